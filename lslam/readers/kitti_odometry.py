@@ -13,7 +13,8 @@ from lslam.formats.sequence_toml import SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
-from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps, rows_of
+from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps
+from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
@@ -93,14 +94,9 @@ def _stamps(
         rate = info.rate_hz or DEFAULT_RATE_HZ
         voice.notes.append(f"no usable {path.name}: scans are stamped at {rate:g} Hz")
         return files, nominal_stamps(len(files), rate), rate
-    rows, rule = rows_of(files, len(stamps))
-    have = rows >= 0
-    if len(stamps) != len(files):
-        voice.problems.append(
-            f"{path} has {len(stamps)} times for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
-        )
-    files = [f for f, known in zip(files, have, strict=True) if known]
-    checked, rate = check_stamps(stamps[rows[have]], info.rate_hz, path, voice.problems)
+    rows = rows_of_scans(path, stamps, files, voice)
+    files = [f for f, known in zip(files, rows.have, strict=True) if known]
+    checked, rate = check_stamps(rows.stamps_ns, info.rate_hz, path, voice.problems)
     return files, checked, rate
 
 

@@ -35,6 +35,7 @@ from lslam.readers.listing import (
     nominal_stamps,
     rows_of,
 )
+from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
@@ -208,14 +209,9 @@ def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], voice: Voi
 def _common(
     files: list[Path], stamps: NDArray[np.int64], source: Path, rate_hz: float | None, voice: Voice
 ) -> tuple[list[Path], NDArray[np.int64], float]:
-    rows, rule = rows_of(files, len(stamps))
-    have = rows >= 0
-    if len(stamps) != len(files):
-        voice.problems.append(
-            f"{source} has {len(stamps)} stamps for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
-        )
-    files = [f for f, known in zip(files, have, strict=True) if known]
-    checked, _ = check_stamps(stamps[rows[have]], rate_hz, source, voice.problems)
+    rows = rows_of_scans(source, stamps, files, voice)
+    files = [f for f, known in zip(files, rows.have, strict=True) if known]
+    checked, _ = check_stamps(rows.stamps_ns, rate_hz, source, voice.problems)
     return files, checked, rate_hz or measured_rate(checked)
 
 

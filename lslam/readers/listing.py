@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.point_files import SUFFIXES
-from lslam.formats.pose_rows import parse_stamp
 from lslam.formats.stamp_files import read_stamps
 
 DEFAULT_RATE_HZ = 10.0
@@ -60,16 +59,6 @@ def rows_of(files: list[Path], count: int) -> tuple[NDArray[np.int64], str]:
     rows = np.arange(len(files), dtype=np.int64)
     rows[rows >= count] = -1
     return rows, "by index"
-
-
-def stamps_in_names(files: list[Path]) -> NDArray[np.int64] | None:
-    """Stamps (N,) ns when every file name is one (`1670403902.235281229.pcd`, `1670403902235281229.bin`), else None."""
-    stamps = []
-    for path in files:
-        if not re.fullmatch(r"\d{9,10}[._]\d+|\d{18,19}", path.stem):
-            return None
-        stamps.append(parse_stamp(path.stem.replace("_", ".")))
-    return np.array(stamps, np.int64)
 
 
 def nominal_stamps(count: int, rate_hz: float, start_ns: int = 0) -> Stamps:

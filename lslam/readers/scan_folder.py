@@ -21,12 +21,10 @@ from lslam.readers.listing import (
     DEFAULT_RATE_HZ,
     check_stamps,
     list_scans,
-    load_stamps,
     nominal_stamps,
-    rows_of,
-    stamps_in_names,
 )
 from lslam.readers.point_times import TimeRule, rule_of_scans
+from lslam.readers.scan_stamps import StampedScans, stamp_scans
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
@@ -148,31 +146,12 @@ def _stamps_and_truth(
     return files, nominal, rate, truth
 
 
-def _own_stamps(
-    folder: Path, info: SequenceInfo, files: list[Path], voice: Voice
-) -> tuple[list[Path], NDArray[np.int64], float] | None:
+def _own_stamps(folder: Path, info: SequenceInfo, files: list[Path], voice: Voice) -> StampedScans | None:
     names = STAMP_NAMES if info.stamps is None else (info.stamps,)
     path = next((p for p in (folder / name for name in names) if p.is_file()), None)
     if path is None and info.stamps is not None:
         voice.problems.append(f"stamps {folder / info.stamps}, named by sequence.toml, do not exist")
-    stamps = load_stamps(path, voice.problems) if path else None
-    if path is None or stamps is None:
-        in_names = stamps_in_names(files)
-        if in_names is None:
-            return None
-        voice.notes.append("scan stamps from the file names")
-        checked, rate = check_stamps(in_names, info.rate_hz, folder, voice.problems)
-        return files, checked, rate
-    rows, rule = rows_of(files, len(stamps))
-    have = rows >= 0
-    if len(stamps) != len(files):
-        voice.problems.append(
-            f"{path} has {len(stamps)} stamps for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
-        )
-    files = [f for f, known in zip(files, have, strict=True) if known]
-    voice.notes.append(f"scan stamps from {path.name}")
-    checked, rate = check_stamps(stamps[rows[have]], info.rate_hz, path, voice.problems)
-    return files, checked, rate
+    return stamp_scans(files, path, read_points, info.rate_hz, voice)
 
 
 def _truth(

@@ -1,0 +1,125 @@
+"""Stamps in the names of scan files, in whatever unit and form: it is found from all names together, and said."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Stamps = NDArray[np.int64]
+
+_UNITS = {"nanoseconds": 1, "microseconds": 10**3, "milliseconds": 10**6, "seconds": 10**9}
+_EARLIEST_NS, _LATEST_NS = 10**17, 41 * 10**17  # 1973, where seconds have nine digits, to 2099
+_DATE = re.compile(
+    r"(?<!\d)(\d{4})([-_]?)(\d\d)\2(\d\d)[T _-]?(\d\d)([-_:.]?)(\d\d)\6(\d\d)(?:[.,_-]?(\d{1,9}))?"
+    r"(Z|[+-]\d\d:?\d\d)?(?!\d)"
+)
+# Numbers that lie so far apart count no scans; in their unit scans follow each other at 1 to 100 Hz.
+_NO_COUNT = 10_000
+_SHORTEST_NS, _LONGEST_NS = 10**7, 10**9
+_CLEARLY = 0.5
+
+
+class NameStamps(NamedTuple):
+    """Stamps (N,) ns of the files in their order, and what the names hold, in words; None where stamps repeat."""
+
+    stamps_ns: Stamps | None
+    words: str
+
+
+def stamps_in_names(files: list[Path]) -> NameStamps | None:
+    """Stamps of scan files by their names: dates, or one number since 1970 in s, ms, us or ns, or seconds and their fraction.
+
+    Numbers may stand behind or before other words and numbers. None when the names hold no times; the finest that differ in
+    all names count.
+    """
+    stems = [path.stem for path in files]
+    shapes = {re.sub(r"\d+", "#", stem) for stem in stems}
+    found = list(_dates(stems))
+    if len(shapes) == 1:
+        shape = shapes.pop()
+        groups = [list(column) for column in zip(*(re.findall(r"\d+", stem) for stem in stems), strict=True)]
+        found += [*_pairs(groups, shape.split("#")[1:-1]), *_numbers(groups)]
+    for stamps, words in found:
+        if len(np.unique(stamps)) == len(stamps):
+            return NameStamps(np.array(stamps, np.int64), words)
+    return NameStamps(None, found[0][1]) if found else None
+
+
+def _dates(stems: list[str]) -> Iterator[tuple[list[int], str]]:
+    matches = [_DATE.search(stem) for stem in stems]
+    stamps = []
+    for match in matches:
+        if match is None:
+            return
+        year, _, month, day, hour, _, minute, second, fraction, zone = match.groups()
+        try:
+            begin = datetime.strptime(
+                f"{year}{month}{day}{hour}{minute}{second}{'+0000' if zone in (None, 'Z') else zone}", "%Y%m%d%H%M%S%z"
+            )
+        except ValueError:
+            return
+        seconds = round((begin - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds())
+        stamps.append(seconds * 10**9 + int((fraction or "").ljust(9, "0")))
+    if min(stamps) >= _EARLIEST_NS and max(stamps) <= _LATEST_NS:
+        yield stamps, "dates, UTC where they state no other zone"
+
+
+def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[int], str]]:
+    """Seconds and the number behind them."""
+    for k, separator in enumerate(between):
+        whole, rest = groups[k], groups[k + 1]
+        is_alone = len(groups) == 2 and all(len(text) == 9 for text in rest)
+        if separator not in tuple("._-,") or max(map(len, rest)) > 9 or not (_is_time(whole, 10**9) or is_alone):
+            continue
+        if _counts(rest):
+            continue
+        seconds = [int(text) * 10**9 for text in whole]
+        decimals = [s + int(text.ljust(9, "0")) for s, text in zip(seconds, rest, strict=True)]
+        units = [s + int(text) for s, text in zip(seconds, rest, strict=True)]
+        is_padded = len({len(text) for text in rest}) == 1 or any(len(t) > 1 and t[0] == "0" for t in rest)
+        digits = len(rest[0])
+        if is_padded:
+            yield decimals, f"seconds and {digits} decimals" if len({len(t) for t in rest}) == 1 else "decimal seconds"
+            continue
+        a, b = _unevenness(decimals), _unevenness(units)
+        is_clear = min(a, b) < _CLEARLY * max(a, b)
+        if b < a if is_clear else max(map(len, rest)) == 9:
+            yield units, "seconds and nanoseconds without leading zeros"
+        else:
+            yield decimals, "decimal seconds"
+
+
+def _numbers(groups: list[list[str]]) -> Iterator[tuple[list[int], str]]:
+    for unit, scale in _UNITS.items():
+        for texts in groups:
+            if _is_time(texts, scale) and not (len(texts) > 1 and len(set(texts)) == 1):
+                yield [int(text) * scale for text in texts], f"{unit} since 1970"
+    varying = [texts for texts in groups if len(set(texts)) > 1]
+    if len(varying) == 1 and len(varying[0]) > 2:
+        values = np.sort(np.array([int(text[-18:]) for text in varying[0]], np.int64))
+        step = float(np.median(np.diff(values)))
+        for unit, scale in _UNITS.items():
+            if step >= _NO_COUNT and _SHORTEST_NS <= step * scale <= _LONGEST_NS and values[-1] * scale < _EARLIEST_NS:
+                yield [int(text) * scale for text in varying[0]], f"{unit} of a clock that began elsewhere"
+
+
+def _is_time(texts: list[str], scale: int) -> bool:
+    return all(len(text) < 20 and _EARLIEST_NS <= int(text) * scale <= _LATEST_NS for text in texts)
+
+
+def _counts(texts: list[str]) -> bool:
+    """Whether numbers only count the files."""
+    return len(texts) > 2 and bool((np.diff([int(text) for text in texts]) == 1).all())
+
+
+def _unevenness(stamps: list[int]) -> float:
+    """Mean deviation of the intervals from their median, in medians."""
+    steps = np.diff(np.sort(np.array(stamps, np.int64))).astype(np.float64)
+    middle = float(np.median(steps)) if len(steps) else 0.0
+    return float(np.mean(np.abs(steps - middle))) / middle if middle > 0 else np.inf
