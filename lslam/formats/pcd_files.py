@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+from lslam.formats.point_cloud import AXES
 from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
@@ -37,10 +38,10 @@ class _Header:
         return sum(d.itemsize * c for d, c in zip(self.dtypes, self.counts, strict=True))
 
 
-def read_pcd(path: Path) -> PointCloud:
-    """Read a PCD file; the points stay in the order and the frame of the file (VIEWPOINT is not applied, as in PCL).
+def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
+    """The points of a PCD file by field; they stay in the order and the frame of the file (VIEWPOINT is not applied, as in PCL).
 
-    Raises InputError naming the file and the place: a header that lies, missing x, y or z, data that end early.
+    Raises InputError naming the file and the place: a header that lies, data that end early.
     """
     try:
         data = path.read_bytes()
@@ -49,14 +50,9 @@ def read_pcd(path: Path) -> PointCloud:
     header = _read_header(path, data)
     body = memoryview(data)[header.size :]
     if header.points == 0:
-        columns: dict[str, NDArray[Any]] = {n: np.zeros(0, d) for n, d in zip(header.names, header.dtypes, strict=True)}
-    elif header.encoding == "ascii":
-        columns = _ascii_columns(path, header, body)
-    elif header.encoding == "binary":
-        columns = _binary_columns(path, header, body)
-    else:
-        columns = _compressed_columns(path, header, body)
-    return cloud_from_fields(path, columns)
+        return {name: np.zeros(0, kind) for name, kind in zip(header.names, header.dtypes, strict=True)}
+    read = {"ascii": _ascii_columns, "binary": _binary_columns}.get(header.encoding, _compressed_columns)
+    return read(path, header, body)
 
 
 def write_pcd(
@@ -128,7 +124,9 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
     width = _number(path, "WIDTH", *entries.get("WIDTH", ["0"]))
     height = _number(path, "HEIGHT", *entries.get("HEIGHT", ["1"]))
     points = _number(path, "POINTS", *entries.get("POINTS", [str(width * height)]))
-    if "WIDTH" in entries and points != width * height:
+    # Some writers leave one of them at 0.
+    points = points or width * height
+    if width * height and points != width * height:
         raise InputError(f"{path}: PCD header lies: POINTS {points} is not WIDTH {width} x HEIGHT {height}")
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     if encoding not in ENCODINGS:
@@ -148,20 +146,51 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
     lines = bytes(body).split(b"\n")
     while lines and not lines[-1].strip():
         lines.pop()
-    if len(lines) < header.points:
-        raise InputError(f"{path}: PCD header says {header.points} points, the file holds {len(lines)} lines of them")
+    raw: set[int] = set()
     try:
+        if len(lines) < header.points:
+            raise ValueError(f"header says {header.points} points, the file holds {len(lines)} lines of them")
         table = np.loadtxt([line.decode("ascii") for line in lines[: header.points]], np.float64, ndmin=2)
     except ValueError as error:
-        raise InputError(f"{path}: PCD ascii data (counted from the first point) cannot be read: {error}") from None
+        raw, rows = _raw_columns(header), None
+        if raw and 2 * width * header.points <= len(body) + 1:
+            rows = _rows_with_raw_bytes(header, bytes(body), raw)
+        if rows is None:
+            raise InputError(f"{path}: PCD ascii data (counted from the first point) cannot be read: {error}") from None
+        table = rows
     if table.shape != (header.points, width):
         raise InputError(f"{path}: PCD ascii lines hold {table.shape[1]} numbers where FIELDS and COUNT say {width}")
     columns, k = {}, 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        if count == 1 and name != "_":
-            columns[name] = table[:, k].astype(dtype) if dtype.kind == "f" else table[:, k]
+        if count == 1 and name != "_" and k not in raw:
+            # Text holds the digits that it holds, whatever type its header names.
+            as_read = name.lower() in AXES or dtype.kind != "f"
+            columns[name] = table[:, k] if as_read else table[:, k].astype(dtype)
         k += count
     return columns
+
+
+def _raw_columns(header: _Header) -> set[int]:
+    """Columns that a writer may have put as bytes, not as digits: those of one byte, as C++ streams write a char."""
+    sizes = np.repeat([dtype.itemsize for dtype in header.dtypes], header.counts)
+    return set(np.flatnonzero(sizes == 1).tolist())
+
+
+def _rows_with_raw_bytes(header: _Header, body: bytes, raw: set[int]) -> NDArray[np.float64] | None:
+    """Numbers of lines of which the columns `raw` hold a byte, any byte, a blank or the end of a line too; these as NaN."""
+    number = rb"([-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf))"
+    words = [rb"(?:[-+]?\d+|[\s\S])" if k in raw else number for k in range(sum(header.counts))]
+    line = re.compile(b" ".join(words) + rb" ?\r?(?:\n|\Z)", re.IGNORECASE)
+    table = np.full((header.points, len(words)), np.nan)
+    kept = [k for k in range(len(words)) if k not in raw]
+    position = 0
+    for row in table:
+        match = line.match(body, position)
+        if match is None:
+            return None
+        row[kept] = [float(word) for word in match.groups()]
+        position = match.end()
+    return table
 
 
 def _binary_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+from lslam.formats.point_cloud import AXES
 from lslam.untrusted import whole_number
 
 _TYPES = {
@@ -30,10 +30,10 @@ class _Element:
     properties: list[tuple[str, str]]  # name, numpy code; code "list" for lists
 
 
-def read_ply(path: Path) -> PointCloud:
-    """Read the vertices of a PLY file; faces and other elements after them are ignored.
+def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
+    """The vertices of a PLY file by property; faces and other elements after them are ignored.
 
-    Raises InputError naming the file and the line: no PLY, a bad header, missing x, y or z, data that end early.
+    Raises InputError naming the file and the line: no PLY, a bad header, data that end early.
     """
     try:
         data = path.read_bytes()
@@ -49,10 +49,10 @@ def read_ply(path: Path) -> PointCloud:
             raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
         if element.name == "vertex":
             if element.count == 0:
-                return cloud_from_fields(path, {name: np.zeros(0, code) for name, code in element.properties})
+                return {name: np.zeros(0, code) for name, code in element.properties}
             if encoding == "ascii":
-                return cloud_from_fields(path, _ascii_columns(path, element, body, skipped))
-            return cloud_from_fields(path, _binary_columns(path, element, body, order, skipped))
+                return _ascii_columns(path, element, body, skipped)
+            return _binary_columns(path, element, body, order, skipped)
         record = sum(np.dtype(code).itemsize for code in codes if code != "list")
         skipped += element.count * (record if encoding != "ascii" else 1)
     raise InputError(f"{path}: PLY header has no element 'vertex'")
@@ -142,7 +142,8 @@ def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int
             f"{path}: PLY ascii lines hold {table.shape[1]} numbers for {len(element.properties)} properties"
         )
     return {
-        name: table[:, k].astype(code) if code.startswith("f") else table[:, k]
+        # Text holds the digits that it holds, whatever type its header names.
+        name: table[:, k] if name.lower() in AXES or not code.startswith("f") else table[:, k].astype(code)
         for k, (name, code) in enumerate(element.properties)
     }
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 
+AXES = ("x", "y", "z")
 INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity", "reflectance", "scalar_intensity", "remission")
 RING_NAMES = ("ring", "rings", "channel", "line", "laser_id", "scalar_ring")
 # docs/conventions.md, "Per-point times".
@@ -24,11 +25,11 @@ TIME_NAMES = (
 class PointCloud:
     """What a point file holds.
 
-    points : (N, 3) float32, m; intensity : (N,) float32 or None; rings : (N,) uint16 or None
+    points : (N, 3) float32 (of maps float64), m; intensity : (N,) float32 or None; rings : (N,) uint16 or None
     times : (N,) per-point times as stored, of any type and unit, or None; time_field : their name in the file
     """
 
-    points: NDArray[np.float32]
+    points: NDArray[Any]
     intensity: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     times: NDArray[Any] | None = None
@@ -38,8 +39,12 @@ class PointCloud:
         return len(self.points)
 
 
-def cloud_from_fields(path: Path, columns: Mapping[str, NDArray[Any]]) -> PointCloud:
+def cloud_from_fields(
+    path: Path, columns: Mapping[str, NDArray[Any]], kind: type[np.floating[Any]] = np.float32
+) -> PointCloud:
     """Collect x, y, z and the fields known by name (case does not matter) from one array per field.
+
+    kind : of the points: float32 for scans, float64 for maps
 
     Raises InputError naming the file and the fields it has when x, y or z is missing.
     """
@@ -47,7 +52,7 @@ def cloud_from_fields(path: Path, columns: Mapping[str, NDArray[Any]]) -> PointC
     missing = [axis for axis in "xyz" if axis not in lower]
     if missing:
         raise InputError(f"{path}: no field {', '.join(missing)}; the file has {', '.join(columns) or 'no fields'}")
-    points = np.empty((len(columns[lower["x"]]), 3), np.float32)
+    points = np.empty((len(columns[lower["x"]]), 3), kind)
     for k, axis in enumerate("xyz"):
         points[:, k] = columns[lower[axis]]
     intensity = _first(lower, INTENSITY_NAMES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -13,37 +15,60 @@ from lslam.errors import InputError, UsageError, cause
 from lslam.formats.array_headers import HEADERS
 from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
-from lslam.formats.pcd_files import pcd_header, read_pcd, write_pcd
-from lslam.formats.ply_files import ply_header, read_ply, write_ply
-from lslam.formats.point_cloud import PointCloud
+from lslam.formats.pcd_files import pcd_columns, pcd_header, write_pcd
+from lslam.formats.ply_files import ply_columns, ply_header, write_ply
+from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, named_table, recognise
 from lslam.remote import RemotePath
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.untrusted import MISFIT
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
-# Record sizes other data sets use, to tell a truncated file from one of another kind.
-_OTHER_RECORDS = {12: "x, y, z", 20: "x, y, z, intensity, ring", 24: "x, y, z, intensity, ring, time"}
 MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
+_MOST_COLUMNS = 64
+# Coordinates beyond are those of a projection; of a map they shall lie in finer steps.
+LARGE_M, COARSE_M = 1e5, 0.01
+_FEW = 8
+log = logging.getLogger("lslam")
 
 
-def read_points(path: Path) -> PointCloud:
+def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
     """Read one point file, chosen by its suffix; NaN, Inf and zero points are kept as they are.
+
+    record : of the points of a `.bin` file or of a plain NumPy array; None recognises it by the values
 
     Raises InputError naming the file and the place when it is missing, truncated or of another kind.
     """
+    return cloud_from_fields(path, _read_columns(path, record))
+
+
+def _read_columns(path: Path, record: PointRecord | None = None) -> Mapping[str, NDArray[Any]]:
     suffix = path.suffix.lower()
     if suffix == ".bin":
-        raw = read_bin(path)
-        return PointCloud(np.ascontiguousarray(raw[:, :3]), np.ascontiguousarray(raw[:, 3]))
+        raw = read_bytes(path)
+        record = record or record_of({path: raw})[0]
+        check_size(path, raw, record)
+        return record.columns(raw)
     if suffix == ".pcd":
-        return read_pcd(path)
+        return pcd_columns(path)
     if suffix == ".ply":
-        return read_ply(path)
+        return ply_columns(path)
     if suffix == ".npy":
-        return _read_npy(path)
+        return _npy_columns(path, record)
     if suffix == ".txt":
-        return _read_text(path)
+        return _text_columns(path)
     raise InputError(f"{path}: no point file lslam reads; known suffixes: {', '.join(SUFFIXES)}")
+
+
+def read_bytes(path: Path) -> NDArray[np.uint8]:
+    """All bytes of a file. Raises InputError naming it when it cannot be read."""
+    try:
+        if isinstance(path, RemotePath):
+            return np.frombuffer(bytearray(path.read_bytes()), np.uint8)
+        with path.open("rb") as stream:
+            return np.fromfile(stream, np.uint8)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 def read_bin(path: Path) -> NDArray[np.float32]:
@@ -51,22 +76,43 @@ def read_bin(path: Path) -> NDArray[np.float32]:
 
     Raises InputError naming the file and its size when that is no multiple of 16 bytes.
     """
-    try:
-        if isinstance(path, RemotePath):
-            raw = np.frombuffer(bytearray(path.read_bytes()), np.uint8)
-        else:
-            with path.open("rb") as stream:
-                raw = np.fromfile(stream, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    if len(raw) % 16:
-        others = [f"{size} bytes ({what})" for size, what in _OTHER_RECORDS.items() if len(raw) % size == 0]
-        could = f"or its records are of {' or '.join(others)}: convert them" if others else "fetch it again"
-        raise InputError(
-            f"{path}: {len(raw)} bytes are no multiple of 16 (x, y, z, intensity as float32): the file is truncated "
-            f"after point {len(raw) // 16}, {could}"
-        )
+    raw = read_bytes(path)
+    check_size(path, raw, KITTI)
     return raw.view("<f4").reshape(-1, 4)
+
+
+def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
+    """Raise InputError when the bytes of a file are no multiple of those of a point."""
+    if len(raw) % record.size:
+        what = "x, y, z, intensity as float32" if record == KITTI else str(record)
+        raise InputError(
+            f"{path}: {len(raw)} bytes are no multiple of {record.size} ({what}): the file is truncated after point "
+            f"{len(raw) // record.size}, or its records are of {_other_sizes(len(raw), record)} bytes: {WAY_OUT}"
+        )
+
+
+def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str]:
+    """The record of the points in `.bin` files, by their values, and why it is not KITTI's; empty where it is.
+
+    Raises InputError with the sizes that would fit when no record fits or several do.
+    """
+    recognition = recognise(list(files.values()))
+    record = recognition.record
+    if record is not None:
+        return record, recognition.reason
+    path, raw = next((path, raw) for path, raw in files.items() if len(raw))
+    fitting = " or ".join(f"{r.size} bytes ({r})" for r in recognition.fitting)
+    if not fitting and len(raw) % KITTI.size:
+        check_size(path, raw, KITTI)
+    could = f"its values allow records of {fitting}" if fitting else (
+        f"it could be truncated, or its records are of {_other_sizes(len(raw), KITTI)} bytes"
+    )  # fmt: skip
+    raise InputError(f"{path}: as {KITTI} of {KITTI.size} bytes {recognition.reason}; {could}: {WAY_OUT}")
+
+
+def _other_sizes(size: int, record: PointRecord) -> str:
+    sizes = [str(k) for k in range(12, 65) if k != record.size and size % k == 0]
+    return ", ".join(sizes) or "another number of"
 
 
 def write_points(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, *, comment: str = "") -> None:
@@ -96,28 +142,55 @@ def write_points(path: Path, points: NDArray[Any], intensity: NDArray[Any] | Non
         raise UsageError(f"{path}: no point file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
 
 
-def _read_npy(path: Path) -> PointCloud:
-    from lslam.formats.point_cloud import cloud_from_fields
-
+def read_array(path: Path) -> NDArray[Any]:
+    """An array of points: structured and flat, or numbers (N, K). Raises InputError when it is something else."""
     try:
         with HEADERS, path.open("rb") as stream:
             table = np.load(stream, allow_pickle=False)
     except (OSError, *MISFIT, EOFError, SyntaxError, MemoryError, TokenError) as error:
         raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None
     if table.dtype.names:
-        flat = table.ravel()
-        return cloud_from_fields(path, {name: flat[name] for name in table.dtype.names})
-    # Organised clouds (rows, cols, 3 or 4) are flattened row by row.
-    if table.ndim not in (2, 3) or table.shape[-1] < 3 or table.dtype.kind not in "fiu":
+        flat: NDArray[Any] = table.ravel()
+        return flat
+    # Organised clouds (rows, cols, K) are flattened row by row.
+    if table.ndim not in (2, 3) or not 3 <= table.shape[-1] <= _MOST_COLUMNS or table.dtype.kind not in "fiu":
         raise InputError(
-            f"{path}: array of shape {table.shape} and type {table.dtype}, expected (N, 3) or (N, 4) numbers"
+            f"{path}: array of shape {table.shape} and type {table.dtype}, expected (N, 3), (N, 4) or up to "
+            f"(N, {_MOST_COLUMNS}) numbers"
         )
-    table = table.reshape(-1, table.shape[-1])
-    points = np.ascontiguousarray(table[:, :3], np.float32)
-    return PointCloud(points, np.ascontiguousarray(table[:, 3], np.float32) if table.shape[1] > 3 else None)
+    return np.asarray(table.reshape(-1, table.shape[-1]))
 
 
-def _read_text(path: Path) -> PointCloud:
+def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray[Any]]:
+    table = read_array(path)
+    if table.dtype.names:
+        return _of_structure(table)
+    names = name_columns([table]) if record is None else record.names
+    if len(names) != table.shape[1]:
+        raise InputError(f"{path}: {table.shape[1]} columns where {' '.join(names)} are {len(names)}")
+    return named_table(table, names)
+
+
+def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Fields of one number each; three together are x, y and z where no field has these names."""
+    columns: dict[str, NDArray[Any]] = {}
+    names = {name.lower() for name in table.dtype.names or ()}
+    for name in table.dtype.names or ():
+        values = table[name]
+        if values.dtype.kind not in "fiu":
+            continue
+        if values.ndim == 1:
+            columns[name] = values
+        elif (
+            values.shape[1:] == (3,)
+            and name.lower() in ("xyz", "point", "points", "position", "positions")
+            and "x" not in names
+        ):
+            columns |= {axis: values[:, k] for k, axis in enumerate("xyz")}
+    return columns
+
+
+def _text_columns(path: Path) -> dict[str, NDArray[Any]]:
     """KITTI raw `extract` scans: x y z intensity, one point per line."""
     try:
         text = path.read_text(encoding="ascii")
@@ -126,7 +199,7 @@ def _read_text(path: Path) -> PointCloud:
         raise InputError(f"{path} cannot be read as lines of x y z intensity: {error}") from None
     if table.shape[1] != 4:
         raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
-    return PointCloud(np.ascontiguousarray(table[:, :3]), np.ascontiguousarray(table[:, 3]))
+    return dict(zip(KITTI.names, table.T, strict=True))
 
 
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
@@ -159,11 +232,33 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
 
 
 def read_cloud(path: Path) -> ArrayCloud:
-    """Read any map or point file whole, its points as float64, m; LAS and LAZ keep their millimetres at any offset.
+    """Read any map or point file whole, its points as float64, m, with all the digits that the file has.
 
+    Coordinates far from the origin in coarse steps are warned about.
     Raises InputError naming the file when it is missing, damaged or of another kind.
     """
     if path.suffix.lower() in (".las", ".laz"):
-        return read_las(path)[0]
-    read = read_points(path)
-    return ArrayCloud.of(read.points, read.intensity)
+        cloud = read_las(path)[0]
+    else:
+        read = cloud_from_fields(path, _read_columns(path), np.float64)
+        cloud = ArrayCloud.of(read.points, read.intensity)
+    step = coordinate_step(cloud.points)
+    if step > COARSE_M:
+        log.warning(
+            "%s: its coordinates lie in steps of %.3g m, so far from the origin are they for float32 or for their digits: write "
+            "them as double, or less an offset", path, step,
+        )  # fmt: skip
+    return cloud
+
+
+def coordinate_step(points: NDArray[np.float64]) -> float:
+    """Step of which all coordinates along an axis are multiples, m, the largest of the axes; 0 for those near the origin."""
+    steps = [0.0]
+    for column in points.T:
+        values = np.unique(column[np.isfinite(column)])
+        if len(values) >= _FEW and np.abs(values).max() > LARGE_M:
+            between = np.diff(values)
+            counted = between / between.min()
+            if np.abs(counted - np.round(counted)).max() < 0.01:
+                steps.append(float(between.min()))
+    return max(steps)

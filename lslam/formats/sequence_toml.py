@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, nearest
 from lslam.formats.atomic import write_text
+from lslam.formats.point_records import is_record
 from lslam.geometry import so3
 from lslam.printable import toml_text
 from lslam.untrusted import parse_toml
@@ -20,6 +21,7 @@ from lslam.untrusted import parse_toml
 FILE_NAME = "sequence.toml"
 INSTANTS = ("scan_start", "scan_middle", "scan_end")
 UNITS = ("s", "ms", "us", "ns")
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # m
 REFERENCES = ("start", "end", "absolute")
 FRAMES = ("lidar", "cam0", "imu")
 EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
@@ -38,6 +40,8 @@ class SequenceInfo:
     per_point : folder of `<scan>.npz` with `t` (float32 s from the scan's stamp) and `ring` (uint16)
     point_time_unit, point_time_reference : of the points' own time field, where it does not show, one of `UNITS` and of
         `REFERENCES`: the scan's start or end, which is its stamp then, or absolute
+    bin_record : what a point of a `.bin` file or of a plain array consists of, see `parse_record`
+    point_unit : of the coordinates of points, one of `LENGTHS`
     stamps, imu, gnss, ground_truth : files, relative to the sequence folder
     ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read
@@ -56,6 +60,8 @@ class SequenceInfo:
     per_point: str | None = None
     point_time_unit: str | None = None
     point_time_reference: str | None = None
+    bin_record: str | None = None
+    point_unit: str | None = None
     stamps: str | None = None
     imu: str | None = None
     gnss: str | None = None
@@ -155,6 +161,8 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "per_point": (_is_text, "a folder"),
     "point_time_unit": (lambda v: v in UNITS, "one of " + ", ".join(UNITS)),
     "point_time_reference": (lambda v: v in REFERENCES, "one of " + ", ".join(REFERENCES)),
+    "bin_record": (is_record, 'columns like "x y z intensity ring:u2 time:f8", float32 where no type is named'),
+    "point_unit": (lambda v: v in (*LENGTHS,), "one of " + ", ".join(LENGTHS)),
     "stamps": (_is_text, "a file"),
     "imu": (_is_text, "a file"),
     "gnss": (_is_text, "a file"),

@@ -13,6 +13,7 @@ from lslam.errors import InputError, cause
 from lslam.formats.array_headers import HEADERS
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
+from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.state_files import DAMAGE
 from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
 from lslam.types.gnss import GnssStream
@@ -30,6 +31,7 @@ class FolderSequence(Scans):
     rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
     time_rule : how the files' own per-point times are understood, None when they have none or are not to be used
     sweep_s : (N, 2) begin and end of each sweep, s from its stamp, when per-point times follow from the azimuth; else None
+    record : of the points, where the files do not name their fields; unit_m : of coordinates, None where nobody states it
     rings : number of beams, if known; sensor : its name, if known
     """
 
@@ -54,6 +56,8 @@ class FolderSequence(Scans):
     sweep_s: NDArray[np.float64] | None = None
     rings: int | None = None
     sensor: str | None = None
+    record: PointRecord | None = None
+    unit_m: float | None = None
 
     def __len__(self) -> int:
         return len(self.files)
@@ -67,7 +71,10 @@ class FolderSequence(Scans):
             raise IndexError(f"scan {index} of {len(self.files)}")
         path = self.files[index]
         stamp = int(self.stamps_ns[index])
-        cloud = _split(read_bin(path)) if path.suffix.lower() == ".bin" else read_points(path)
+        is_kitti = path.suffix.lower() == ".bin" and self.record in (None, KITTI)
+        cloud = _split(read_bin(path)) if is_kitti else read_points(path, self.record)
+        if self.unit_m is not None and self.unit_m != 1:
+            cloud.points[...] *= np.float32(self.unit_m)
         times, rings, stamp = self._times_and_rings(path, cloud, index, stamp)
         if self.correction_deg and len(cloud):
             from lslam.kernels.transform import rotate_up

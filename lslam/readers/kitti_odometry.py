@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_odometry_calib
-from lslam.formats.sequence_toml import SequenceInfo
+from lslam.formats.point_records import KITTI
+from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps
+from lslam.readers.scan_folder import time_rule
+from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
     calibration_over,
@@ -59,7 +62,11 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else printable(folder.name))
     files, stamps, rate = _stamps(folder, info, files, voice)
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
-    compensated = True if info.motion_compensated is None and info.per_point is None else info.motion_compensated
+    record = scan_record(files, info, voice)
+    # The benchmark's points have no times: scans with times are of another sensor.
+    has_times = record is not None and "time" in record.names
+    is_benchmark = info.motion_compensated is None and info.per_point is None and not has_times
+    compensated = True if is_benchmark else info.motion_compensated
     if info.motion_compensated is None and compensated:
         voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
     return FolderSequence(
@@ -74,12 +81,15 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         ground_truth=_ground_truth(folder, info, files, stamps, calibration, voice),
         imu=load_imu(folder, info, voice.problems),
         gnss=load_gnss(folder, info, voice.problems),
-        correction_deg=vertical_correction(info, files, voice.notes),
+        correction_deg=vertical_correction(info, files, record, voice.notes),
         rows=info.rows,
         cols=info.cols,
         per_point=per_point_folder(folder, info),
         rings=info.rings or info.rows,
-        sensor=info.sensor or (None if has_toml else "HDL-64E"),
+        sensor=info.sensor or (None if has_toml or record != KITTI else "HDL-64E"),
+        record=record,
+        unit_m=LENGTHS.get(info.point_unit or ""),
+        time_rule=time_rule(files, record, stamps, rate, info, voice) if has_times and not compensated else None,
         notes=voice.notes,
         problems=voice.problems,
     )

@@ -22,7 +22,7 @@ from lslam.errors import InputError, cause
 from lslam.formats.calibration_files import read_raw_cam0_lidar, read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.point_files import SUFFIXES
-from lslam.formats.sequence_toml import SequenceInfo
+from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, oxts_truth, to_lidar
@@ -35,6 +35,7 @@ from lslam.readers.listing import (
     nominal_stamps,
     rows_of,
 )
+from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
     calibration_over,
@@ -87,6 +88,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         raise InputError(f"{data} holds no scans (*.bin or *.txt): fetch the velodyne data of this drive")
     voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
     is_extract = folder.name.endswith("_extract")
+    record = scan_record(files, info, voice)
     oxts = _oxts(folder, voice)
     compensated = bool(info.motion_compensated)
     files, stamps, rate, passed = _stamps(folder, info, files, oxts, is_extract, compensated, voice)
@@ -120,13 +122,15 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         ground_truth=_ground_truth(folder, info, files, stamps, oxts, calibration, voice),
         imu=load_imu(folder, info, voice.problems) or _imu(oxts),
         gnss=load_gnss(folder, info, voice.problems) or _gnss(oxts),
-        correction_deg=vertical_correction(info, files, voice.notes),
+        correction_deg=vertical_correction(info, files, record, voice.notes),
         rows=info.rows,
         cols=info.cols,
         per_point=per_point,
         sweep_s=sweep,
         rings=info.rings or info.rows,
         sensor=info.sensor or (None if has_toml else "HDL-64E"),
+        record=record,
+        unit_m=LENGTHS.get(info.point_unit or ""),
         notes=voice.notes,
         problems=voice.problems,
     )

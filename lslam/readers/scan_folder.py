@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,10 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_mcd_extrinsics, read_odometry_calib
+from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import SUFFIXES, read_points
-from lslam.formats.sequence_toml import SequenceInfo
+from lslam.formats.point_records import KITTI, PointRecord
+from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Numbered, Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
@@ -24,12 +28,14 @@ from lslam.readers.listing import (
     nominal_stamps,
 )
 from lslam.readers.point_times import TimeRule, rule_of_scans
+from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import StampedScans, stamp_scans
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 KIND = "scan-folder"
+Read = Callable[[Path], PointCloud]
 SUBFOLDERS = ("data", "scans", "lidar", "points", "clouds", "pcd", "ply", "bin")
 STAMP_NAMES = ("times.txt", "timestamps.txt", "stamps.txt", "times.csv", "timestamps.csv", "stamps.csv")
 
@@ -58,11 +64,13 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
             "vertical correction of its points"
         )
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
-    files, stamps, rate, truth = _stamps_and_truth(folder, info, files, calibration, voice)
+    record = scan_record(files, info, voice)
+    read = partial(read_points, record=record)
+    files, stamps, rate, truth = _stamps_and_truth(folder, info, files, read, calibration, voice)
     correction = info.vertical_correction_deg or 0.0
     if correction:
         voice.notes.append(f"vertical correction {correction:g} deg, as stated")
-    rule = None if info.motion_compensated else _time_rule(files, stamps, rate, info, voice)
+    rule = None if info.motion_compensated else time_rule(files, record, stamps, rate, info, voice)
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     return FolderSequence(
@@ -84,6 +92,8 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         time_rule=rule,
         rings=info.rings or info.rows,
         sensor=info.sensor,
+        record=record,
+        unit_m=LENGTHS.get(info.point_unit or ""),
         notes=voice.notes,
         problems=voice.problems,
     )
@@ -109,10 +119,10 @@ def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
 
 
 def _stamps_and_truth(
-    folder: Path, info: SequenceInfo, files: list[Path], calibration: Calibration, voice: Voice
+    folder: Path, info: SequenceInfo, files: list[Path], read: Read, calibration: Calibration, voice: Voice
 ) -> tuple[list[Path], NDArray[np.int64], float, Trajectory | None]:
     """Stamps from their file, the file names, or the ground truth that goes with the scans by index; else nominal."""
-    found = _own_stamps(folder, info, files, voice)
+    found = _own_stamps(folder, info, files, read, voice)
     truth_file = find_ground_truth(folder, info, voice)
     if found is not None:
         files, stamps, rate = found
@@ -146,12 +156,12 @@ def _stamps_and_truth(
     return files, nominal, rate, truth
 
 
-def _own_stamps(folder: Path, info: SequenceInfo, files: list[Path], voice: Voice) -> StampedScans | None:
+def _own_stamps(folder: Path, info: SequenceInfo, files: list[Path], read: Read, voice: Voice) -> StampedScans | None:
     names = STAMP_NAMES if info.stamps is None else (info.stamps,)
     path = next((p for p in (folder / name for name in names) if p.is_file()), None)
     if path is None and info.stamps is not None:
         voice.problems.append(f"stamps {folder / info.stamps}, named by sequence.toml, do not exist")
-    return stamp_scans(files, path, read_points, info.rate_hz, voice)
+    return stamp_scans(files, path, read, info.rate_hz, voice)
 
 
 def _truth(
@@ -190,15 +200,20 @@ def _mcd_extrinsics(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
     return None
 
 
-def _time_rule(
-    files: list[Path], stamps: NDArray[np.int64], rate: float, info: SequenceInfo, voice: Voice
+def time_rule(
+    files: list[Path],
+    record: PointRecord | None,
+    stamps: NDArray[np.int64],
+    rate: float,
+    info: SequenceInfo,
+    voice: Voice,
 ) -> TimeRule | None:
     """How per-point times of the files are read, decided on the first scans that have any."""
-    if files[0].suffix.lower() == ".bin":
+    if record == KITTI:
         return None
     count = min(len(files), 5)
-    index, name, first = _first_times(files, range(count))
-    _, _, later = _first_times(files, range(count - 1, index, -1))
+    index, name, first = _first_times(files, record, range(count))
+    _, _, later = _first_times(files, record, range(count - 1, index, -1))
     if not len(first):
         return None
     begin = int(stamps[index])
@@ -211,11 +226,11 @@ def _time_rule(
     return rule
 
 
-def _first_times(files: list[Path], indices: range) -> tuple[int, str, NDArray[Any]]:
+def _first_times(files: list[Path], record: PointRecord | None, indices: range) -> tuple[int, str, NDArray[Any]]:
     """The first of the files `indices` whose points have times, the field's name and its values; else no values."""
     for index in indices:
         with suppress(InputError):
-            cloud = read_points(files[index])
+            cloud = read_points(files[index], record)
             if cloud.times is not None and len(cloud):
                 return index, cloud.time_field, cloud.times
     return len(files), "", np.zeros(0)

@@ -11,6 +11,7 @@ import numpy as np
 
 from lslam.errors import InputError
 from lslam.formats.point_files import read_points
+from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.types.gnss import GnssStream
@@ -43,7 +44,7 @@ def compensation_note(info: SequenceInfo) -> list[str]:
     return [f"scans are motion compensated, as stated{instant}"]
 
 
-def vertical_correction(info: SequenceInfo, files: list[Path], notes: list[str]) -> float:
+def vertical_correction(info: SequenceInfo, files: list[Path], record: PointRecord | None, notes: list[str]) -> float:
     """Degrees by which real KITTI HDL-64E points are lifted, 0 where something says otherwise; the reason goes to `notes`."""
     if info.vertical_correction_deg is not None:
         degrees = info.vertical_correction_deg
@@ -56,7 +57,10 @@ def vertical_correction(info: SequenceInfo, files: list[Path], notes: list[str])
     ):
         notes.append(f"no vertical correction: the sensor is {info.sensor}")
         return 0.0
-    top = _top_elevation_deg(files)
+    if record not in (None, KITTI):
+        notes.append("no vertical correction: the points are no records of KITTI's HDL-64E")
+        return 0.0
+    top = _top_elevation_deg(files, record)
     if top is not None and top > _HDL64_TOP_DEG:
         notes.append(f"no vertical correction: points up to {top:.1f} deg of elevation are no HDL-64E's")
         return 0.0
@@ -64,11 +68,11 @@ def vertical_correction(info: SequenceInfo, files: list[Path], notes: list[str])
     return HDL64_CORRECTION_DEG
 
 
-def _top_elevation_deg(files: list[Path]) -> float | None:
+def _top_elevation_deg(files: list[Path], record: PointRecord | None) -> float | None:
     """99th percentile of elevation in the first scan that can be read, None when there is none."""
     for path in files[:5]:
         try:
-            points = read_points(path).points
+            points = read_points(path, record).points
         except InputError:
             continue
         points = points[np.isfinite(points).all(1)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from lslam.errors import LslamError
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_files import read_points
+from lslam.formats.point_files import read_cloud
 from lslam.reports import svg
 from lslam.reports.compare_table import recipes, tables
 from lslam.reports.crops import Crop, Floats, choose_crops, crop_images
@@ -197,7 +197,7 @@ def _cloud(run: DrawnRun) -> Floats | None:
     if run.map_file is None:
         return None
     try:
-        points = np.asarray(read_points(run.map_file).points, np.float64)
+        points = read_cloud(run.map_file).points
     except LslamError:
         return None
     T = run.T_drawing_world

@@ -11,7 +11,7 @@ import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
 from numpy.typing import NDArray
 
-from lslam.formats.ply_files import read_ply
+from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.geometry.umeyama import align
@@ -77,7 +77,7 @@ def test_a_town_that_stayed_has_no_changes(drives: Path, tmp_path: Path) -> None
     assert cells["same"] > 0.95 * cells["occupied_new"] > 5000
     assert cells["unseen_old"] > 100, "what the second drive never passed"
     assert json.loads((tmp_path / "out" / "changes.geojson").read_text())["features"] == []
-    assert len(read_ply(tmp_path / "out" / "changes.ply").points) == cells["same"]
+    assert len(read_points(tmp_path / "out" / "changes.ply").points) == cells["same"]
 
 
 @pytest.mark.parametrize(("new", "old", "kind"), [("boxed-run", "old", "appeared"), ("old", "boxed-run", "vanished")])

@@ -160,7 +160,7 @@ def test_a_floor_plan_shows_walls_ways_and_what_nobody_saw() -> None:
 def test_files_hold_every_cell(tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    from lslam.formats.ply_files import read_ply
+    from lslam.formats.point_files import read_points
 
     mapper = OccupancyMapper(0.4, 1.0, 40.0)
     mapper.add(street(True), np.eye(4))
@@ -170,7 +170,7 @@ def test_files_hold_every_cell(tmp_path: Path) -> None:
         assert np.array_equal(stored["cells"], grid.cells)
         assert np.array_equal(stored["log_odds"], grid.log_odds)
         assert float(stored["voxel"]) == 0.4
-    np.testing.assert_allclose(read_ply(tmp_path / "occupancy.ply").points, grid.centres, atol=1e-5)
+    np.testing.assert_allclose(read_points(tmp_path / "occupancy.ply").points, grid.centres, atol=1e-5)
     plan = floor_plan(grid)
     assert np.array_equal(np.rint(imread(tmp_path / "floor_plan.png") * 255).astype(int), plan.image)
     assert f"resolution: {plan.resolution:g}" in (tmp_path / "floor_plan.yaml").read_text()

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.config import load_config
 from lslam.errors import UsageError
-from lslam.formats.ply_files import read_ply, write_ply
+from lslam.formats.ply_files import write_ply
+from lslam.formats.point_files import read_points
 from lslam.pipeline.check import check_config
 from lslam.pipeline.run import run
 from lslam.reports.text import summary
@@ -35,7 +36,7 @@ def test_a_run_saves_its_feature_map(method: str, tmp_path: Path) -> None:
     run(drive, load_config(None, [f"odometry.method={method}", *SETTINGS], {}), out=out)
     table = columns(out / "feature_map.ply")
     edges, planes = table[table[:, 3] == 1], table[table[:, 3] == 0]
-    assert len(edges) + len(planes) == len(table) == len(read_ply(out / "feature_map.ply").points)
+    assert len(edges) + len(planes) == len(table) == len(read_points(out / "feature_map.ply").points)
     assert len(planes) > len(edges) > 300
     for part in (edges, planes):
         assert len(np.unique(np.floor(part[:, :3]), axis=0)) > 0.9 * len(part)  # voxels of 1 m
