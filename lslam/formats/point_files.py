@@ -146,7 +146,7 @@ def read_array(path: Path) -> NDArray[Any]:
     """An array of points: structured and flat, or numbers (N, K). Raises InputError when it is something else."""
     try:
         with HEADERS, path.open("rb") as stream:
-            table = np.load(stream, allow_pickle=False)
+            table = np.lib.format.read_array(stream, allow_pickle=False)
     except (OSError, *MISFIT, EOFError, SyntaxError, MemoryError, TokenError) as error:
         raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None
     if table.dtype.names:
