@@ -105,18 +105,26 @@ def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], d
 
 
 def reading(function: F) -> F:
-    """--lidar-topic, --imu-topic, --gnss-topic and --extrinsics."""
+    """--lidar-topic, --lidar-frame, --imu-topic, --gnss-topic and --extrinsics."""
     function = click.option(
         "--extrinsics", metavar="T|FILE", help="The IMU in the LiDAR's frame: 12, 16 or 7 numbers, or a file with them."
     )(function)
-    for name, text in (("gnss", "satellite fixes"), ("imu", "the IMU"), ("lidar", "the scans")):
+    function = click.option(
+        "--lidar-frame",
+        metavar="NAME|all",
+        help="Of a bag: which LiDAR of a topic that several share; all merges them.",
+    )(function)
+    for name, text in (("gnss", "satellite fixes"), ("imu", "the IMU")):
         function = click.option(f"--{name}-topic", metavar="TOPIC", help=f"Of a bag: the topic of {text}.")(function)
-    return function
+    return click.option(
+        "--lidar-topic", multiple=True, metavar="TOPIC", callback=lambda context, option, topics: ",".join(topics) or None,
+        help="Of a bag: the topic of the scans; several LiDARs are merged into the sweeps of the first.",
+    )(function)  # fmt: skip
 
 
 def reading_of(given: dict[str, Any]) -> dict[str, Any]:
     """Arguments of `open_sequence` from the options of `reading`."""
-    return {name: given[name] for name in ("lidar_topic", "imu_topic", "gnss_topic", "extrinsics")}
+    return {name: given[name] for name in ("lidar_topic", "lidar_frame", "imu_topic", "gnss_topic", "extrinsics")}
 
 
 def manual(function: F) -> F:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.errors import InputError
 from lslam.odometry.sanity import FARTHEST_M
-from lslam.readers.selection import Ringed, with_rings
+from lslam.preprocessing.rings import RingRule
+from lslam.readers.selection import with_rings
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
@@ -120,7 +121,8 @@ def rings_rule(sequence: Sequence) -> tuple[str | None, str]:
         ringed = with_rings(sequence)
     except InputError as error:
         return None, f"no rings, which loam and lego-loam need (loam-livox does not), can be found: {error}"
-    return (ringed.rule.kind, str(ringed.rule)) if isinstance(ringed, Ringed) else (None, "")
+    rule: RingRule | None = getattr(ringed, "rule", None)
+    return (None, "") if rule is None else (rule.kind, str(rule))
 
 
 def _scan_facts(scan: Scan) -> Facts:

@@ -15,7 +15,7 @@ from lslam.doctor.examine_truth import examine_gaps, examine_jumps
 from lslam.doctor.examine_turns import examine_turns
 from lslam.doctor.examine_units import examine_units
 from lslam.doctor.findings import Facts, Finding
-from lslam.readers.bag import BagSequence
+from lslam.formats.bag_files import Bag
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -58,6 +58,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         notes.append("IMU: the sensor hardly turns in the first scans, so its clock and axes could not be checked")
     gnss = examine_gnss(sequence, findings)
     findings += [*examine_gaps(sequence), *examine_jumps(sequence.ground_truth)]
+    bag: Bag | None = getattr(sequence, "bag", None)
     follows = set().union(*(_FOLLOWS.get(f.code, set()) for f in units))
     findings = [f for f in findings if f.code not in follows]
     return {
@@ -66,7 +67,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         "path": str(sequence.path),
         "format": sequence.kind,
         "sensor": getattr(sequence, "sensor", None),
-        "bag": examine_bag(sequence.bag, sequence.uses) if isinstance(sequence, BagSequence) else None,
+        "bag": None if bag is None else examine_bag(bag, getattr(sequence, "uses", {})),
         "scans": n,
         "time": time,
         "points": points,

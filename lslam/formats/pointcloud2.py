@@ -49,8 +49,7 @@ def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
 
 def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path) -> tuple[PointCloud, int]:
     """Points of a Livox CustomMsg whose header ends at `start`, and its `timebase`, ns. Raises InputError when it is cut."""
-    origin = 0 if is_ros1 else 4  # numbers of CDR are aligned from behind its first four bytes
-    at = start if is_ros1 else origin + -(-(start - origin) // 8) * 8
+    at = _livox_body(start, is_ros1)
     try:
         timebase = int(np.frombuffer(data, f"{order}u8", 1, at)[0])
         count = int(np.frombuffer(data, f"{order}u4", 1, at + 16)[0])
@@ -65,6 +64,12 @@ def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path
     return _finite(cloud_from_fields(where, columns)), timebase
 
 
+def livox_id(data: bytes, start: int, is_ros1: bool) -> int | None:
+    """Which LiDAR a Livox CustomMsg is of, whose header ends at `start`; None when it is cut off before that."""
+    at = _livox_body(start, is_ros1) + 12
+    return data[at] if at < len(data) else None
+
+
 def encode_fields(columns: Mapping[str, NDArray[Any]]) -> tuple[list[tuple[str, int, int]], int, NDArray[np.uint8]]:
     """Fields as (name, offset, type code), bytes per point and the data of a PointCloud2 with these columns, packed."""
     dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
@@ -74,6 +79,11 @@ def encode_fields(columns: Mapping[str, NDArray[Any]]) -> tuple[list[tuple[str, 
     assert dtype.fields is not None
     fields = [(name, int(dtype.fields[name][1]), _CODES[values.dtype]) for name, values in columns.items()]
     return fields, dtype.itemsize, table.view(np.uint8).reshape(-1)
+
+
+def _livox_body(start: int, is_ros1: bool) -> int:
+    """Where the numbers of a CustomMsg begin; those of CDR are aligned from behind its first four bytes."""
+    return start if is_ros1 else 4 + -(-(start - 4) // 8) * 8
 
 
 def _dtype(message: Any, where: Path) -> np.dtype[Any]:

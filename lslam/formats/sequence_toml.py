@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -44,8 +44,10 @@ class SequenceInfo:
     point_unit : of the coordinates of points, one of `LENGTHS`
     stamps, imu, gnss, ground_truth : files, relative to the sequence folder
     ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
-    lidar_topic, imu_topic, gnss_topic : which topics of a bag are read
+    lidar_topic, imu_topic, gnss_topic : which topics of a bag are read; lidar_frame : which of the LiDARs that share one, by
+        the frame of their messages, or `all`; several have commas between them and are merged, the first one leads
     T_cam0_lidar, T_lidar_imu, T_lidar_gnss : (4, 4) extrinsics, written in the table `[extrinsics]`
+    lidars : further LiDARs and where they sit, T_lidar_other (4, 4) by folder, or by frame or topic of a bag
     """
 
     name: str | None = None
@@ -68,11 +70,13 @@ class SequenceInfo:
     ground_truth: str | None = None
     ground_truth_frame: str | None = None
     lidar_topic: str | None = None
+    lidar_frame: str | None = None
     imu_topic: str | None = None
     gnss_topic: str | None = None
     T_cam0_lidar: Matrix | None = None
     T_lidar_imu: Matrix | None = None
     T_lidar_gnss: Matrix | None = None
+    lidars: Mapping[str, Matrix] | None = None
 
     def over(self, other: SequenceInfo) -> SequenceInfo:
         """What this says, and what `other` says where this is silent."""
@@ -98,18 +102,24 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
         tree = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} cannot be read as TOML: {error}") from None
-    extrinsics = tree.pop("extrinsics", {})
+    extrinsics, lidars = tree.pop("extrinsics", {}), tree.pop("lidars", {})
     if not isinstance(extrinsics, dict):
         raise InputError(f"{path}: extrinsics is a table, write [extrinsics] and below it T_lidar_imu = [...]")
+    if not isinstance(lidars, dict):
+        raise InputError(
+            f'{path}: lidars is a table, write [lidars] and below it "FOLDER" = [T_lidar_other, 12 numbers]'
+        )
     values: dict[str, Any] = {}
     for key, value in tree.items():
         if key not in _CHECKS:
-            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_CHECKS, 'extrinsics'])}")
+            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_CHECKS, 'extrinsics', 'lidars'])}")
         values[key] = _checked(path, key, value)
     for key, value in extrinsics.items():
         if key not in EXTRINSICS:
             raise InputError(f"{path}: unknown key extrinsics.{key}; {nearest(key, EXTRINSICS)}")
-        values[key] = _transform(path, key, value)
+        values[key] = _transform(path, f"extrinsics.{key}", value)
+    if lidars:
+        values["lidars"] = {name: _transform(path, f"lidars.{name}", T) for name, T in lidars.items()}
     if (values.get("rows") is None) != (values.get("cols") is None):
         raise InputError(f"{path}: rows and cols of organised clouds go together, one of them is missing")
     return SequenceInfo(**values)
@@ -122,12 +132,14 @@ def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
 
 def sequence_toml_text(info: SequenceInfo) -> str:
     """`info` as TOML, without what is None."""
-    tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in EXTRINSICS}
+    tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, "lidars")}
     tree = {key: value for key, value in tree.items() if value is not None}
     known = {key: getattr(info, key) for key in EXTRINSICS}
     matrices = {key: np.asarray(T, np.float64).tolist() for key, T in known.items() if T is not None}
     if matrices:
         tree["extrinsics"] = matrices
+    if info.lidars:
+        tree["lidars"] = {name: np.asarray(T, np.float64).tolist() for name, T in info.lidars.items()}
     return toml_text(tree)
 
 
@@ -168,6 +180,7 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "gnss": (_is_text, "a file"),
     "ground_truth": (_is_text, "a file"),
     "lidar_topic": (_is_text, "a topic"),
+    "lidar_frame": (_is_text, "a frame, or all"),
     "imu_topic": (_is_text, "a topic"),
     "gnss_topic": (_is_text, "a topic"),
     "ground_truth_frame": (lambda v: v in FRAMES, "one of " + ", ".join(FRAMES)),
@@ -188,9 +201,9 @@ def _transform(path: Path | str, key: str, value: Any) -> Matrix:
     except (TypeError, ValueError):
         numbers = np.zeros(0)
     if len(numbers) not in (12, 16):
-        raise InputError(f"{path}: extrinsics.{key} needs 3x4 or 4x4 numbers, row by row")
+        raise InputError(f"{path}: {key} needs 3x4 or 4x4 numbers, row by row")
     T = np.eye(4)
     T[:3] = numbers[:12].reshape(3, 4)
     if not np.isfinite(numbers).all() or not so3.is_rotation(T[:3, :3], 1e-3):
-        raise InputError(f"{path}: extrinsics.{key} is no rigid transform: its left 3x3 block is not a rotation")
+        raise InputError(f"{path}: {key} is no rigid transform: its left 3x3 block is not a rotation")
     return T

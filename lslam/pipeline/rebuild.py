@@ -80,9 +80,9 @@ class EarlierRun:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Which topics of a bag were asked for; extrinsics are of no use to a map."""
+        """Which topics and LiDARs of a bag were asked for; extrinsics are of no use to a map."""
         reading = self.manifest.get("sequence", {}).get("reading", {})
-        return {name: str(text) for name, text in reading.items() if name.endswith("_topic")}
+        return {name: str(text) for name, text in reading.items() if name.endswith(("_topic", "_frame"))}
 
     @property
     def world(self) -> str:

@@ -41,6 +41,7 @@ def open_sequence(
     motion_compensated: bool | None = None,
     vertical_correction_deg: float | None = None,
     lidar_topic: str | None = None,
+    lidar_frame: str | None = None,
     imu_topic: str | None = None,
     gnss_topic: str | None = None,
     extrinsics: str | None = None,
@@ -57,6 +58,7 @@ def open_sequence(
     motion_compensated : whether scans are free of motion distortion
     vertical_correction_deg : rotation of every point about p x z; None leaves it to the reader
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read, where it has several
+    lidar_frame : which of the LiDARs that share a topic, by the frame of their messages, or `all`
     extrinsics : T_lidar_imu, as numbers or a file (see `transform_text`)
         What is given wins over `sequence.toml`, which wins over what the layout implies.
     imu, gnss : the stream is asked for: where the recording has none it is sought, as in the raw drive of a KITTI sequence
@@ -87,6 +89,7 @@ def open_sequence(
         vertical_correction_deg=vertical_correction_deg,
         T_lidar_imu=None if extrinsics is None else read_transform(extrinsics),
         lidar_topic=lidar_topic,
+        lidar_frame=lidar_frame,
         imu_topic=imu_topic,
         gnss_topic=gnss_topic,
     )
@@ -96,11 +99,18 @@ def open_sequence(
         raise _unreadable(name_or_path, error) from None
     from lslam.readers.raw_drive import with_streams
 
-    flags = {"--lidar-topic": lidar_topic, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic}
-    given = [flag for flag, topic in flags.items() if topic is not None]
+    flags = {
+        "--lidar-topic": lidar_topic, "--lidar-frame": lidar_frame, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic,
+    }  # fmt: skip
+    given = [flag for flag, name in flags.items() if name is not None]
     if given and sequence.kind != "bag":
         raise UsageError(f"{', '.join(given)} is for bags: {folder} is {sequence.kind}")
-    return with_streams(sequence, imu, gnss, data_root)
+    sequence = with_streams(sequence, imu, gnss, data_root)
+    if sequence.kind == "bag":
+        return sequence
+    from lslam.readers.merged_lidars import with_folders
+
+    return with_folders(sequence, overrides, lambda path: _open(path, SequenceInfo()))
 
 
 def _unreadable(name_or_path: str | Path, error: OSError) -> InputError:

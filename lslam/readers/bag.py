@@ -21,7 +21,8 @@ from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_
 from lslam.geometry import se3
 from lslam.printable import printable
 from lslam.readers.bag_halves import Halves, read_whole
-from lslam.readers.bag_links import Links
+from lslam.readers.bag_lidars import UNNAMED, ScanIndex
+from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
     check_parts,
@@ -34,13 +35,14 @@ from lslam.readers.bag_topics import (
 )
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
+from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_times import TimeRule, apply_rule, rule_of_scans
 from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans, no_shared_time
+from lslam.types.sequence import Calibration, Scans, Sequence, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
@@ -115,6 +117,10 @@ class BagSequence(Scans):
         return read_whole(self.bag, self.topic, int(self.messages[index]), self.halves)
 
 
+# One LiDAR of a bag: which messages, its scans, and what its packets tell where it has any.
+_Lidar = tuple[ScanIndex, BagSequence, Opened | None]
+
+
 def locate(path: Path) -> tuple[Path, str] | None:
     """The bag at or in `path` and why it is one; None when there is none, or when it lies in one of KITTI's layouts."""
     if path.is_dir() and any((path / name).is_dir() for name in _LAYOUTS):
@@ -138,18 +144,21 @@ def _others(path: Path) -> str:
     return f"; by {'its name' if is_one else 'their names'} {shown} {are} of it: a folder of its parts is read as one"
 
 
-def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
-    """Open the bag file, or the folder of them, at `path`.
+def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
+    """Open the bag file, or the folder of them, at `path`; several LiDARs that are asked for become one sequence.
 
-    Raises InputError when it is unreadable or holds no clouds, UsageError for topics that are ambiguous or do not exist.
+    Raises InputError when it is unreadable, holds no clouds, or does not say where a LiDAR to be merged sits, UsageError for
+    topics that are ambiguous or do not exist.
     """
     bag = open_bag(path)
     info = _info(path, bag, overrides)
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info), *bag.notes], list(bag.losses))
-    topic = choose_clouds(bag, info.lidar_topic, voice)
-    voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
-    check_parts(bag, topic)
-    sequence, frame, opened = _scans_of(bag, topic, info, voice)
+    lidars: list[_Lidar] = []
+    for topic in choose_clouds(bag, info.lidar_topic, voice):
+        voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
+        check_parts(bag, topic)
+        lidars += _lidars_of(bag, topic, info, voice, bool(lidars))
+    (leading, sequence, opened), frame = lidars[0], lidars[0][0].frame
     stamps, own = sequence.stamps_ns, opened if info.imu_topic is None else None
     imu = load_imu(bag, info.imu_topic, voice) if own is None or own.imu is None else None
     gnss = load_fixes(bag, info.gnss_topic, voice)
@@ -167,30 +176,53 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> BagSequence:
         sequence.imu = own.imu
         T_lidar_imu = own.T_lidar_imu if info.T_lidar_imu is None else info.T_lidar_imu
         sequence.calibration = replace(sequence.calibration, T_lidar_imu=T_lidar_imu)
-    sequence.uses = _uses(sequence, imu, gnss, links)
-    return sequence
+    places = places_of([index for index, _, _ in lidars], links, info.lidars)
+    sequence.uses = _uses(sequence, imu, gnss, links) | {index.topic.name: "scans" for index, _, _ in lidars}
+    if not places:
+        return sequence
+    voice.notes.append(f"scans are the sweeps of {leading}, the leading one of {len(lidars)} LiDARs")
+    others = [
+        FurtherLidar(str(index), scans, *place) for (index, scans, _), place in zip(lidars[1:], places, strict=True)
+    ]
+    return MergedLidars(sequence, others)
 
 
-def _scans_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice) -> tuple[BagSequence, str, Opened | None]:
-    """The scans of a topic, the frame of their points and, where it holds packets, what else these tell."""
-    name, opened = info.name or printable(stem_of(bag.path)), None
-    halves: Halves = {}
+def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_leading: bool) -> list[_Lidar]:
+    """The LiDARs of a topic that are read; what `info` says of the sensor is said of the leading one."""
     if is_decoded(topic):
         opened, frame = open_packets(bag, topic, voice)
         stamps = opened.revolutions.stamps_ns
-        messages = np.arange(len(stamps))
-        rate, rings, sensor = opened.rate_hz, opened.rings, opened.sensor
+        index = ScanIndex(topic, frame or UNNAMED, frame, np.arange(len(stamps)), stamps, {})
+        found: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
     else:
-        messages, stamps, frame, halves = index_scans(bag, topic, voice)
-        rate, rings, sensor = measured_rate(stamps), None, None
+        found = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]
+    others = replace(info, rate_hz=None, rings=None, sensor=None)
+    return [
+        (index, _scans_of(bag, index, opened, others, Voice([], [])), opened)
+        if k or has_leading
+        else (index, _scans_of(bag, index, opened, info, voice), opened)
+        for k, (index, opened) in enumerate(found)
+    ]
+
+
+def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceInfo, voice: Voice) -> BagSequence:
+    """The scans of one LiDAR, of packets that are `opened` or of messages, without what rides along."""
     sequence = BagSequence(
-        name, bag.path, bag, topic, messages, stamps, stamps, info.rate_hz or rate,
-        motion_compensated=info.motion_compensated, rings=info.rings or rings, sensor=info.sensor or sensor,
-        notes=voice.notes, problems=voice.problems, halves=halves, revolutions=None if opened is None else opened.revolutions,
+        info.name or printable(stem_of(bag.path)), bag.path, bag, index.topic, index.messages, index.stamps_ns, index.stamps_ns,
+        info.rate_hz or (measured_rate(index.stamps_ns) if opened is None else opened.rate_hz),
+        motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
+        notes=voice.notes, problems=voice.problems, halves=index.halves,
     )  # fmt: skip
-    if opened is None and not info.motion_compensated:
+    if opened is not None:
+        return replace(
+            sequence,
+            rings=info.rings or opened.rings,
+            sensor=info.sensor or opened.sensor,
+            revolutions=opened.revolutions,
+        )
+    if not info.motion_compensated:
         _decide_times(sequence, info)
-    return sequence, frame, opened
+    return sequence
 
 
 def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:
@@ -204,7 +236,7 @@ def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links:
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None:
             uses[stream.topic] = what
-    return uses | {sequence.topic.name: "scans"}
+    return uses
 
 
 def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.errors import InputError
 from lslam.formats.bag_files import Bag
 from lslam.formats.bag_streams import Transforms, chain, is_static, read_transforms
 from lslam.geometry import se3, so3
+from lslam.readers.bag_lidars import UNNAMED, ScanIndex
 from lslam.readers.bag_topics import say_broken
 from lslam.readers.ground_truth import Voice
 
@@ -95,6 +98,41 @@ class Links:
                     found.setdefault(pair, []).append(poses)
                 say_broken(broken, topic.name, self.voice)
         return {pair: np.concatenate(pieces) for pair, pieces in found.items()}
+
+
+def places_of(
+    lidars: Sequence[ScanIndex], links: Links, stated: Mapping[str, Floats] | None
+) -> list[tuple[Floats, str]]:
+    """`T_leading_other` (4, 4) of each of the LiDARs behind the first, which leads, and what says so.
+
+    stated : `T_lidar_other` by frame or topic. The only LiDAR that it does not name is the one that it is about.
+
+    Raises InputError for a LiDAR whose place nothing says: clouds of one frame may be in it already, or their drivers do not
+    know better.
+    """
+    known = {} if stated is None else stated
+    named = [next((known[key] for key in (one.name, one.topic.name) if key in known), None) for one in lidars]
+    if known and sum(T is None for T in named) == 1:
+        named = [np.eye(4) if T is None else T for T in named]
+    leading, T_lidar_leading = lidars[0], named[0]
+    places = []
+    for other, T_lidar_other in zip(lidars[1:], named[1:], strict=True):
+        is_same = other.frame == leading.frame
+        place = None if is_same else links.find(leading.frame, other.frame)
+        if T_lidar_other is not None:
+            T = T_lidar_other if T_lidar_leading is None else se3.inverse(T_lidar_leading) @ T_lidar_other
+            place = T, "as stated"
+        if place is None:
+            why = (
+                f"both are of frame {other.frame or UNNAMED}" if is_same else links.why_not(leading.frame, other.frame)
+            )
+            raise InputError(
+                f"{links.bag.path}: {other} cannot be merged with {leading}, {why}: state T_lidar_other, 12 numbers, in "
+                f'sequence.toml, [lidars] "{other.topic.name if is_same else other.name}" = [1, 0, 0, x, ...], or take one '
+                "LiDAR with --lidar-topic or --lidar-frame"
+            )
+        places.append(place)
+    return places
 
 
 def _spread(poses: Floats) -> tuple[float, float]:

@@ -16,8 +16,10 @@ from lslam.formats.bag_listing import missing_parts
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.formats.packet_makers import is_packets, maker_by_name, not_decoded
 from lslam.formats.packet_messages import packet_topics
+from lslam.formats.pointcloud2 import livox_id
 from lslam.formats.pose_rows import seconds_text
-from lslam.readers.bag_halves import Halves, find_halves
+from lslam.readers.bag_halves import find_halves
+from lslam.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
 from lslam.readers.clocks import Clock, agree, stands_still
 from lslam.readers.ground_truth import Voice
 
@@ -32,23 +34,27 @@ _SAID = 3  # damaged messages that are named one by one
 Stamps = NDArray[np.int64]
 
 
-def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> BagTopic:
-    """The topic `wanted`, or the only one with clouds; where there are none, the only one with packets that are decoded.
+def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> list[BagTopic]:
+    """The topics `wanted`, or the only one with clouds; where there are none, the only one with packets that are decoded.
 
-    Raises UsageError listing the flags when there are several or `wanted` is not among them, InputError when there is none.
+    wanted : names with commas between them
+
+    Raises UsageError listing the flags when there are several or one of `wanted` is not there, InputError when there is none.
     """
     clouds, packets = bag.of_type(*CLOUDS), packet_topics(bag)
     if wanted is not None:
-        return _named(bag, clouds + packets, wanted, "--lidar-topic", "clouds")
+        names = dict.fromkeys(name.strip() for name in wanted.split(","))
+        return [_named(bag, clouds + packets, name, "--lidar-topic", "clouds") for name in names]
     if clouds and packets:
-        names = ", ".join(t.name for t in packets)
-        voice.notes.append(f"raw packets on {names} are left out, for there are clouds; --lidar-topic reads them")
+        left_out = ", ".join(t.name for t in packets)
+        voice.notes.append(f"raw packets on {left_out} are left out, for there are clouds; --lidar-topic reads them")
     clouds = clouds or packets
     if len(clouds) == 1:
-        return clouds[0]
+        return clouds
     if clouds:
         raise UsageError(
-            f"{bag.path} has clouds on {len(clouds)} topics, choose one:\n{_flags(clouds, '--lidar-topic')}"
+            f"{bag.path} has clouds on {len(clouds)} topics, choose one, or several LiDARs to merge:\n"
+            f"{_flags(clouds, '--lidar-topic')}"
         )
     raw = [t for t in bag.topics if len(t) and is_packets(t.type)]
     nameless = [t for t in bag.topics if len(t) and not t.type]
@@ -108,33 +114,45 @@ def why_no_fixes(bag: Bag) -> LslamError:
     return _why_none(bag, "GNSS", "--gnss-topic", "NavSatFix", "--gnss and --georeference")
 
 
-def index_scans(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Stamps, Stamps, str, Halves]:
-    """Which messages are scans, (N,), their header stamps, (N,) ns increasing, the frame of the first, and `find_halves`.
+def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> list[ScanIndex]:
+    """The scans of each LiDAR of `topic` that is read, see `choose_lidars`; their stamps increase.
 
-    Only headers are read, where stamps do not repeat. Raises InputError when not a single one can be.
+    Only headers are read, where stamps do not repeat. Raises InputError when not a single one can be, UsageError for a LiDAR
+    that is not there.
     """
     kept, stamps, broken = [], [], []
     frames: list[str] = []
+    ids: list[int | None] = []
     bag.expect(topic, is_head=True)
     for k in range(len(topic)):
         try:
-            header = read_header(topic, bag.message(topic, k, _HEADER))
+            data = bag.message(topic, k, _HEADER)
+            header = read_header(topic, data)
         except InputError as error:
             broken.append(str(error))
             continue
         kept.append(k)
         stamps.append(header.stamp_ns)
         frames.append(header.frame)
+        ids.append(livox_id(data, header.end, topic.encoding == "ros1") if topic.type.endswith("CustomMsg") else None)
     say_broken(broken, topic.name, voice)
     if not kept:
         way_out = "; where its index is wrong `rosbag reindex` mends it" if topic.encoding == "ros1" else ""
         raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read{way_out}")
+    recorded = np.array(bag.recorded_ns(topic), np.int64)[kept]
     messages, headers = np.array(kept, np.int64), np.array(stamps, np.int64)
-    halves = find_halves(bag, topic, messages, headers, frames, voice)
-    is_scan = ~np.isin(messages, [k for others in halves.values() for k in others])
-    messages, recorded = messages[is_scan], np.array(bag.recorded_ns(topic), np.int64)[kept][is_scan]
-    order, ordered = put_in_order(headers[is_scan], recorded, f"{topic.name}: scans", voice)
-    return messages[order], ordered, next(filter(None, frames), ""), halves
+    names = name_lidars(frames, ids)
+    chosen = choose_lidars(topic, names, wanted, voice)
+    indices = []
+    for name, mine in chosen:
+        its = [names[k] for k in np.flatnonzero(mine)]
+        halves = find_halves(bag, topic, messages[mine], headers[mine], its, voice)
+        own = mine & ~np.isin(messages, [k for others in halves.values() for k in others])
+        what = f"{topic.name}: scans" if len(chosen) == 1 else f"{topic.name}: scans of {name}"
+        order, ordered = put_in_order(headers[own], recorded[own], what, voice)
+        frame = next((frames[k] for k in np.flatnonzero(mine) if frames[k]), "")
+        indices.append(ScanIndex(topic, name, frame, messages[own][order], ordered, halves))
+    return indices
 
 
 def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.formats.bag_files import Bag
 from lslam.formats.calibration_files import read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.stamp_files import read_stamps
-from lslam.readers.bag import BagSequence
 from lslam.readers.bag_topics import why_no_fixes, why_no_imu
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND
@@ -57,8 +57,9 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """
     if sequence.imu is not None:
         return sequence
-    if isinstance(sequence, BagSequence):
-        raise why_no_imu(sequence.bag)
+    bag: Bag | None = getattr(sequence, "bag", None)
+    if bag is not None:
+        raise why_no_imu(bag)
     number = sequence.path.name
     if not isinstance(sequence, FolderSequence):
         raise InputError(
@@ -79,8 +80,9 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """
     if sequence.gnss is not None:
         return sequence
-    if isinstance(sequence, BagSequence):
-        raise why_no_fixes(sequence.bag)
+    bag: Bag | None = getattr(sequence, "bag", None)
+    if bag is not None:
+        raise why_no_fixes(bag)
     number = sequence.path.name
     if not isinstance(sequence, FolderSequence):
         return sequence

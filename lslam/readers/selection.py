@@ -36,6 +36,10 @@ class SequenceView(Scans):
         """Scan `index` of the whole. Raises InputError as it does."""
         return self.whole.scan(index)
 
+    def ringed(self, wanted: str) -> Sequence:
+        """This view with rings, see `with_rings`."""
+        return _ringed(self, wanted)
+
 
 class Selection(SequenceView):
     """Every `step`-th scan of a sequence; scans keep their index of the recording, all else is the sequence's own."""
@@ -90,6 +94,10 @@ def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:
     The first scans of the recording decide, whatever part of it is used, so that a run that is resumed decides alike.
     Raises InputError naming --rings when there are no rings to be found.
     """
+    return sequence.ringed(wanted) if isinstance(sequence, SequenceView) else _ringed(sequence, wanted)
+
+
+def _ringed(sequence: Sequence, wanted: str) -> Sequence:
     scans = _first_scans(sequence)
     if not scans:
         return sequence  # nothing can be read, which is said in its turn

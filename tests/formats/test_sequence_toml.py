@@ -16,9 +16,9 @@ FULL = SequenceInfo(
     name="block", sensor="OS1-32", rings=32, rows=32, cols=1024, rate_hz=10.0, motion_compensated=False,
     compensated_to="scan_start", vertical_correction_deg=0.0, per_point="per_point", stamps="times.txt", imu="imu.csv",
     gnss="gnss.csv", ground_truth="gt.tum", ground_truth_frame="lidar", point_time_unit="us", point_time_reference="end",
-    lidar_topic="/points", imu_topic="/imu", gnss_topic="/fix",
+    lidar_topic="/points", lidar_frame="all", imu_topic="/imu", gnss_topic="/fix",
     T_cam0_lidar=se3.exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])), T_lidar_imu=se3.exp(np.array([0, 0, 0.1, 0, 0, 3.0])),
-    T_lidar_gnss=np.eye(4),
+    T_lidar_gnss=np.eye(4), lidars={"../rear": se3.exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])), "top": np.eye(4)},
 )  # fmt: skip
 
 
@@ -31,11 +31,17 @@ def test_round_trip(info: SequenceInfo, tmp_path: Path) -> None:
         mine, theirs = getattr(info, field.name), getattr(back, field.name)
         if field.name in EXTRINSICS and mine is not None:
             np.testing.assert_array_equal(mine, theirs)
+        elif field.name == "lidars" and mine is not None:
+            assert list(mine) == list(theirs)
+            for name, T in mine.items():
+                np.testing.assert_array_equal(T, theirs[name])
         else:
             assert mine == theirs, field.name
 
 
 BAD = {
+    "lidars = 'rear'": "lidars is a table",
+    "[lidars]\n'../rear' = [1, 2, 3]": "lidars.../rear needs 3x4 or 4x4 numbers",
     "sensr = 'VLP-16'": "did you mean 'sensor'?",
     "rate_hz = 0": "rate_hz = 0, expected a number above 0",
     "rate_hz = nan": "rate_hz",
