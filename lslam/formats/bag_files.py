@@ -167,10 +167,14 @@ class Bag:
 
     def messages(self, topic: BagTopic, broken: list[str]) -> Iterator[bytes]:
         """All messages of `topic`; of those that are damaged the reason goes to `broken`."""
+        return (data for _, data in self.numbered(topic, broken))
+
+    def numbered(self, topic: BagTopic, broken: list[str]) -> Iterator[tuple[int, bytes]]:
+        """As `messages`, each with its number."""
         self.expect(topic)
         for k in range(len(topic)):
             try:
-                yield self.message(topic, k)
+                yield k, self.message(topic, k)
             except InputError as error:
                 broken.append(str(error))
 

@@ -23,12 +23,16 @@ _LARGEST = 1e9  # m, no pose on this planet; NaN is not less either
 
 @dataclass(frozen=True)
 class Stream:
-    """Stamped rows of one topic: stamps_ns (N,) int64 of the headers, values (N, K) float64, frame of the first, its name."""
+    """Stamped rows of one topic: stamps_ns (N,) int64 of the headers, values (N, K) float64, frame of the first, its name.
+
+    recorded_ns : (N,) int64, when the messages were recorded
+    """
 
     stamps_ns: NDArray[np.int64]
     values: Floats
     frame: str
     topic: str
+    recorded_ns: NDArray[np.int64]
 
 
 def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
@@ -37,9 +41,10 @@ def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
     Messages that are damaged are left out, the reasons go to `broken`.
     """
     stamps: list[int] = []
+    kept: list[int] = []
     rows: list[bytes] = []
     frame, order = "", "<"
-    for data in bag.messages(topic, broken):
+    for k, data in bag.numbered(topic, broken):
         try:
             header = read_header(topic, data)
         except InputError as error:
@@ -50,10 +55,11 @@ def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
             broken.append(f"{bag.path}: a message of {topic.name} has {len(data)} bytes, too few for an Imu")
             continue
         frame, order = frame or header.frame, header.order
+        kept.append(k)
         stamps.append(header.stamp_ns)
         rows.append(data[at + _ACCEL : at + _ACCEL + 24] + data[at + _GYRO : at + _GYRO + 24])
     values = np.frombuffer(b"".join(rows), f"{order}f8").reshape(-1, 6).astype(np.float64)
-    return Stream(np.array(stamps, np.int64), values, frame, topic.name)
+    return Stream(np.array(stamps, np.int64), values, frame, topic.name, recorded_ns(bag, topic, kept))
 
 
 def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
@@ -62,9 +68,10 @@ def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
     Without a fix (status below 0, NaN) a message is left out.
     """
     stamps: list[int] = []
+    kept: list[int] = []
     rows: list[list[float]] = []
     frame = ""
-    for data in bag.messages(topic, broken):
+    for k, data in bag.numbered(topic, broken):
         try:
             fix = bag.decode(topic, data)
         except InputError as error:
@@ -76,17 +83,25 @@ def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
         frame = frame or fix.header.frame_id.lstrip("/")
         variance = (float(fix.position_covariance[0]) + float(fix.position_covariance[4])) / 2
         is_known = fix.position_covariance_type > 0 and variance >= 0
+        kept.append(k)
         stamps.append(stamp_of(fix))
         rows.append([*position, float(np.sqrt(variance)) if is_known else np.nan])
-    return Stream(np.array(stamps, np.int64), np.array(rows, np.float64).reshape(-1, 4), frame, topic.name)
+    return Stream(
+        np.array(stamps, np.int64),
+        np.array(rows, np.float64).reshape(-1, 4),
+        frame,
+        topic.name,
+        recorded_ns(bag, topic, kept),
+    )
 
 
-def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> tuple[NDArray[np.int64], Floats, str]:
-    """Stamps (N,), poses (N, 4, 4) T_world_body and the body's frame of an Odometry or PoseStamped topic."""
+def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
+    """Poses T_world_body (N, 4, 4) of an Odometry or PoseStamped topic; its frame is that of the body."""
     stamps: list[int] = []
+    kept: list[int] = []
     rows: list[list[float]] = []
     body = ""
-    for data in bag.messages(topic, broken):
+    for k, data in bag.numbered(topic, broken):
         try:
             message = bag.decode(topic, data)
             pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
@@ -95,9 +110,15 @@ def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> tuple[NDArray[np
             broken.append(str(error))
             continue
         body = body or getattr(message, "child_frame_id", "").lstrip("/")
+        kept.append(k)
         stamps.append(stamp_of(message))
         rows.append(row)
-    return np.array(stamps, np.int64), _poses(rows), body
+    return Stream(np.array(stamps, np.int64), _poses(rows), body, topic.name, recorded_ns(bag, topic, kept))
+
+
+def recorded_ns(bag: Bag, topic: BagTopic, messages: list[int]) -> NDArray[np.int64]:
+    """When `messages` (N,) of a topic were recorded, ns."""
+    return np.array(bag.recorded_ns(topic), np.int64)[messages]
 
 
 def is_static(topic: BagTopic) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import bag_streams
-from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag
+from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
 from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
@@ -25,6 +25,7 @@ from lslam.readers.bag_lidars import UNNAMED, ScanIndex
 from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
+    HEADER,
     check_parts,
     choose_clouds,
     index_scans,
@@ -37,6 +38,7 @@ from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
 from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
+from lslam.readers.point_stamps import point_stamps
 from lslam.readers.point_times import TimeRule, apply_rule, rule_of_scans
 from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
@@ -48,6 +50,7 @@ from lslam.types.trajectory import Trajectory
 KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
 _LOOKED_AT = 5
+_OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 _SAID_NS = 1000  # shorter shifts are what absolute seconds are rounded by
 CAMERA = "cam0"
 # Odometry in a bag is somebody's estimate, unless its name says that it is the truth.
@@ -220,9 +223,28 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
             sensor=info.sensor or opened.sensor,
             revolutions=opened.revolutions,
         )
+    _stamp_by_points(sequence)
     if not info.motion_compensated:
         _decide_times(sequence, info)
     return sequence
+
+
+def _stamp_by_points(sequence: BagSequence) -> None:
+    """Where the headers stand still, the absolute times of the points are better stamps than the times of recording."""
+    bag, topic, messages = sequence.bag, sequence.topic, sequence.messages.tolist()
+    headers = {read_header(topic, bag.message(topic, k, HEADER)).stamp_ns for k in (messages[0], messages[-1])}
+    if len(messages) < 2 or len(headers) > 1:
+        return
+    points = point_stamps(len(messages), lambda index: sequence.cloud(index)[0])
+    if points is None:
+        return
+    # A clock of another epoch is brought onto that of the recording, by the scan that was recorded with the least delay.
+    ahead = int((points.stamps_ns - sequence.headers_ns).max())
+    is_other = abs(ahead) > _OTHER_EPOCH_NS
+    sequence.headers_ns = points.stamps_ns - (ahead if is_other else 0)
+    sequence.stamps_ns = sequence.headers_ns
+    how = f", {-ahead * 1e-9:+.3f} s to the clock of the recording" if is_other else ""
+    sequence.notes.append(f"scan stamps from the absolute times of the points, field {points.field!r}{how}")
 
 
 def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:
@@ -327,12 +349,12 @@ def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory |
         others = ", ".join(t.name for t in topics[1:])
         voice.notes.append(f"ground truth from {topic.name}, the first of {len(topics)}: {others} left out")
     broken: list[str] = []
-    stamps, poses, body = read_poses(bag, topic, broken)
+    stream = read_poses(bag, topic, broken)
     say_broken(broken, topic.name, voice)
-    order, stamps = put_in_order(stamps, np.zeros(len(stamps), np.int64), f"{topic.name}: poses", voice)
+    order, stamps = put_in_order(stream.stamps_ns, stream.recorded_ns, f"{topic.name}: poses", voice)
     if not len(order):
         return None
-    poses = poses[order]
+    poses, body = stream.values[order], stream.frame
     rigid = links.find(body, lidar)
     if rigid is None:
         voice.problems.append(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,11 +21,11 @@ from lslam.formats.pointcloud2 import livox_id
 from lslam.formats.pose_rows import seconds_text
 from lslam.readers.bag_halves import find_halves
 from lslam.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
-from lslam.readers.clocks import Clock, agree, stands_still
+from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, stands_still
 from lslam.readers.ground_truth import Voice
 
 CLOUDS = ("PointCloud2", "CustomMsg")
-_HEADER = 512  # bytes of a message that hold its header
+HEADER = 512  # bytes of a message that hold its header
 _LATE_NS = 10**9  # stamps that go back further are no jitter, nor by more than so many messages
 _LATE_STEPS = 10
 _CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
@@ -126,7 +127,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     bag.expect(topic, is_head=True)
     for k in range(len(topic)):
         try:
-            data = bag.message(topic, k, _HEADER)
+            data = bag.message(topic, k, HEADER)
             header = read_header(topic, data)
         except InputError as error:
             broken.append(str(error))
@@ -143,16 +144,34 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     messages, headers = np.array(kept, np.int64), np.array(stamps, np.int64)
     names = name_lidars(frames, ids)
     chosen = choose_lidars(topic, names, wanted, voice)
+    is_own = _no_copies(headers, lambda i: bag.message(topic, kept[i]), f"{topic.name}: scans", voice)
     indices = []
     for name, mine in chosen:
         its = [names[k] for k in np.flatnonzero(mine)]
         halves = find_halves(bag, topic, messages[mine], headers[mine], its, voice)
-        own = mine & ~np.isin(messages, [k for others in halves.values() for k in others])
+        own = mine & is_own & ~np.isin(messages, [k for others in halves.values() for k in others])
         what = f"{topic.name}: scans" if len(chosen) == 1 else f"{topic.name}: scans of {name}"
         order, ordered = put_in_order(headers[own], recorded[own], what, voice)
         frame = next((frames[k] for k in np.flatnonzero(mine) if frames[k]), "")
         indices.append(ScanIndex(topic, name, frame, messages[own][order], ordered, halves))
     return indices
+
+
+def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice: Voice) -> NDArray[np.bool_]:
+    """Which messages (N,) are no copies of earlier ones, as of a recording that was played in a loop; said in `voice`."""
+    own = np.ones(len(stamps), bool)
+    _, first, again = np.unique(stamps, return_index=True, return_inverse=True)
+    repeats = np.flatnonzero(first[again] < np.arange(len(stamps)) - 1)
+    if len(first) <= len(stamps) / MESSAGES_PER_STAMP:
+        return own  # of a clock that stands still
+    for i in repeats.tolist():
+        with suppress(InputError):
+            own[i] = content(i) != content(int(first[again[i]]))
+    if not own.all():
+        voice.problems.append(
+            f"{what}: {int((~own).sum())} messages, message {int(np.argmin(own))} the first, are copies of earlier ones: left out"
+        )
+    return own
 
 
 def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
@@ -253,12 +272,11 @@ def _load(
     if not len(stream.stamps_ns):
         voice.problems.append(f"{what}: {topic.name} holds {len(topic)} messages and none that can be used")
         return None
-    recorded = np.array(bag.recorded_ns(topic), np.int64)
-    # Where messages were left out, it is not known which: no time of recording stands in then.
-    recorded = recorded if len(recorded) == len(stream.stamps_ns) else np.zeros(len(stream.stamps_ns), np.int64)
-    order, stamps = put_in_order(stream.stamps_ns, recorded, f"{what}: samples", voice)
+    own = _no_copies(stream.stamps_ns, lambda i: stream.values[i].tobytes(), f"{what}: samples", voice)
+    order, stamps = put_in_order(stream.stamps_ns[own], stream.recorded_ns[own], f"{what}: samples", voice)
     voice.notes.append(f"{what} from {topic.name} ({len(topic)} messages, frame {stream.frame or 'unnamed'})")
-    return replace(stream, stamps_ns=stamps, values=stream.values[order])
+    kept = np.flatnonzero(own)[order]
+    return replace(stream, stamps_ns=stamps, values=stream.values[kept], recorded_ns=stream.recorded_ns[kept])
 
 
 def _why_none(bag: Bag, what: str, flag: str, kind: str, wish: str) -> LslamError:

@@ -23,7 +23,7 @@ _SPREAD_SAMPLES = 8  # and four times as many
 _REGULAR = 0.02  # of the interval, the median deviation of a clock that ticks
 _SNAP = 0.3  # of the interval, how far an interval across a step may lie from whole ones
 _MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others are brought onto
-_MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
+MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
 _JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
 _FAR = 1000  # durations of a recording, by which nothing pauses within it
 _MANY, _UNEVEN = 0.3, 0.25  # share of all messages; of the interval
@@ -52,7 +52,7 @@ def stands_still(stamps: Stamps, witness: Stamps) -> bool:
         return False
     if len(stamps) == 1:
         return not stamps.any() and bool(witness.any())
-    return len(np.unique(stamps)) <= max(1, len(stamps) / _MESSAGES_PER_STAMP)
+    return len(np.unique(stamps)) <= max(1, len(stamps) / MESSAGES_PER_STAMP)
 
 
 def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClock:
@@ -143,7 +143,7 @@ def _in_parts(h: Stamps) -> bool:
     """Whether each scan comes as the same number of messages of one stamp."""
     counts = np.bincount(np.unique(h, return_inverse=True)[1], minlength=1)
     usual = int(np.median(counts))
-    return 1 < usual < _MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
+    return 1 < usual < MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
 
 
 def _recording_spread(w: Stamps, period: float) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_builders import GRAVITY, START_NS, STEP_NS, Fill, bag, scan, together
+from bag_builders import GRAVITY, START_NS, STEP_NS, Fill, bag, clouds, raw_cloud, scan, together
 from numpy.typing import NDArray
 
 from lslam.formats import bag_messages
@@ -174,3 +174,65 @@ def test_a_step_does_not_tear_scans_and_imu_of_one_clock_apart(tmp_path: Path, s
     np.testing.assert_array_equal(sequence.imu.stamps_ns, START_NS + np.arange(COUNT * 10) * 10_000_000)
     np.testing.assert_allclose(sequence.imu.gyro[:, 2], 0.001 * np.arange(COUNT * 10))
     assert sum("brought onto one clock" in p for p in sequence.problems) == 2
+
+
+def by_points(start_s: float, with_imu: bool = False) -> Fill:
+    """Scans without stamps in their headers, recorded unevenly, whose points have absolute times from `start_s`."""
+
+    def fill(writer: BagWriter) -> None:
+        for k in range(COUNT):
+            table = np.zeros(50, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
+            table["x"], table["timestamp"] = 1 + np.arange(50), start_s + 0.1 * k + np.linspace(0, 0.0999, 50)
+            message = raw_cloud(writer.store, 0, table)
+            writer.write("/points", int(TRUE[k] + 100_000_000 + delays(COUNT, 0.02)[k]), message)
+
+    return fill
+
+
+@pytest.mark.parametrize("start_s", [START_NS * 1e-9, 123.25])
+def test_scans_without_stamps_are_stamped_by_absolute_times_of_their_points(tmp_path: Path, start_s: float) -> None:
+    """Of the epoch of the recording, or since the sensor was switched on: then by the clock of the recording."""
+    sequence = open_sequence(bag(tmp_path / "a.bag", by_points(start_s)))
+    assert len(sequence) == COUNT
+    np.testing.assert_allclose(np.diff(sequence.stamps_ns), STEP_NS, atol=1000)
+    late = 0.1e9 + delays(COUNT, 0.02).min() if start_s < 1000 else 0
+    assert abs(sequence.stamps_ns[0] - TRUE[0] - late) < 2000
+    for k in (0, 17):
+        one = sequence.scan(k)
+        assert abs(one.stamp_ns - sequence.stamps_ns[k]) < 10
+        assert one.times is not None
+        np.testing.assert_allclose(one.times, np.linspace(0, 0.0999, 50), atol=1e-6)
+    assert any("from the absolute times of the points, field 'timestamp'" in n for n in sequence.notes)
+
+
+def test_fixes_without_a_fix_do_not_cost_the_clock_of_the_others(tmp_path: Path) -> None:
+    def fill(writer: BagWriter) -> None:
+        for k in range(COUNT):
+            stamp = int(TRUE[k]) - S37 * (k >= 12)
+            message = bag_messages.fix(writer.store, stamp, np.array([48.0, 11.0 + 1e-6 * k, 500.0]), 1.0, "gnss")
+            if k % 7 == 3:
+                message.status.status = -1
+            writer.write("/fix", int(TRUE[k]) + 5_000_000, message)
+
+    gnss = open_sequence(bag(tmp_path / "a.mcap", together(clouds(COUNT, n=20), fill), "mcap")).gnss
+    assert gnss is not None
+    np.testing.assert_array_equal(gnss.stamps_ns, TRUE[K % 7 != 3])
+    np.testing.assert_allclose(gnss.lat_lon_alt[:, 1], 11.0 + 1e-6 * K[K % 7 != 3])
+
+
+def test_a_recording_that_was_played_in_a_loop_is_read_once(tmp_path: Path) -> None:
+    def fill(writer: BagWriter) -> None:
+        for k in range(2 * COUNT):
+            one = scan(k % COUNT, 50)
+            writer.write("/points", START_NS + k * STEP_NS, bag_messages.cloud(writer.store, one, "lidar"))
+            message = bag_messages.imu(writer.store, one.stamp_ns, GRAVITY, np.full(3, 0.01 * (k % COUNT)), "imu")
+            writer.write("/imu", START_NS + k * STEP_NS, message)
+
+    sequence = open_sequence(bag(tmp_path / "a.mcap", fill, "mcap"))
+    np.testing.assert_array_equal(sequence.stamps_ns, TRUE)
+    assert sequence.imu is not None
+    np.testing.assert_array_equal(sequence.imu.stamps_ns, TRUE)
+    said = [
+        p for p in sequence.problems if "30 messages, message 30 the first, are copies of earlier ones: left out" in p
+    ]
+    assert len(said) == 2
