@@ -10,7 +10,7 @@ import pytest
 from sequence_builders import scans
 
 from lslam.errors import InputError
-from lslam.formats.ply_files import read_ply
+from lslam.formats.point_files import read_points
 from lslam.readers import open_sequence
 from lslam.readers.name_stamps import stamps_in_names
 
@@ -107,7 +107,7 @@ def timed(path: Path, times: np.ndarray, name: str = "time") -> None:
         head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(times)}\n"
         head += "".join(f"property float {axis}\n" for axis in "xyz") + f"property double {name}\nend_header\n"
         path.write_bytes(head.encode() + table.tobytes())
-        assert len(read_ply(path)) == len(times)
+        assert len(read_points(path)) == len(times)
     else:
         head = (
             f"FIELDS x y z {name}\nSIZE 4 4 4 {size}\nTYPE F F F {kind}\nCOUNT 1 1 1 1\nWIDTH {len(times)}\nHEIGHT 1\n"
