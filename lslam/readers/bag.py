@@ -17,7 +17,7 @@ from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
-from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, parse_sequence_toml, read_sequence_toml
+from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
 from lslam.readers.bag_halves import Halves, read_whole
@@ -40,6 +40,7 @@ from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_stamps import point_stamps
 from lslam.readers.point_times import TimeRule, apply_rule, rule_of_scans
+from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -65,7 +66,7 @@ class BagSequence(Scans):
     time_rule : how per-point times are understood, None when there are none or they are not to be used
     has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
     uses : what each topic that is used is used for; halves : further messages of a scan
-    revolutions : of packets, which then are read in place of messages
+    revolutions : of packets, which then are read in place of messages; unit_m : of coordinates, None where nobody states it
     """
 
     name: str
@@ -91,6 +92,7 @@ class BagSequence(Scans):
     uses: dict[str, str] = field(default_factory=dict)
     halves: Halves = field(default_factory=dict)
     revolutions: Revolutions | None = None
+    unit_m: float | None = None
 
     def __len__(self) -> int:
         return len(self.messages)
@@ -117,7 +119,8 @@ class BagSequence(Scans):
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
         """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
-        return read_whole(self.bag, self.topic, int(self.messages[index]), self.halves)
+        cloud, shift = read_whole(self.bag, self.topic, int(self.messages[index]), self.halves)
+        return in_metres(cloud, self.unit_m), shift
 
 
 # One LiDAR of a bag: which messages, its scans, and what its packets tell where it has any.
@@ -215,6 +218,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
         info.rate_hz or (measured_rate(index.stamps_ns) if opened is None else opened.rate_hz),
         motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
         notes=voice.notes, problems=voice.problems, halves=index.halves,
+        unit_m=LENGTHS.get(info.point_unit or ""),
     )  # fmt: skip
     if opened is not None:
         return replace(
@@ -223,6 +227,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
             sensor=info.sensor or opened.sensor,
             revolutions=opened.revolutions,
         )
+    settle_unit(sequence)
     _stamp_by_points(sequence)
     if not info.motion_compensated:
         _decide_times(sequence, info)

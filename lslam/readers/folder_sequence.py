@@ -16,6 +16,7 @@ from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.state_files import DAMAGE
 from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
+from lslam.readers.point_units import in_metres
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan, Span
@@ -72,9 +73,7 @@ class FolderSequence(Scans):
         path = self.files[index]
         stamp = int(self.stamps_ns[index])
         is_kitti = path.suffix.lower() == ".bin" and self.record in (None, KITTI)
-        cloud = _split(read_bin(path)) if is_kitti else read_points(path, self.record)
-        if self.unit_m is not None and self.unit_m != 1:
-            cloud.points[...] *= np.float32(self.unit_m)
+        cloud = in_metres(_split(read_bin(path)) if is_kitti else read_points(path, self.record), self.unit_m)
         times, rings, stamp = self._times_and_rings(path, cloud, index, stamp)
         if self.correction_deg and len(cloud):
             from lslam.kernels.transform import rotate_up

@@ -15,6 +15,7 @@ from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps
+from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_folder import time_rule
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import rows_of_scans
@@ -69,7 +70,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     compensated = True if is_benchmark else info.motion_compensated
     if info.motion_compensated is None and compensated:
         voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
-    return FolderSequence(
+    sequence = FolderSequence(
         name=name,
         path=folder,
         kind=KIND,
@@ -93,6 +94,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         notes=voice.notes,
         problems=voice.problems,
     )
+    return settle_unit(sequence)
 
 
 def _stamps(

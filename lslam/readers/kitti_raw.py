@@ -35,6 +35,7 @@ from lslam.readers.listing import (
     nominal_stamps,
     rows_of,
 )
+from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
@@ -110,7 +111,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
             "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
             "leaves scans as they are)"
         )
-    return FolderSequence(
+    sequence = FolderSequence(
         name=info.name or printable(folder.name),
         path=folder,
         kind=KIND,
@@ -134,6 +135,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         notes=voice.notes,
         problems=voice.problems,
     )
+    return settle_unit(sequence)
 
 
 def _oxts(folder: Path, voice: Voice) -> Oxts | None:

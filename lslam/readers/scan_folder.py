@@ -28,6 +28,7 @@ from lslam.readers.listing import (
     nominal_stamps,
 )
 from lslam.readers.point_times import TimeRule, rule_of_scans
+from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import StampedScans, stamp_scans
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
@@ -73,7 +74,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     rule = None if info.motion_compensated else time_rule(files, record, stamps, rate, info, voice)
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
-    return FolderSequence(
+    sequence = FolderSequence(
         name=info.name or printable(folder.name),
         path=folder,
         kind=KIND,
@@ -97,6 +98,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         notes=voice.notes,
         problems=voice.problems,
     )
+    return settle_unit(sequence)
 
 
 def _scans_in(folder: Path) -> tuple[Path, list[Path], list[str]] | None:
