@@ -15,6 +15,7 @@ from lslam.printable import printable
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps
+from lslam.readers.lookup import sequence_number
 from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_folder import time_rule
 from lslam.readers.scan_records import scan_record
@@ -135,7 +136,9 @@ def _ground_truth(
     calibration: Calibration,
     voice: Voice,
 ) -> Trajectory | None:
-    path: Path | None = folder.parent.parent / "poses" / f"{folder.name}.txt"
+    number = sequence_number(folder.name) or folder.name
+    usual = [above / "poses" / f"{number}.txt" for above in (folder.parent.parent, folder.parent)]
+    path: Path | None = next((p for p in usual if p.is_file()), usual[0])
     if info.ground_truth is not None:
         path = find_ground_truth(folder, info, voice)
     elif path is not None and not path.is_file():

@@ -20,8 +20,9 @@ _ROOTS = ("", "dataset", "kitti", "kitti/dataset", "raw", "kitti_raw", "kitti/ra
 def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path:
     """The folder or bag of a sequence: `name_or_path` itself when it exists, else the name looked up under `data_root`.
 
-    `data_root` is LSLAM_DATA when None. `seq07`, `07` and `kitti/07` find `sequences/07`; a drive is found by its name, by
-    `drive_0005` or `0005` when only one has it. Raises InputError naming where it looked and names that are near.
+    `data_root` is LSLAM_DATA when None; the current folder comes after it. `seq07`, `07` and `kitti/07` find `sequences/07`
+    and folders of those names; a drive is found by its name, by `drive_0005` or `0005` when only one has it.
+    Raises InputError naming where it looked and names that are near.
     """
     text = str(name_or_path)
     path = as_path(name_or_path).expanduser()
@@ -37,21 +38,27 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
         raise InputError(f"no sequence {text!r}: no such bucket, object or folder")
     if data_root is None and os.environ.get("LSLAM_DATA"):
         data_root = Path(os.environ["LSLAM_DATA"])
+    here = Path.cwd()
     if data_root is None:
-        raise InputError(
-            f"no sequence {text!r}: {path} does not exist; names such as seq07 need --data-root or LSLAM_DATA"
-        )
-    root = data_root.expanduser()
-    if not root.is_dir():
-        raise InputError(f"no sequence {text!r}: the data root {root} does not exist")
-    if (root / text).is_dir() or is_recording(root / text):
-        return root / text
-    found = _sequences(root, text) or _drives(root, text)
+        found = _sequences(here, text) or _drives(here, text)
+        if not found:
+            raise InputError(
+                f"no sequence {text!r}: {path} does not exist, nor is it in {here}; names such as seq07 need --data-root or "
+                "LSLAM_DATA where their data set is elsewhere"
+            )
+    else:
+        root = data_root.expanduser()
+        if not root.is_dir():
+            raise InputError(f"no sequence {text!r}: the data root {root} does not exist")
+        if (root / text).is_dir() or is_recording(root / text):
+            return root / text
+        found = _sequences(root, text) or _drives(root, text) or _sequences(here, text) or _drives(here, text)
     if len(found) == 1:
         return found[0]
     if found:
         raise InputError(f"{text!r} may be any of {', '.join(str(p) for p in found)}: name one of them")
-    raise InputError(_not_found(text, root))
+    assert data_root is not None
+    raise InputError(_not_found(text, data_root.expanduser()))
 
 
 def is_recording(path: Path) -> bool:
@@ -59,12 +66,22 @@ def is_recording(path: Path) -> bool:
     return bool(list_bag_files(path)) or (path.suffix.lower() in CAPTURES and path.is_file())
 
 
+def sequence_number(name: str) -> str:
+    """The number of a KITTI odometry sequence by a name that a user or a folder gives it, empty when it is none.
+
+    >>> sequence_number("seq07"), sequence_number("kitti/7"), sequence_number("town")
+    ('07', '07', '')
+    """
+    match = _SEQUENCE.match(name)
+    return match.group(1).zfill(2) if match else ""
+
+
 def _sequences(root: Path, text: str) -> list[Path]:
-    match = _SEQUENCE.match(text)
-    if not match:
+    number = sequence_number(text)
+    if not number:
         return []
-    number = match.group(1).zfill(2)
     folders = [root / part / "sequences" / number for part in _ROOTS]
+    folders += [root / part / name for part in _ROOTS for name in (f"seq{number}", number)]
     return [p for p in folders if p.is_dir()][:1]
 
 

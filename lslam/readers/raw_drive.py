@@ -17,6 +17,7 @@ from lslam.formats.stamp_files import read_stamps
 from lslam.readers.bag_topics import why_no_fixes, why_no_imu
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND
+from lslam.readers.lookup import sequence_number
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
@@ -50,8 +51,9 @@ def with_streams(sequence: Sequence, imu: bool, gnss: bool, data_root: Path | No
 def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """The sequence with an IMU: its own, else, for a KITTI odometry sequence, that of its raw drive.
 
-    The drive is looked for below `data_root`, LSLAM_DATA and the folders the sequence lies in, as
-    `raw/<date>/<drive>_extract` (100 Hz) or `_sync` (10 Hz), with `calib_imu_to_velo.txt` beside it.
+    The drive is looked for below `data_root`, LSLAM_DATA, the current folder and those the sequence lies in, as
+    `raw/<date>/<drive>_extract` (100 Hz) or `_sync` (10 Hz), with or without `raw` and `<date>`, with
+    `calib_imu_to_velo.txt` beside it.
 
     Raises InputError naming the paths looked at, UsageError when a bag has several to choose from.
     """
@@ -60,7 +62,7 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     bag: Bag | None = getattr(sequence, "bag", None)
     if bag is not None:
         raise why_no_imu(bag)
-    number = sequence.path.name
+    number = sequence_number(sequence.path.name)
     if not isinstance(sequence, FolderSequence):
         raise InputError(
             f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu, by a method that needs none"
@@ -83,7 +85,7 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     bag: Bag | None = getattr(sequence, "bag", None)
     if bag is not None:
         raise why_no_fixes(bag)
-    number = sequence.path.name
+    number = sequence_number(sequence.path.name)
     if not isinstance(sequence, FolderSequence):
         return sequence
     if sequence.kind != KIND or number not in DRIVES:
@@ -98,17 +100,20 @@ def _drive_of(
 ) -> tuple[Path, int]:
     """Folder of the raw drive, and the frame in it that is the first scan."""
     date, drive, first = DRIVES[number]
+    places = _places(sequence.path, data_root)
     folders = [
-        root / date / f"{date}_drive_{drive:04d}_{kind}"
+        place / above / day / f"{date}_drive_{drive:04d}_{kind}"
         for kind in ("extract", "sync")
-        for root in _raw_roots(sequence.path, data_root)
+        for above, day in (("raw", date), ("", date), ("raw", ""), ("", ""), ("kitti_raw", date))
+        for place in places
     ]
     found = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
     if found is None:
-        looked = ", ".join(str(f / "oxts") for f in folders)
+        looked = ", ".join(str(f / "oxts") for f in folders if f.parent.parent.name == "raw")
         raise InputError(
             f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and the raw drive in "
-            f"{looked}; fetch {date}_drive_{drive:04d}_sync or _extract, or run without {flags}"
+            f"{looked}, and there without raw/ and {date}/; fetch {date}_drive_{drive:04d}_sync or _extract, or run without "
+            f"{flags}"
         )
     return found, first
 
@@ -140,9 +145,11 @@ def _samples(
     sequence: FolderSequence, drive: Path, first: int
 ) -> tuple[Oxts, NDArray[np.int64], NDArray[np.float64], str]:
     """OXTS of the drive, its stamps (N,), ns, on the sequence's clock, T_lidar_imu (4, 4), and in words where from."""
-    calibration = drive.parent / CALIBRATION
-    if not calibration.is_file():
-        raise InputError(f"{calibration} is missing: it says how the IMU sits, fetch the calibration of that day")
+    day = drive.parent / drive.name[: len("2011_09_30")]
+    beside = [folder / CALIBRATION for folder in (drive.parent, drive, day, drive.parent.parent)]
+    calibration = next((path for path in beside if path.is_file()), None)
+    if calibration is None:
+        raise InputError(f"{beside[0]} is missing: it says how the IMU sits, fetch the calibration of that day")
     T_lidar_imu = read_rigid(calibration)
     oxts = read_oxts(drive / "oxts")
     if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns):
@@ -176,8 +183,8 @@ def _begin(drive: Path, oxts: Oxts, first: int) -> tuple[int, str]:
     )
 
 
-def _raw_roots(sequence: Path, data_root: Path | None) -> list[Path]:
-    """`raw` folders that may hold the drive, the most likely first."""
+def _places(sequence: Path, data_root: Path | None) -> list[Path]:
+    """Folders that may hold the drive, or its `raw` folder, the most likely first."""
     roots = [p for p in (data_root, os.environ.get("LSLAM_DATA")) if p]
-    places = [Path(p).expanduser() for p in roots] + list(sequence.parents)[1 : 1 + _UPWARDS]
-    return list(dict.fromkeys(place / "raw" for place in places))
+    places = [Path(p).expanduser() for p in roots] + list(sequence.parents)[: 1 + _UPWARDS] + [Path.cwd()]
+    return list(dict.fromkeys(places))

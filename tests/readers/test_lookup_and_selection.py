@@ -56,6 +56,16 @@ def test_environment_names_the_data_root(tmp_path: Path, monkeypatch: pytest.Mon
     assert find_folder("seq07") == folder
 
 
+@pytest.mark.parametrize("name", ["seq07", "07", "kitti/07"])
+def test_the_current_folder_is_a_data_root_too(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LSLAM_DATA", raising=False)
+    folder = kitti_root(tmp_path / "kitti", 1)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert find_folder(name) == folder
+    assert find_folder(name, tmp_path / "elsewhere") == folder
+
+
 def test_relative_paths_and_links(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = kitti_root(tmp_path / "disk", 2)
     monkeypatch.chdir(folder)

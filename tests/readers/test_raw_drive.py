@@ -94,6 +94,45 @@ def test_the_faster_extract_drive_is_preferred_and_timed_by_the_camera(tmp_path:
     assert sequence.imu.stamps_ns[75] == sequence.stamps_ns[0], "0.75 s after the first of 100 Hz"
 
 
+PLACES = {"beside": "", "by its day": "2011_09_30", "under raw": "raw", "under raw by its day": "raw/2011_09_30"}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("root", ["current folder", "data root"])
+def test_a_folder_called_seq07_finds_its_drive(
+    place: str, root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("LSLAM_DATA", raising=False)
+    kitti_root(tmp_path / "kitti", 20).rename(tmp_path / "seq07")
+    poses = tmp_path / "kitti" / "poses"
+    poses.rename(tmp_path / "poses")
+    above = tmp_path / PLACES[place]
+    oxts(above / f"{DRIVE}_sync" / "oxts", 20, 10.0)
+    calibration(above)
+    monkeypatch.chdir(tmp_path if root == "current folder" else tmp_path / "kitti")
+    sequence = open_sequence("seq07", data_root=tmp_path if root == "data root" else None, imu=True, gnss=True)
+    assert sequence.imu is not None
+    np.testing.assert_allclose(sequence.imu.gyro[:, 2], np.arange(20) / 1000)
+    assert sequence.gnss is not None
+    assert sequence.ground_truth is not None
+    assert sequence.name == "seq07"
+
+
+def test_the_calibration_of_the_day_lies_beside_a_drive_too(tmp_path: Path) -> None:
+    folder = kitti_root(tmp_path, 20)
+    oxts(tmp_path / f"{DRIVE}_sync" / "oxts", 20, 10.0)
+    (tmp_path / "2011_09_30").mkdir()
+    calibration(tmp_path / "2011_09_30")
+    assert with_imu(open_sequence(folder)).imu is not None
+
+
+def test_without_the_drive_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kitti_root(tmp_path / "kitti", 5).rename(tmp_path / "seq07")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="fetch 2011_09_30_drive_0027_sync or _extract"):
+        open_sequence("seq07", imu=True)
+
+
 def test_nothing_found_names_every_place(tmp_path: Path) -> None:
     folder = kitti_root(tmp_path / "kitti", 5)
     with pytest.raises(InputError) as error:
