@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
 from contextlib import ExitStack
@@ -12,7 +13,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
-from lslam.errors import GateError, LslamError, RunFailedError, UsageError
+from lslam.errors import GateError, InputError, LslamError, RunFailedError, UsageError
 from lslam.remote import RemotePath, as_path
 from lslam.studies.output import BATCH, require_free
 
@@ -39,6 +40,7 @@ _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
     "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
 )
 @click.option("--strict", is_flag=True, help="Exit 4 when a run was degraded.")
+@options.as_json
 @options.verbosity
 def command(jobs_file: Path, **given: Any) -> None:
     """Make many runs, each with its map and report, and a row of results.csv and results.parquet for each.
@@ -53,14 +55,14 @@ def command(jobs_file: Path, **given: Any) -> None:
         require_free(output.out, BATCH, "batch", output.overwrite, output.resume)
     expanded = _expanded(jobs_file, output, given)
     if given["dry_run"]:
-        show("".join(f"{job.name}  {job.folder}\n" for job in expanded.jobs))
+        _print_plan(expanded, given["as_json"])
         return
     from lslam.cli.study_screen import bars
     from lslam.studies.expanded_study import make_runs
 
     with options.engine_of(given, "runs", is_persistent=False) as engine, ExitStack() as stack:
         rows = make_runs(expanded, output, engine, bars(stack))
-    _print(rows)
+    _print(rows, output.out, given["as_json"])
     log.info("every run: %s", output.out / "results.csv")
     _judge(rows, given["strict"])
 
@@ -88,7 +90,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     from lslam.cli.run import command as run_command
     from lslam.cli.run import opened_with, read_truth, resolved
     from lslam.readers.lookup import find_folder
-    from lslam.studies.batch import listed_line, opened_line
+    from lslam.studies.batch import listed_line, opened_line, refused_line
 
     try:
         said = run_command.make_context("run", list(words)).params
@@ -101,8 +103,13 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
         text, folder, reading = shlex.join(words), said["out"], options.reading_of(said)
         if said["gt"] is None and isinstance(place := as_path(said["sequence"]), RemotePath):
             return listed_line(text, find_folder(place), resolved(said), folder, reading)
-        sequence, config = opened_with(said)
-        return opened_line(text, sequence, config, read_truth(said["gt"], sequence), folder, reading)
+        try:
+            sequence, config = opened_with(said)
+            return opened_line(text, sequence, config, read_truth(said["gt"], sequence), folder, reading)
+        except InputError as error:
+            # One recording of hundreds that cannot be read is a failed run, not the end of all.
+            path = as_path(said["sequence"]).expanduser().absolute()
+            return refused_line(text, path, resolved(said), folder, f"line {number}: {error}")
     except LslamError as error:
         raise type(error)(f"line {number}: {error}") from None
     except click.UsageError as error:
@@ -111,7 +118,27 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
         raise UsageError(f"line {number}: --help is no run, give it to lslam run") from None
 
 
-def _print(rows: list[StudyRow]) -> None:
+def _print_plan(expanded: ExpandedStudy, as_json: bool) -> None:
+    if as_json:
+        runs = [
+            {
+                "sequence": job.sequence, "method": job.method, "seed": job.seed, "path": str(job.path),
+                "folder": str(job.folder), "refusal": job.refusal or None,
+            }
+            for job in expanded.jobs
+        ]  # fmt: skip
+        show(json.dumps({"runs": runs}) + "\n")
+        return
+    lines = [f"{job.name}  {job.folder}{f'  ({job.refusal})' if job.refusal else ''}\n" for job in expanded.jobs]
+    show("".join(lines))
+
+
+def _print(rows: list[StudyRow], out: Path, as_json: bool) -> None:
+    if as_json:
+        from lslam.reports.study_table import rows_document
+
+        show(json.dumps({"folder": str(out), "results": str(out / "results.csv"), "runs": rows_document(rows)}) + "\n")
+        return
     from lslam.reports.grid_text import aligned
     from lslam.reports.study_table import batch_table
 

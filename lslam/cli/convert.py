@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,6 +69,7 @@ Examples:
 @click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: stamps of a KITTI file.")
 @options.reading
 @options.data_root
+@options.as_json
 @options.verbosity
 def command(source: str, kind: str | None, out: Path | None, **given: Any) -> None:
     """Convert SOURCE, a sequence (path or name), a run folder or a trajectory file.
@@ -91,7 +93,7 @@ def command(source: str, kind: str | None, out: Path | None, **given: Any) -> No
         raise click.UsageError("--out names the file or folder to write")
     if kind == "gpkg":
         _refuse(given, (*NOT_OF_RUNS, "is_zstd"), "is not for --to gpkg, which has the poses of a run as they lie")
-        _convert_to_gpkg(Path(source).expanduser(), out, given["overwrite"])
+        _convert_to_gpkg(Path(source).expanduser(), out, given)
     elif kind not in SEQUENCES or _is_trajectory(source):
         _convert_trajectory(source, kind, out, given)
     else:
@@ -125,7 +127,7 @@ def _open(source: str, given: dict[str, Any]) -> Sequence:
 def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
     import logging
 
-    from lslam.cli.console import progress, show
+    from lslam.cli.console import progress
     from lslam.convert.output import check_output
 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
@@ -148,11 +150,12 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
             is_zstd=given["is_zstd"], overwrite=given["overwrite"], trajectory=trajectory, on_scan=advance,
         )  # fmt: skip
     left = f", {done.skipped} that could not be read left out" if done.skipped else ""
-    show(f"{done.path}: {done.scans} scans{left}\n")
+    values = {"scans": done.scans, "skipped": done.skipped}
+    _print(f"{done.path}: {done.scans} scans{left}", done.path, kind, values, given)
 
 
 def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any]) -> None:
-    from lslam.cli.console import progress, show
+    from lslam.cli.console import progress
     from lslam.convert.output import check_output
 
     out = folder / f"run{BAGS[kind]}" if out is None else out
@@ -174,21 +177,28 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
             run, scans, kind, out,
             voxel=given["voxel"] or 0.0, is_zstd=given["is_zstd"], overwrite=given["overwrite"], on_scan=advance,
         )  # fmt: skip
-    show(f"{done.path}: {done.poses} poses, {done.clouds} clouds, a map of {done.map_points} points\n")
+    text = f"{done.path}: {done.poses} poses, {done.clouds} clouds, a map of {done.map_points} points"
+    values = {"poses": done.poses, "clouds": done.clouds, "map_points": done.map_points}
+    _print(text, done.path, kind, values, given)
 
 
-def _convert_to_gpkg(folder: Path, out: Path, overwrite: bool) -> None:
+def _print(text: str, path: Path, kind: str, values: dict[str, Any], given: dict[str, Any]) -> None:
+    """What was written, as a line or with --json as one object."""
     from lslam.cli.console import show
+
+    show((json.dumps({"path": str(path), "format": kind, **values}) if given["as_json"] else text) + "\n")
+
+
+def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
     from lslam.convert.to_gpkg import convert_to_gpkg
 
     options.require_there(folder)
-    done = convert_to_gpkg(folder, out, overwrite=overwrite)
-    show(f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in done)}\n")
+    done = convert_to_gpkg(folder, out, overwrite=given["overwrite"])
+    text = f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in done)}"
+    _print(text, out, "gpkg", {"features": {layer.name: len(layer.features) for layer in done}}, given)
 
 
 def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]) -> None:
-    from lslam.cli.console import show
-
     for flag, name in (("--zstd", "is_zstd"), ("--deskewed", "deskewed")):
         if given[name]:
             raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
@@ -205,7 +215,8 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
     else:
         trajectory, calibration = _read_trajectory(source, kind, given)
         moved = convert_trajectory(trajectory, kind, out, calibration, **how)
-    show(f"{out}: {len(moved)} poses of {moved.frame}\n")
+    text = f"{out}: {len(moved)} poses of {moved.frame}"
+    _print(text, out, kind, {"poses": len(moved), "frame": moved.frame}, given)
 
 
 def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:

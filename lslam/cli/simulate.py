@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -88,6 +90,7 @@ if TYPE_CHECKING:
 @click.option("--resume", is_flag=True, help="Continue an interrupted simulation.")
 @click.option("--show", is_flag=True, help="Print SCENARIO with all its keys as TOML.")
 @click.option("--list", "show_list", is_flag=True, help="List scenarios and sensors.")
+@options.as_json
 @options.verbosity
 def command(
     scenario: str | None,
@@ -114,6 +117,7 @@ def command(
     resume: bool,
     show: bool,
     show_list: bool,
+    as_json: bool,
     verbose: bool,
     quiet: bool,
 ) -> None:
@@ -123,12 +127,12 @@ def command(
     drawn.
     """
     if show_list:
-        _print_list()
+        _print_list(as_json)
         return
     if scenario is None and (path_file is not None or osm is not None):
         scenario = "residential"
     if show and scenario is not None:
-        _print_scenario(scenario, settings)
+        _print_scenario(scenario, settings, as_json)
         return
     if scenario is None or (out is None and plan is None):
         missing = "SCENARIO" if scenario is None else "--out DIR"
@@ -148,7 +152,7 @@ def command(
     from lslam.simulation.sensors import GnssModel
 
     if plan is not None and out is None and osm is not None and path_file is None:
-        _draw_map(scenario, seed, settings, osm, at, plan)
+        _print([_draw_map(scenario, seed, settings, osm, at, plan)], as_json)
         return
     drive = simulate(
         scenario,
@@ -166,10 +170,27 @@ def command(
         static_start=static_start,
         visit=Visit(visit, reverse, shift),
     )
+    written = []
     if plan is not None:
-        _draw(drive, plan)
+        written.append(_draw(drive, plan))
     if out is not None:
-        _record(drive, out, overwrite, resume)
+        written.append(_record(drive, out, overwrite, resume))
+    _print(written, as_json)
+
+
+@dataclass(frozen=True)
+class Written:
+    """One thing that was written: a line for people, and the same as values by key for programs."""
+
+    text: str
+    values: dict[str, Any]
+
+
+def _print(written: list[Written], as_json: bool) -> None:
+    if as_json:
+        click.echo(json.dumps({key: value for one in written for key, value in one.values.items()}))
+    else:
+        click.echo("\n".join(one.text for one in written))
 
 
 def _numbers(origin: str) -> list[float]:
@@ -181,15 +202,15 @@ def _numbers(origin: str) -> list[float]:
         ) from None
 
 
-def _draw(drive: SimulatedDrive, plan: Path) -> None:
+def _draw(drive: SimulatedDrive, plan: Path) -> Written:
     from lslam.simulation.plan import plan_of
 
-    _write_plan(plan, plan_of(drive.scene, drive.city, drive.city_poses[:, :3, 3]))
+    return _write_plan(plan, plan_of(drive.scene, drive.city, drive.city_poses[:, :3, 3]))
 
 
 def _draw_map(
     scenario: str, seed: int, settings: tuple[str, ...], osm: Path, origin: list[float] | None, plan: Path
-) -> None:
+) -> Written:
     """Draw the whole extract, with the street of the drive when there is one."""
     from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.lidar import RayScene
@@ -200,18 +221,19 @@ def _draw_map(
 
     extract = read_extract(osm, None if origin is None else checked_origin(origin))
     city, line = whole_map(scenario_named(scenario, settings), seed, extract)
-    _write_plan(plan, plan_of(RayScene(city.mesh), city, line))
+    return _write_plan(plan, plan_of(RayScene(city.mesh), city, line))
 
 
-def _write_plan(path: Path, plan: ScenePlan) -> None:
+def _write_plan(path: Path, plan: ScenePlan) -> Written:
     from lslam.reports.scene_plan import write_plan
 
     write_plan(path, plan)
     width, depth = plan.high - plan.low
-    click.echo(f"{path}: {width:.0f} x {depth:.0f} m, a line every 10 m")
+    text = f"{path}: {width:.0f} x {depth:.0f} m, a line every 10 m"
+    return Written(text, {"plan": str(path), "plan_size_m": [float(width), float(depth)]})
 
 
-def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> None:
+def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> Written:
     from lslam.simulation.record import record
     from lslam.stopping import heeded
 
@@ -224,23 +246,33 @@ def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> 
 
         done = record(drive, out, overwrite, on_scan, resume, shlex.join(["lslam", *sys.argv[1:]]))
     assert drive.ground_truth is not None
-    click.echo(
-        f"{done.sequence}: {len(drive)} scans, {drive.ground_truth.path_lengths[-1]:.1f} m, "
-        f"{done.points / len(drive):.0f} points per scan, {done.size / 1e6:.1f} MB"
-    )
+    length = float(drive.ground_truth.path_lengths[-1])
+    return Written(
+        f"{done.sequence}: {len(drive)} scans, {length:.1f} m, {done.points / len(drive):.0f} points per scan, "
+        f"{done.size / 1e6:.1f} MB",
+        {
+            "sequence": str(done.sequence), "scans": len(drive), "path_length_m": length,
+            "points_per_scan": done.points / len(drive), "bytes": done.size,
+        },
+    )  # fmt: skip
 
 
-def _print_scenario(name: str, settings: tuple[str, ...]) -> None:
+def _print_scenario(name: str, settings: tuple[str, ...], as_json: bool) -> None:
     from lslam.simulation.scenario_files import scenario_named, scenario_text
 
-    click.echo(scenario_text(scenario_named(name, settings)), nl=False)
+    text = scenario_text(scenario_named(name, settings))
+    click.echo(json.dumps({"scenario": name, "toml": text}) + "\n" if as_json else text, nl=False)
 
 
-def _print_list() -> None:
+def _print_list(as_json: bool) -> None:
     from lslam.simulation.imu import IMUS
     from lslam.simulation.lidar_models import LIDARS
     from lslam.simulation.scenario_files import scenario_named, scenario_names
 
+    if as_json:
+        names = {name: scenario_named(name).summary for name in scenario_names()}
+        click.echo(json.dumps({"scenarios": names, "lidars": list(LIDARS), "imus": list(IMUS)}))
+        return
     for name in scenario_names():
         click.echo(f"scenario  {name:<16}  {scenario_named(name).summary}")
     for name, model in LIDARS.items():

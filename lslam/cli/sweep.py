@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from contextlib import ExitStack
 from math import isnan
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
 )
 @click.option("--strict", is_flag=True, help="Exit 4 when any run failed or diverged.")
+@options.as_json
 @options.verbosity
 def command(study: str | None, **given: Any) -> None:
     """Vary parameters over sequences, methods and seeds; every run is a row of results.csv, and of results.parquet
@@ -53,13 +55,13 @@ def command(study: str | None, **given: Any) -> None:
     machine, and --jobs 1 where in doubt.
     """
     if given["show_list"]:
-        _print_list()
+        _print_list(given["as_json"])
         return
     setup_logging(given["verbose"], given["quiet"])
     if given["report"] is not None:
         if study is not None:
             raise click.UsageError(f"--report writes the report of a folder and runs nothing: leave out {study}")
-        _report(given["report"])
+        _print_verdicts(_report(given["report"]), given["report"], None, given["as_json"])
         return
     if given["pilot"] and not given["dry_run"]:
         raise click.UsageError("--pilot estimates the time of a --dry-run: give both")
@@ -74,11 +76,12 @@ def command(study: str | None, **given: Any) -> None:
         from lslam.cli.study_screen import bars, best_so_far
 
         if given["dry_run"]:
-            _print_plan(sweep, engine.at_once, given["pilot"], stack)
+            _print_plan(sweep, engine.at_once, given["pilot"], stack, given["as_json"])
             return
         on_rows = stack.enter_context(best_so_far())
         rows = run_sweep(sweep, engine, bars(stack), on_rows)
-    _print(rows)
+    if not given["as_json"]:
+        _print(rows)
     unscored = [row for row in rows if row.is_usable and isnan(row.error)]
     if unscored:
         log.warning(
@@ -88,7 +91,7 @@ def command(study: str | None, **given: Any) -> None:
             unscored[0].reason or "its metric is not available",
         )
     log.info("every run: %s", sweep.output.out / "results.csv")
-    _report(sweep.output.out)
+    _print_verdicts(_report(sweep.output.out), sweep.output.out, rows, given["as_json"])
     failed = [row for row in rows if not row.is_usable]
     if failed and given["strict"]:
         raise GateError(f"--strict: {len(failed)} of {len(rows)} runs failed, the first one: {failed[0].reason}")
@@ -121,25 +124,40 @@ def _print(rows: list[StudyRow]) -> None:
     show(aligned(best_table(rows), 2) + "\n")
 
 
-def _report(folder: Path) -> None:
-    """Write the report and print its verdicts."""
+def _report(folder: Path) -> list[str]:
+    """Write the report; the sentences of its verdicts."""
     options.require_there(folder / "results.csv")
     from lslam.studies.sweep import report_folder
 
-    for result in report_folder(folder):
-        for verdict in result.verdicts:
-            show(f"{verdict.sentence}\n")
+    verdicts = [verdict.sentence for result in report_folder(folder) for verdict in result.verdicts]
     log.info("report: %s", folder / "report.html")
+    return verdicts
 
 
-def _print_list() -> None:
+def _print_verdicts(verdicts: list[str], folder: Path, rows: list[StudyRow] | None, as_json: bool) -> None:
+    if not as_json:
+        show("".join(f"{verdict}\n" for verdict in verdicts))
+        return
+    document: dict[str, Any] = {"folder": str(folder), "results": str(folder / "results.csv")}
+    if rows is not None:
+        from lslam.reports.study_table import rows_document
+
+        document["runs"] = rows_document(rows)
+    document["verdicts"] = verdicts
+    show(json.dumps(document) + "\n")
+
+
+def _print_list(as_json: bool) -> None:
     from lslam.studies.study_files import find_study, study_names
 
+    if as_json:
+        show(json.dumps({"studies": {name: find_study(name).summary for name in study_names()}}) + "\n")
+        return
     for name in study_names():
         show(f"{name:<22}  {find_study(name).summary}\n")
 
 
-def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack) -> None:
+def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack, as_json: bool) -> None:
     """Print every run, their number, and the estimated time of those that are not finished."""
     from lslam.cli.study_screen import bars
     from lslam.studies.estimate import estimate, from_finished
@@ -147,19 +165,21 @@ def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack) 
     from lslam.studies.sweep import expand_study
 
     expanded = expand_study(sweep)
-    for job in expanded.jobs:
-        show(f"{job.name}\n")
     left = left_to_do(sweep.output, expanded.jobs)
     many = f"{len(expanded.jobs)} runs, {len(left)} left to do"
-    if not left:
-        show(f"{many}\n")
-        return
-    if is_piloted:
+    if not as_json:
+        show("".join(f"{job.name}\n" for job in expanded.jobs))
+    if left and is_piloted:
         guess = estimate(left, expanded.variants, at_once, bars(stack), time.process_time())
-        show(f"{many}: about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)\n")
-        return
-    earlier = from_finished(expanded.jobs, left, expanded.variants, at_once)
-    if earlier is None:
-        show(f"{many}; --pilot estimates their time by a few short runs\n")
+        many += f": about {guess.text}, {at_once} at once ({guess.pilots} pilot runs)"
+    elif left:
+        earlier = from_finished(expanded.jobs, left, expanded.variants, at_once)
+        if earlier is None:
+            many += "; --pilot estimates their time by a few short runs"
+        else:
+            many += f": about {earlier.text}, {at_once} at once (as the finished ones took)"
+    if as_json:
+        names = {"runs": [job.name for job in expanded.jobs], "left_to_do": [job.name for job in left]}
+        show(json.dumps(names | {"summary": many}) + "\n")
     else:
-        show(f"{many}: about {earlier.text}, {at_once} at once (as the finished ones took)\n")
+        show(f"{many}\n")

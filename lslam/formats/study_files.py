@@ -74,7 +74,7 @@ def read_study_csv(path: Path) -> list[StudyRow]:
             f"{path} was written by another version of lslam (study version {other}, this one reads {VERSION}): "
             "--overwrite makes its runs anew, --out names another folder"
         )
-    if missing := [name for name in _PLAIN if name not in header]:
+    if missing := [name for name in _PLAIN if name not in header and name != "path"]:
         raise InputError(f"{path} is not complete: column {', '.join(missing)} is missing")
     rows = []
     for number, cells in enumerate(lines[1:], 2):
@@ -88,7 +88,8 @@ def read_study_csv(path: Path) -> list[StudyRow]:
 
 
 def _row(cells: dict[str, str]) -> StudyRow:
-    values: dict[str, Any] = {name: _READ[kind](cells[name]) for name, kind in _PLAIN.items()}
+    # Earlier tables have no column `path`.
+    values: dict[str, Any] = {name: _READ[kind](cells.get(name, "")) for name, kind in _PLAIN.items()}
     if values["metric"] not in get_args(StudyMetric):
         raise ValueError(f"metric {values['metric']!r} is none of {', '.join(get_args(StudyMetric))}")
     stages = {name.removeprefix(STAGE): float(text) for name, text in cells.items() if name.startswith(STAGE) and text}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from math import inf
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from lslam.evaluation.curves import normalise
 from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable
+from lslam.reports.evaluations import strict
 from lslam.reports.grid_text import Grid
 from lslam.types.sensitivity import CurveResult, Interval, Law, StudyResult
 from lslam.types.study import StudyRow
@@ -232,6 +234,13 @@ def batch_table(rows: Sequence[StudyRow]) -> Grid:
         end = row.folder if row.is_usable else row.reason
         lines.append([row.sequence, label(row), row.status, str(row.scans), *shown, end])
     return [header, *lines]
+
+
+def rows_document(rows: Sequence[StudyRow]) -> list[dict[str, Any]]:
+    """The rows as plain values for JSON, None for a number that is not there."""
+    documents = strict([asdict(row) for row in rows])
+    assert isinstance(documents, list)
+    return documents
 
 
 def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:

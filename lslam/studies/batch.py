@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from lslam.config import Config
-from lslam.config.study import BatchConfig, parse_batch
-from lslam.errors import UsageError
+from lslam.config.study import BatchConfig, BatchJob, parse_batch
+from lslam.errors import InputError, UsageError
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe, toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same
-from lslam.studies.grid import Job, cells_of, expand, label_of, run_folder
+from lslam.studies.grid import Cell, Job, cells_of, expand, label_of, run_folder
 from lslam.studies.output import BATCH, OutputOptions
+from lslam.studies.subjects import unique_labels
 from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, settings_of
 from lslam.types.sequence import Sequence as Recording
 from lslam.types.trajectory import Trajectory
@@ -27,7 +28,7 @@ class RunLine:
     """One `lslam run`, resolved: what it reads, how, and where it is written.
 
     words : of its command line; label, path, digest : of the recording; imu : digest of its IMU, empty when it is not used
-    reading : what else it is opened with; folder : None to choose
+    reading : what else it is opened with; folder : None to choose; refusal : why it cannot be read, empty when it can
     """
 
     words: str
@@ -39,6 +40,7 @@ class RunLine:
     truth: Trajectory | None = None
     folder: Path | None = None
     reading: dict[str, Any] = field(default_factory=dict)
+    refusal: str = ""
 
 
 def opened_line(
@@ -62,27 +64,46 @@ def listed_line(words: str, path: Path, config: Config, folder: Path | None, rea
     return RunLine(words, label_of(path), path, listing_digest(path), "", config, None, folder, reading)
 
 
-def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[str] = ()) -> ExpandedStudy:
-    """All runs of a batch file; `settings` ("a.b=v") beat what it says.
+def refused_line(words: str, path: Path, config: Config, folder: Path | None, refusal: str) -> RunLine:
+    """Of a recording that cannot be read: its run fails with `refusal`."""
+    return RunLine(words, label_of(path), path, "", "", config, None, folder, refusal=refusal)
 
-    Raises ConfigError, UsageError or InputError for methods, recordings and scenarios that make no sense; OutputExistsError
-    when it is to go on in the folder of another list.
+
+def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[str] = ()) -> ExpandedStudy:
+    """All runs of a batch file; `settings` ("a.b=v") beat what it says. Runs of a recording that cannot be read will fail.
+
+    Raises ConfigError, UsageError or InputError for methods and scenarios that make no sense, and when no recording can be
+    read; OutputExistsError when it is to go on in the folder of another list.
     """
     text = toml_text(batch.model_dump(mode="json", exclude_none=True, exclude_defaults=True))
     check_same(output, BATCH, "batch", text, _names)
     jobs: list[Job] = []
     found: dict[str, Variant] = {}
     taken: set[str] = set()
+    parts: list[tuple[list[Cell], list[Variant], BatchJob]] = []
     for entry in batch.jobs:
         common = [*settings_of(batch.config), *settings_of(entry.config), *settings]
         variants = []
         for variant in find_variants(entry.methods, None, common, entry.imu):
             # One method with two configurations is two folders.
             variants.append(replace(variant, name=free_name(variant.name, taken), without=""))
-        cells = cells_of(entry.sequences, entry.seeds, variants, output, settings)
-        jobs += expand(cells, variants, entry.seeds, output.out, output.command)
+        parts.append(
+            (cells_of(entry.sequences, entry.seeds, variants, output, settings, may_fail=True), variants, entry)
+        )
         found |= {variant.name: variant for variant in variants}
+    every = [cell for cells, _, _ in parts for cell in cells]
+    names = iter(unique_labels([c.sequence for c in every], [None if c.scene else c.path for c in every]))
+    for cells, variants, entry in parts:
+        named = [replace(cell, sequence=next(names)) for cell in cells]
+        jobs += expand(named, variants, entry.seeds, output.out, output.command)
+    _check_readable(jobs)
     return ExpandedStudy("batch", "batch", BATCH, text, jobs, found)
+
+
+def _check_readable(jobs: Sequence[Job]) -> None:
+    """Raise InputError when no recording of the jobs can be read, with the reason of the first."""
+    if jobs and all(job.refusal for job in jobs):
+        raise InputError(jobs[0].refusal)
 
 
 def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStudy:
@@ -96,14 +117,15 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
     jobs: list[Job] = []
     found: dict[str, Variant] = {}
     owners: dict[Path, int] = {}
-    for number, line in enumerate(lines, 1):
+    labels = unique_labels([line.label for line in lines], [line.path for line in lines])
+    for number, (line, label) in enumerate(zip(lines, labels, strict=True), 1):
         method = line.config.odometry.preset or line.config.odometry.method
         name = f"{number:03d}-{file_safe(method)}{WITH_IMU if line.config.imu.use else ''}"
         found[name] = Variant(name, line.config, method)
         seed = line.config.preprocess.seed
         how = hashlib.sha256(repr(sorted(line.reading.items())).encode()).hexdigest()
         digest = job_digest(line.config, line.digest + how, line.imu)
-        folder = run_folder(output.out, line.label, name, seed) if line.folder is None else line.folder
+        folder = run_folder(output.out, label, name, seed) if line.folder is None else line.folder
         if owners.setdefault(folder.resolve(), number) != number:
             raise UsageError(
                 f"run {owners[folder.resolve()]} and run {number} of the batch are both to be written to {folder}: give each "
@@ -111,10 +133,11 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
             )
         jobs.append(
             Job(
-                line.label, name, seed, line.path, line.config, folder, digest, line.words, line.truth,
-                output.data_root, reading=line.reading,
+                label, name, seed, line.path, line.config, folder, digest, line.words, line.truth,
+                output.data_root, reading=line.reading, refusal=line.refusal,
             )
         )  # fmt: skip
+    _check_readable(jobs)
     return ExpandedStudy("batch", "batch", BATCH, text, jobs, found)
 
 

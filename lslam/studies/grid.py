@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.config.study import StudySequence
-from lslam.errors import UsageError
+from lslam.errors import InputError, UsageError
 from lslam.formats.bag_listing import stem_of
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.readers.raw_drive import with_imu
-from lslam.remote import RemotePath
+from lslam.remote import RemotePath, as_path
 from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
 from lslam.studies.subjects import check_range, scans_needed, with_range
@@ -35,6 +35,7 @@ class Cell:
     digest : of the input; imu : likewise of its IMU, empty when no run asks for it
     data_root : where the IMU of a KITTI odometry sequence is looked for
     scene : what is simulated with `seed` when nothing lies in `path` yet; range : which scans are used, over the configuration
+    refusal : why the recording cannot be read: its runs fail with that
     """
 
     sequence: str
@@ -46,6 +47,7 @@ class Cell:
     data_root: Path | None = None
     scene: Scene | None = None
     range: ScanRange = AS_CONFIGURED
+    refusal: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class Job:
     method : the variant's name, the method of `config` or a preset that says more than a method
     digest : two jobs of one digest have the same result; scene : as of the cell; reading : what else `open_sequence` is given
     goes_on : where a run was begun and not finished, it is gone on with
+    refusal : why the recording cannot be read, empty when it can
     """
 
     sequence: str
@@ -70,6 +73,7 @@ class Job:
     scene: Scene | None = None
     reading: dict[str, Any] = field(default_factory=dict)
     goes_on: bool = False
+    refusal: str = ""
 
     @property
     def name(self) -> str:
@@ -109,7 +113,7 @@ def expand(
                 jobs.append(
                     Job(
                         cell.sequence, variant.name, seed, cell.path, config, folder, digest, command, cell.truth,
-                        cell.data_root, cell.scene,
+                        cell.data_root, cell.scene, refusal=cell.refusal,
                     )
                 )  # fmt: skip
     return jobs
@@ -174,10 +178,13 @@ def cells_of(
     variants: Sequence[Variant],
     output: OutputOptions,
     settings: Sequence[str] = (),
+    *,
+    may_fail: bool = False,
 ) -> list[Cell]:
     """Recordings as they are, scenarios once per seed, every one with a label of its own.
 
     settings : "a.b=v" that beat the sequences' own `start`, `count` and `skip_frames`
+    may_fail : a recording that cannot be read is a cell with its refusal
 
     Raises InputError for a recording that cannot be opened or lacks the IMU; UsageError or ConfigError for a scenario that is
     none, UsageError for a sequence that ends before the scans that are its own.
@@ -191,7 +198,7 @@ def cells_of(
         own = ScanRange(**{key: value for key, value in sequence.own.items() if f"input.{key}" not in beaten})
         needed = scans_needed([with_range(config, own).input for config in configs])
         made = (
-            [_recorded(sequence.path, own, needs_imu, output)]
+            [_recorded(sequence.path, own, needs_imu, output, may_fail)]
             if sequence.path
             else _simulated(sequence, own, needed, seeds, output)
         )
@@ -201,13 +208,19 @@ def cells_of(
     return cells
 
 
-def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions) -> Cell:
-    path = find_folder(word, output.data_root).absolute()
-    if isinstance(path, RemotePath):
-        # Thousands of recordings are not opened here over a network: each run says what is wrong with its own.
-        return Cell(label_of(path), path, None, listing_digest(path), data_root=output.data_root, range=own)
-    label = file_safe(open_sequence(path).name)
-    return recorded_cell(label, path, needs_imu=needs_imu, data_root=output.data_root, own=own)
+def _recorded(word: str, own: ScanRange, needs_imu: bool, output: OutputOptions, may_fail: bool) -> Cell:
+    path = as_path(word).expanduser().absolute()
+    try:
+        path = find_folder(word, output.data_root).absolute()
+        if isinstance(path, RemotePath):
+            # Thousands of recordings are not opened here over a network: each run says what is wrong with its own.
+            return Cell(label_of(path), path, None, listing_digest(path), data_root=output.data_root, range=own)
+        label = file_safe(open_sequence(path).name)
+        return recorded_cell(label, path, needs_imu=needs_imu, data_root=output.data_root, own=own)
+    except InputError as error:
+        if not may_fail:
+            raise
+        return Cell(label_of(path), path, None, "", data_root=output.data_root, range=own, refusal=str(error))
 
 
 def _simulated(

@@ -223,6 +223,7 @@ class Results:
             digest=job.digest,
             machine=state.machine,
             folder=_seen_from(self.out, job.folder),
+            path=_seen_from(self.out, job.path) if job.path.is_relative_to(self.out) else str(job.path),
             metric=self.metric,
         )
 

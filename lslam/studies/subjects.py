@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -68,20 +68,34 @@ def _find(word: str, data_root: Path | None) -> Subject:
 
 
 def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:
-    """Recordings of one name are told apart by the part of their paths in which all of them differ, or by a number."""
-    taken: dict[str, list[int]] = {}
-    for i, subject in enumerate(subjects):
-        taken.setdefault(subject.label, []).append(i)
-    out = list(subjects)
-    for label, indices in taken.items():
-        if len(indices) < 2:
+    names = unique_labels([s.label for s in subjects], [s.path for s in subjects])
+    return [replace(subject, label=name) for subject, name in zip(subjects, names, strict=True)]
+
+
+def unique_labels(labels: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
+    """Labels of recordings, None for a simulation; one for each path.
+
+    Those of one name are told apart by the part of their paths in which all of them differ, or by a number.
+    """
+    taken: dict[str, list[Path | None]] = {}
+    for label, path in zip(labels, paths, strict=True):
+        if path not in taken.setdefault(label, []):
+            taken[label].append(path)
+    out = {(label, places[0]): label for label, places in taken.items()}
+    used_labels = set(taken)
+    for label, places in taken.items():
+        if len(places) < 2:
             continue
-        parts = [((s.path and s.path.parts) or ("simulated",))[::-1] for s in (subjects[i] for i in indices)]
-        columns = [column for column in zip(*parts, strict=False) if len(set(column)) == len(column)]
-        names = [file_safe(part) for part in columns[0]] if columns else [str(k + 1) for k in range(len(indices))]
-        for i, name in zip(indices, names, strict=True):
-            out[i] = replace(subjects[i], label=f"{label}-{name}")
-    return out
+        parts = [((path and path.parts) or ("simulated",))[::-1] for path in places]
+        columns = [[file_safe(part) for part in column] for column in zip(*parts, strict=False)]
+        names = next((c for c in columns if len(set(c)) == len(c)), [str(k + 1) for k in range(len(places))])
+        for path, name in zip(places, names, strict=True):
+            own = f"{label}-{name}"
+            while own in used_labels:
+                own += "-2"
+            used_labels.add(own)
+            out[label, path] = own
+    return [out[label, path] for label, path in zip(labels, paths, strict=True)]
 
 
 def used(scans: int, config: InputConfig) -> int:

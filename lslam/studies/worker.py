@@ -18,7 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.errors import GateError, InterruptedRunError, LslamError, OutputExistsError, RunFailedError, RunFinishedError
+from lslam.errors import (
+    GateError,
+    InputError,
+    InterruptedRunError,
+    LslamError,
+    OutputExistsError,
+    RunFailedError,
+    RunFinishedError,
+)
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
 from lslam.pipeline.storage import spool_of
 from lslam.readers.selection import SequenceView
@@ -194,6 +202,8 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     from lslam.pipeline.run import run
     from lslam.pipeline.watch import RunOutcome, Watch
 
+    if job.refusal:
+        raise InputError(job.refusal)
     ended: list[RunOutcome] = []
     config = job.config
     key = (

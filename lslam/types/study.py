@@ -27,7 +27,7 @@ class StudyRow:
     is_timing_comparable : nothing else ran on the machine that the study knows of
     at_once : runs of the study that shared the machine
     digest : of the resolved configuration, the input and lslam's version; machine : name of the host
-    folder : of the run, from the study's
+    folder : of the run, from the study's; path : of the recording, from the study's where it lies in there
     """
 
     run: str
@@ -55,6 +55,7 @@ class StudyRow:
     digest: str = ""
     machine: str = ""
     folder: str = ""
+    path: str = ""
     metric: str = "ate_se3"
 
     @property

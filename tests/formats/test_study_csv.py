@@ -92,7 +92,7 @@ def test_no_rows_are_a_file_too(tmp_path: Path) -> None:
         ("ate_se3", "ate", "column ate_se3 is missing"),
         (",0.2,", ",much,", "line 2: could not convert string to float: 'much'"),
         (",true,", ",perhaps,", "line 2: 'perhaps' is neither true nor false"),
-        (",here,", ",", "line 2: 30 columns where the header has 31"),
+        (",here,", ",", "line 2: 31 columns where the header has 32"),
     ],
 )
 def test_results_of_another_version_are_an_error(tmp_path: Path, old: str, new: str, sentence: str) -> None:
