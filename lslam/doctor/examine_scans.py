@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.errors import InputError
-from lslam.odometry.sanity import FARTHEST_M
 from lslam.preprocessing.rings import RingRule
 from lslam.readers.selection import with_rings
-from lslam.types.scan import Scan
+from lslam.types.scan import FARTHEST_M, NO_RING, Scan
 from lslam.types.sequence import Sequence
 
 # A sweep lasts one period; drivers that cut it elsewhere stay well within these.
@@ -63,6 +62,10 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
     if empty:
         what = f"{empty} of the {len(indices)} scans looked at hold no points"
         findings.append(Finding("scan-empty", what, "a run skips them and bridges the motion"))
+    faulty = [s for s in scans if s["fault"]]
+    if faulty:
+        what = f"{len(faulty)} of the {len(indices)} scans looked at are not wholly right, the first is scan {faulty[0]['index']}"
+        findings.append(Finding("scan-faults", f"{what}: {faulty[0]['fault']}", "a run uses the rest of these scans"))
     full = [s for s in scans if s["count"]]
     far = [s for s in full if s["far"]]
     if far:
@@ -134,13 +137,13 @@ def _scan_facts(scan: Scan) -> Facts:
     ranges = np.linalg.norm(good, axis=1)
     elevation = np.degrees(np.arctan2(good[:, 2], np.hypot(good[:, 0], good[:, 1])))
     facts: Facts = {"count": len(scan), "valid": len(good), "nan": int((~finite).sum()), "zero": int(zero.sum())}
-    facts["far"] = int(far.sum())
+    facts |= {"far": int(far.sum()), "index": scan.index, "fault": scan.fault}
     if len(good):
         facts["ranges"] = [float(v) for v in np.percentile(ranges, [0, 5, 50, 95, 100])]
         # One per cent on either side: single points close by have wild elevations.
         facts["low"], facts["high"] = (float(v) for v in np.percentile(elevation, [1, 99]))
     for name, values in (("intensity", scan.intensity), ("times", scan.times), ("rings", scan.rings)):
-        known = None if values is None else values[np.isfinite(values)]
+        known = None if values is None else values[np.isfinite(values) & ((values != NO_RING) | (name != "rings"))]
         facts[name] = None if known is None or not len(known) else [float(known.min()), float(known.max())]
     return facts
 

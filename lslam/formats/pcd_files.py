@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import AXES
+from lslam.formats.point_cloud import AXES, organised
 from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
@@ -29,6 +29,7 @@ class _Header:
     dtypes: list[np.dtype[Any]]
     counts: list[int]
     points: int
+    shape: tuple[int, int]  # rows and columns
     encoding: str
     size: int  # bytes of the header itself
 
@@ -52,7 +53,9 @@ def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
     if header.points == 0:
         return {name: np.zeros(0, kind) for name, kind in zip(header.names, header.dtypes, strict=True)}
     read = {"ascii": _ascii_columns, "binary": _binary_columns}.get(header.encoding, _compressed_columns)
-    return read(path, header, body)
+    columns = {name: values for name, values in read(path, header, body).items() if name != "_"}
+    height, width = header.shape
+    return columns | (organised(height, width) if height * width == header.points else {})
 
 
 def write_pcd(
@@ -131,7 +134,7 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     if encoding not in ENCODINGS:
         raise InputError(f"{path}: PCD DATA {encoding!r} is unknown; known: {', '.join(ENCODINGS)}")
-    return _Header(names, dtypes, counts, points, encoding, size)
+    return _Header(names, dtypes, counts, points, (height, width), encoding, size)
 
 
 def _number(path: Path, key: str, *words: str) -> int:
@@ -162,10 +165,11 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
         raise InputError(f"{path}: PCD ascii lines hold {table.shape[1]} numbers where FIELDS and COUNT say {width}")
     columns, k = {}, 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        if count == 1 and name != "_" and k not in raw:
+        values = table[:, k] if count == 1 else table[:, k : k + count]
+        if k not in raw:
             # Text holds the digits that it holds, whatever type its header names.
             as_read = name.lower() in AXES or dtype.kind != "f"
-            columns[name] = table[:, k] if as_read else table[:, k].astype(dtype)
+            columns[name] = values if as_read else values.astype(dtype)
         k += count
     return columns
 
@@ -202,8 +206,10 @@ def _binary_columns(path: Path, header: _Header, body: memoryview) -> dict[str, 
         )
     columns, offset = {}, 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        if count == 1 and name != "_":
-            columns[name] = np.ndarray((header.points,), dtype, body, offset, (header.record,))
+        shape, strides = (header.points, count), (header.record, dtype.itemsize)
+        columns[name] = np.ndarray(
+            shape[:1] if count == 1 else shape, dtype, body, offset, strides[:1] if count == 1 else strides
+        )
         offset += dtype.itemsize * count
     return columns
 
@@ -226,8 +232,8 @@ def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[s
     columns, offset = {}, 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
         length = header.points * dtype.itemsize * count
-        if count == 1 and name != "_":
-            columns[name] = out[offset : offset + length].view(dtype)
+        values = out[offset : offset + length].view(dtype)
+        columns[name] = values if count == 1 else values.reshape(header.points, count)
         offset += length
     return columns
 

@@ -1,9 +1,10 @@
-"""One point cloud as files hold it: positions and the fields lslam knows by their usual names."""
+"""One point cloud as files hold it, and the one table of names by which the fields of all drivers and file kinds are known."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,69 +12,222 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.types.scan import NO_RING, is_measured
 
 AXES = ("x", "y", "z")
-INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity", "reflectance", "scalar_intensity", "remission")
-RING_NAMES = ("ring", "rings", "channel", "line", "laser_id", "scalar_ring")
-# docs/conventions.md, "Per-point times".
-TIME_NAMES = (
-    "t", "time", "times", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "stamp",
+# Names as `plain_name` makes them, the likeliest first. docs/conventions.md, "Fields of points", says whose they are.
+AXIS_NAMES = {axis: (axis, f"pos_{axis}", f"position_{axis}", f"point_{axis}") for axis in AXES}
+INTENSITY_NAMES = (
+    "intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "remittance", "amplitude", "signal",
+    "echo_intensity",
 )  # fmt: skip
+# Nothing else is called so; the others are rings when their values can be.
+_SURE_RING_NAMES = ("ring", "rings", "ring_id", "ring_index")
+RING_NAMES = (
+    *_SURE_RING_NAMES, "channel", "line", "laser_id", "channel_id", "line_id", "line_index", "laser", "laser_number", "beam",
+    "beam_id", "beam_index", "layer", "row", "scan_line", "scanline", "shorter_side",
+)  # fmt: skip
+TIME_NAMES = (
+    "t", "time", "times", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "stamp", "ts",
+    "point_time_offset", "relative_timestamp", "relative_time", "rel_time", "point_time", "point_timestamp", "gps_time",
+    "gpstime", "utc_time", "delta_time", "curvature",
+)  # fmt: skip
+# FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
+_DOUBTFUL_TIMES = {"curvature": "ms"}
+_UNITS = {
+    "s": ("s", "sec", "secs", "seconds"),
+    "ms": ("ms", "msec", "millis"),
+    "us": ("us", "usec", "micros", "microsec"),
+    "ns": ("ns", "nsec", "nsecs", "nanosec", "nanos", "nanoseconds"),
+}
+_UNIT_OF = {word: unit for unit, words in _UNITS.items() for word in words}
+_FINE_PER_S = {"ns": 10**9, "us": 10**6, "ms": 10**3}
+# Before `_sec` and `_nsec`, where it is none of `TIME_NAMES`.
+_CLOCKS = ("", "lidar", "sensor", "point", "utc", "gps", "header", "epoch")
+ORGANISED = "(shorter side)"
+# A field of another name than ring with fewer values numbers the heads of a sensor, with more its columns; the values of a
+# small cloud say nothing.
+_FEWEST_RINGS, _MOST_RINGS, _TOO_SMALL = 4, 300, 100
+
+
+@dataclass(frozen=True)
+class TimeColumn:
+    """A field, or two together, that may hold per-point times.
+
+    name : in the file; values : (N,) as stored, of any type; unit : `s`, `ms`, `us` or `ns` where the name says it, else empty
+    is_doubtful : other software uses the name for something else
+    """
+
+    name: str
+    values: NDArray[Any]
+    unit: str = ""
+    is_doubtful: bool = False
 
 
 @dataclass(frozen=True)
 class PointCloud:
     """What a point file holds.
 
-    points : (N, 3) float32 (of maps float64), m; intensity : (N,) float32 or None; rings : (N,) uint16 or None
-    times : (N,) per-point times as stored, of any type and unit, or None; time_field : their name in the file
+    points : (N, 3) float32 (of maps float64), m; intensity : (N,) float32 or None
+    rings : (N,) uint16, `NO_RING` where a point has none, or None
+    clocks : what may be per-point times, the likeliest first; fields : those read as the above; unread : the others
     """
 
     points: NDArray[Any]
     intensity: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
-    times: NDArray[Any] | None = None
-    time_field: str = ""
+    clocks: tuple[TimeColumn, ...] = ()
+    fields: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def times(self) -> NDArray[Any] | None:
+        """(N,) per-point times as stored, of any type and unit, by the likeliest field alone; None without one."""
+        return self.clocks[0].values if self.clocks else None
+
+    def select(self, mask: NDArray[Any]) -> PointCloud:
+        """The points that `mask` (bool or indices) keeps, with all their fields."""
+        return replace(
+            self,
+            points=self.points[mask],
+            intensity=None if self.intensity is None else self.intensity[mask],
+            rings=None if self.rings is None else self.rings[mask],
+            clocks=tuple(replace(clock, values=clock.values[mask]) for clock in self.clocks),
+        )
+
+
+def organised(rows: int, cols: int) -> dict[str, NDArray[Any]]:
+    """The shorter side of an organised cloud as a column, which gives the rings where no field does; nothing of a plain list."""
+    if min(rows, cols) < 2:
+        return {}
+    return {ORGANISED: np.asarray(np.divmod(np.arange(rows * cols), cols)[0 if rows <= cols else 1], np.uint32)}
 
 
 def cloud_from_fields(
     path: Path, columns: Mapping[str, NDArray[Any]], kind: type[np.floating[Any]] = np.float32
 ) -> PointCloud:
-    """Collect x, y, z and the fields known by name (case does not matter) from one array per field.
+    """Collect x, y, z and the fields known by name from one array per field, (N,) or, where a field repeats, (N, K).
 
     kind : of the points: float32 for scans, float64 for maps
 
     Raises InputError naming the file and the fields it has when x, y or z is missing.
     """
-    lower = {name.lower(): name for name in columns}
-    missing = [axis for axis in "xyz" if axis not in lower]
+    columns = {name: values for name, values in columns.items() if values.ndim == 1 or values.shape[1]}
+    names: dict[str, str] = {}
+    for name in columns:
+        names.setdefault(plain_name(name), name)
+    axes = [_first(names, AXIS_NAMES[axis]) for axis in "xyz"]
+    missing = [axis for axis, name in zip("xyz", axes, strict=True) if name is None]
     if missing:
         raise InputError(f"{path}: no field {', '.join(missing)}; the file has {', '.join(columns) or 'no fields'}")
-    points = np.empty((len(columns[lower["x"]]), 3), kind)
-    for k, axis in enumerate("xyz"):
-        points[:, k] = columns[lower[axis]]
-    intensity = _first(lower, INTENSITY_NAMES)
-    ring = _first(lower, RING_NAMES)
-    time = _first(lower, TIME_NAMES)
+    first = {name: values if values.ndim == 1 else values[:, 0] for name, values in columns.items()}
+    points = np.empty((len(first[axes[0] or ""]), 3), kind)
+    for k, axis in enumerate(axes):
+        points[:, k] = first[axis or ""]
+    intensity = _first(names, INTENSITY_NAMES)
+    ring, rings = _find_rings(points, {names[plain]: first[names[plain]] for plain in RING_NAMES if plain in names})
+    fields = [name for name in (*axes, intensity, ring) if name is not None]
     return PointCloud(
         points,
-        None if intensity is None else np.ascontiguousarray(columns[intensity], np.float32),
-        None if ring is None else _as_rings(path, ring, columns[ring]),
-        None if time is None else np.ascontiguousarray(columns[time]),
-        time or "",
+        None if intensity is None else np.ascontiguousarray(first[intensity], np.float32),
+        rings,
+        tuple(_clocks(names, columns)),
+        tuple(fields),
+        tuple(name for name in columns if name not in (*fields, ORGANISED) and plain_name(name)),
     )
 
 
-def _first(lower: Mapping[str, str], names: tuple[str, ...]) -> str | None:
-    return next((lower[name] for name in names if name in lower), None)
+def plain_name(name: str) -> str:
+    """`name` in lower case with one underscore between words, and without CloudCompare's `scalar_`."""
+    parted = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+    return re.sub(r"[^a-z0-9]+", "_", parted.lower()).strip("_").removeprefix("scalar_")
 
 
-def _as_rings(path: Path, name: str, values: NDArray[Any]) -> NDArray[np.uint16]:
-    if np.can_cast(values.dtype, np.uint16):
-        return values.astype(np.uint16)
-    if len(values) and not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 65535):
-        raise InputError(f"{path}: field {name!r} holds no ring numbers (0 to 65535)")
-    return values.astype(np.uint16)
+def _first(names: Mapping[str, str], wanted: tuple[str, ...]) -> str | None:
+    return next((names[plain] for plain in wanted if plain in names), None)
+
+
+def _find_rings(
+    points: NDArray[np.float32], candidates: Mapping[str, NDArray[Any]]
+) -> tuple[str | None, NDArray[np.uint16] | None]:
+    """The first of the fields whose values can be rings; points that were not measured have no say."""
+    for name, values in candidates.items():
+        if np.can_cast(values.dtype, np.uint16):
+            rings = values.astype(np.uint16)
+        else:
+            with np.errstate(invalid="ignore"):
+                is_ring = (values >= 0) & (values < NO_RING) & (np.floor(values) == values)
+            rings = np.where(is_ring, values, NO_RING).astype(np.uint16)
+            if not is_ring.all():
+                measured = is_measured(points)
+                if 2 * np.count_nonzero(is_ring & measured) < np.count_nonzero(measured):
+                    continue
+        if plain_name(name) not in _SURE_RING_NAMES and len(rings) > _TOO_SMALL:
+            count = np.count_nonzero(np.bincount(rings[rings != NO_RING]))
+            if not _FEWEST_RINGS <= count <= _MOST_RINGS:
+                continue
+        return name, rings
+    return None, None
+
+
+def _clocks(names: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> Iterator[TimeColumn]:
+    """Two columns of seconds and their fractions first, then single fields in the order of the table."""
+    parted = {plain: _part_unit(plain) for plain in names}
+    by_unit = {part: names[plain] for plain, part in parted.items()}
+    for (clock, unit), name in by_unit.items():
+        fine = next((u for u in _FINE_PER_S if unit == "s" and (clock, u) in by_unit), None)
+        if fine is not None and (clock in _CLOCKS or clock in TIME_NAMES):
+            other = by_unit[clock, fine]
+            yield from _seconds_and(fine, f"{name} + {other}", columns[name], columns[other])
+    known = [plain for plain in names if parted[plain][0] in TIME_NAMES]
+    for plain in sorted(known, key=lambda plain: (TIME_NAMES.index(parted[plain][0]), plain)):
+        name, (clock, unit) = names[plain], parted[plain]
+        values = columns[name]
+        if values.ndim == 2 and values.shape[1] == 2:
+            yield from _two_words(name, values)
+        elif values.ndim == 1 and values.dtype.kind in "fiu":
+            is_doubtful = clock in _DOUBTFUL_TIMES
+            yield TimeColumn(name, values, unit or _DOUBTFUL_TIMES.get(clock, ""), is_doubtful)
+
+
+def _part_unit(plain: str) -> tuple[str, str]:
+    """`time_offset_ns` -> ("time_offset", "ns"); no unit where the last word is none."""
+    if plain in TIME_NAMES:
+        return plain, ""
+    clock, _, word = plain.rpartition("_")
+    return (clock, _UNIT_OF[word]) if word in _UNIT_OF and (clock or len(word) > 2) else (plain, "")
+
+
+def _seconds_and(fine: str, name: str, seconds: NDArray[Any], parts: NDArray[Any]) -> Iterator[TimeColumn]:
+    """ns from whole seconds and `parts` of a second in the unit `fine`; nothing where the values are something else."""
+    whole, part = _integers(seconds), _integers(parts)
+    if whole is None or part is None or 2 * np.count_nonzero((part >= 0) & (part < _FINE_PER_S[fine])) < len(part):
+        return
+    yield TimeColumn(name, whole * 10**9 + part * (10**9 // _FINE_PER_S[fine]), "ns")
+
+
+def _two_words(name: str, values: NDArray[Any]) -> Iterator[TimeColumn]:
+    """What a field of two numbers of 32 bits can be: content decides."""
+    words = _integers(values)
+    if words is None or (values.dtype.kind in "iu" and values.dtype.itemsize != 4):
+        return
+    low, high = (words[:, k].astype(np.uint32).astype(np.uint64) for k in (0, 1))
+    shift = np.uint64(32)
+    yield TimeColumn(name, (high << shift) | low)
+    yield from _seconds_and("ns", f"{name} (s, ns)", words[:, 0], words[:, 1])
+    yield TimeColumn(f"{name} (high, low)", (low << shift) | high)
+    yield TimeColumn(f"{name} (float64)", ((high << shift) | low).view(np.float64))
+
+
+def _integers(values: NDArray[Any]) -> NDArray[np.int64] | None:
+    """The values as int64, 0 where they are not finite; None where some have a fraction or none are numbers."""
+    if values.dtype.kind in "iu":
+        return values.astype(np.int64)
+    if values.dtype.kind != "f":
+        return None
+    finite = np.where(np.isfinite(values) & (np.abs(values) < 2.0**62), values, 0)
+    whole: NDArray[np.int64] = finite.astype(np.int64)
+    return whole if (whole == finite).all() else None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.point_cloud import RING_NAMES, PointCloud, cloud_from_fields
+from lslam.formats.point_cloud import PointCloud, cloud_from_fields, organised
 
 # sensor_msgs/PointField
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -24,7 +24,7 @@ _LIVOX_BYTES = 19
 
 
 def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
-    """Points of a PointCloud2, those without a finite place and time left out with all their fields.
+    """Points of a PointCloud2, those without a finite place left out with all their fields.
 
     Rows may be padded and numbers big-endian. An organised cloud without a ring field gets its rows (its columns, where there
     are fewer of them) as rings. Raises InputError naming `where` when fields and data contradict each other.
@@ -41,10 +41,7 @@ def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
     dtype = _dtype(message, where)
     table = np.ndarray((height, width), dtype, np.ascontiguousarray(message.data).data, 0, (row_step, step)).reshape(-1)
     columns: dict[str, NDArray[Any]] = {name: _native(table[name]) for name in dtype.names or ()}
-    if height > 1 and not any(name.lower() in RING_NAMES for name in columns):
-        rows, cols = np.divmod(np.arange(height * width), width)
-        columns["ring"] = (rows if height <= width else cols).astype(np.uint16)
-    return _finite(cloud_from_fields(where, columns))
+    return _finite(cloud_from_fields(where, columns | organised(height, width)))
 
 
 def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path) -> tuple[PointCloud, int]:
@@ -59,8 +56,7 @@ def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path
         table = np.frombuffer(padded, dtype, count)
     except ValueError:
         raise InputError(f"{where}: a Livox message of {len(data)} bytes is cut off") from None
-    columns = {name: _native(table[name]) for name in ("x", "y", "z", "offset_time", "line")}
-    columns["intensity"] = table["reflectivity"].astype(np.float32)
+    columns = {name: _native(table[name]) for name in ("x", "y", "z", "reflectivity", "offset_time", "line", "tag")}
     return _finite(cloud_from_fields(where, columns)), timebase
 
 
@@ -90,15 +86,19 @@ def _dtype(message: Any, where: Path) -> np.dtype[Any]:
     order = ">" if message.is_bigendian else "<"
     known = [f for f in message.fields if f.datatype in _TYPES]
     step = int(message.point_step)
-    wrong = [f.name for f in known if f.offset + np.dtype(_TYPES[f.datatype]).itemsize > step]
-    if wrong:
-        raise InputError(f"{where}: field {wrong[0]!r} of the cloud lies beyond its {step} bytes per point")
-    unique = {f.name: f for f in known}
+    formats = {}
+    for f in known:
+        kind = np.dtype(order + _TYPES[f.datatype])
+        if f.offset + kind.itemsize > step:
+            raise InputError(f"{where}: field {f.name!r} of the cloud lies beyond its {step} bytes per point")
+        # A count that reaches beyond the point is not believed.
+        is_repeated = f.count > 1 and f.offset + f.count * kind.itemsize <= step
+        formats[f.name] = (np.dtype((kind, (f.count,))) if is_repeated else kind, int(f.offset))
     return np.dtype(
         {
-            "names": list(unique),
-            "formats": [order + _TYPES[f.datatype] for f in unique.values()],
-            "offsets": [int(f.offset) for f in unique.values()],
+            "names": list(formats),
+            "formats": [kind for kind, _ in formats.values()],
+            "offsets": [offset for _, offset in formats.values()],
             "itemsize": step,
         }
     )
@@ -109,15 +109,5 @@ def _native(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _finite(cloud: PointCloud) -> PointCloud:
-    finite = np.isfinite(cloud.points)
-    timed = True if cloud.times is None else np.isfinite(cloud.times)
-    if finite.all() and np.all(timed):
-        return cloud
-    good = finite.all(axis=1) & timed
-    return PointCloud(
-        cloud.points[good],
-        None if cloud.intensity is None else cloud.intensity[good],
-        None if cloud.rings is None else cloud.rings[good],
-        None if cloud.times is None else cloud.times[good],
-        cloud.time_field,
-    )
+    finite = np.asarray(np.isfinite(cloud.points).all(axis=1))
+    return cloud if finite.all() else cloud.select(finite)

@@ -19,12 +19,12 @@ from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry
-from lslam.odometry.sanity import FARTHEST_M, measurable
+from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.readers.selection import Selection
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import MotionModel
-from lslam.types.scan import Scan, Span
+from lslam.types.scan import FARTHEST_M, Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -69,7 +69,7 @@ def estimate(
             began = time.perf_counter()
             tracker.check(len(results), loaded, result)
             stages["integrity"] = time.perf_counter() - began
-        result = replace(result, stages=stages)
+        result = replace(result, stages=stages, fault="" if loaded.scan is None else loaded.scan.fault)
         results.append(result)
         on_scan(result)
         failures = 0 if result.status == "ok" else failures + 1
@@ -89,13 +89,17 @@ def _failures_at_end(results: list[ScanResult]) -> int:
 
 
 def sweep_of(sequence: Sequence) -> Span | None:
-    """When sweeps begin and end, None when points have no times: the first scan with points speaks for all."""
+    """When sweeps begin and end, None when points have no times: the first scan with a sweep that is half a period or longer
+    speaks for all, or the longest of the first ten."""
+    longest: Span | None = None
     for i in range(min(len(sequence), 10)):
         with suppress(InputError):
             scan = sequence.scan(i)
-            if len(scan):
-                return None if scan.times is None else scan.span
-    return None
+            if len(scan) and scan.times is not None and (longest is None or scan.span.seconds > longest.seconds):
+                longest = scan.span
+        if longest is not None and longest.seconds * sequence.rate_hz >= 0.5:
+            break
+    return longest
 
 
 def is_diverged(results: list[ScanResult], max_failures: int) -> bool:

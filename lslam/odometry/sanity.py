@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.kernels import voxel
-from lslam.types.scan import Scan
+from lslam.types.scan import FARTHEST_M, Scan
 from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
-# m along each axis: no LiDAR that is carried along the ground or a little above sees as far.
-FARTHEST_M = 10_000.0
 # m/s and rad/s: trains and small aircraft are slower, and racing drones turn less. Over a shorter time than so many seconds a
 # registration may err by as much.
 FASTEST_M_S, FASTEST_RAD_S, LEAST_S = 150.0, 20.0, 0.1

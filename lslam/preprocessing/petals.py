@@ -20,7 +20,7 @@ from lslam.preprocessing.features import (
     gather_features,
 )
 from lslam.preprocessing.prepare import gate_points
-from lslam.types.scan import Scan
+from lslam.types.scan import NO_RING, Scan
 
 Floats = NDArray[np.float64]
 
@@ -80,7 +80,8 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
 def walk_lines(scan: Scan, gate: PreprocessConfig) -> RingWalk:
     """The gated points of a scan laser after laser in the order of firing, cut into lines. Raises InputError as above."""
     lasers = np.zeros(len(scan), np.uint16) if scan.rings is None else scan.rings
-    order, starts = curvature.into_rings(lasers, gate_points(scan.points, gate))
+    kept = gate_points(scan.points, gate)
+    order, starts = curvature.into_rings(lasers, kept[lasers[kept] != NO_RING])
     if scan.times is not None:
         order = order[np.lexsort((scan.times[order], lasers[order]))]
     points, ranges, steps, step, _, _ = curvature.walk(scan.points, order, starts)

@@ -12,7 +12,7 @@ from lslam.config.input import RINGS
 from lslam.errors import InputError, UsageError
 from lslam.kernels import ring_order
 from lslam.preprocessing.beams import elevation_borders
-from lslam.types.scan import Scan
+from lslam.types.scan import NO_RING, Scan
 
 Kind = Literal["field", "rows", "order", "elevation"]
 Floats = NDArray[np.float64]
@@ -85,7 +85,9 @@ def decide_rings(scans: list[Scan], wanted: str = "auto", known: int | None = No
     UsageError : `wanted` is none of these. InputError : the scans do not have such rings, or none at all.
     """
     kind, count = parse_rings(wanted)
-    first = scans[0]
+    # The end of a sweep, which a driver may begin with, says nothing of its order.
+    usual = np.median([len(scan) for scan in scans])
+    first = next(scan for scan in scans if 2 * len(scan) >= usual)
     tried = {
         "field": lambda: _decide_field(scans),
         "rows": lambda: _decide_rows(first, count or known),
@@ -159,8 +161,8 @@ def _stab(start: Floats, end: Floats) -> float:
 
 
 def _decide_field(scans: list[Scan]) -> RingRule | None:
-    fields = [np.unique(s.rings) for s in scans if s.rings is not None]
-    if len(fields) < len(scans):
+    fields = [np.unique(s.rings[s.rings != NO_RING]) for s in scans if s.rings is not None]
+    if 2 * len(fields) <= len(scans):
         return None
     values = np.unique(np.concatenate(fields))
     # A driver that fills the field with zeros says nothing.

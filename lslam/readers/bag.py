@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
 from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
 from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
@@ -38,8 +36,9 @@ from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
 from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
+from lslam.readers.point_clock import PointClock, open_clock, read_samples
 from lslam.readers.point_stamps import point_stamps
-from lslam.readers.point_times import TimeRule, apply_rule, rule_of_scans
+from lslam.readers.point_times import Sample, TimeRule
 from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.sidecars import compensation_note
 from lslam.types.gnss import GnssStream
@@ -50,7 +49,6 @@ from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
-_LOOKED_AT = 5
 _OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 _SAID_NS = 1000  # shorter shifts are what absolute seconds are rounded by
 CAMERA = "cam0"
@@ -63,7 +61,7 @@ class BagSequence(Scans):
     """A `Sequence` over a bag. See `lslam.types.sequence` for the attributes every sequence has.
 
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
-    time_rule : how per-point times are understood, None when there are none or they are not to be used
+    clock : how per-point times are read, None when there are none or they are not to be used
     has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
     uses : what each topic that is used is used for; halves : further messages of a scan
     revolutions : of packets, which then are read in place of messages; unit_m : of coordinates, None where nobody states it
@@ -85,7 +83,7 @@ class BagSequence(Scans):
     gnss: GnssStream | None = None
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
-    time_rule: TimeRule | None = None
+    clock: PointClock | None = None
     rings: int | None = None
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
@@ -96,6 +94,11 @@ class BagSequence(Scans):
 
     def __len__(self) -> int:
         return len(self.messages)
+
+    @property
+    def time_rule(self) -> TimeRule | None:
+        """How per-point times are meant; None where `clock` is."""
+        return None if self.clock is None else self.clock.rule
 
     def scan(self, index: int) -> Scan:
         """Read scan `index`; a cloud without points gives an empty scan.
@@ -109,13 +112,13 @@ class BagSequence(Scans):
         stamp = int(self.headers_ns[index])
         cloud, shift = self.cloud(index)
         stamp += shift
-        times: NDArray[np.float32] | None = None
-        if self.time_rule is not None and not len(cloud):
-            times = np.zeros(0, np.float32)  # an empty scan must not look like one of a sensor without times
-        elif self.time_rule is not None and cloud.times is not None:
-            times, shift = apply_rule(self.time_rule, cloud.times, stamp)
-            stamp += shift
-        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
+        if self.clock is None:
+            return Scan(cloud.points, stamp, index, cloud.intensity, None, cloud.rings)
+        timed = self.clock.read(cloud, stamp)
+        cloud = timed.cloud
+        return Scan(
+            cloud.points, stamp + timed.shift_ns, index, cloud.intensity, timed.times, cloud.rings, fault=timed.fault
+        )
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
         """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
@@ -229,8 +232,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
         )
     settle_unit(sequence)
     _stamp_by_points(sequence)
-    if not info.motion_compensated:
-        _decide_times(sequence, info)
+    _open_clock(sequence, info)
     return sequence
 
 
@@ -274,44 +276,30 @@ def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
     return said if text is None else said.over(parse_sequence_toml(text, f"{path}, {INFO_TOPIC}"))
 
 
-def _decide_times(sequence: BagSequence, info: SequenceInfo) -> None:
-    """Find out on the first scans how per-point times are meant; stamps move to the scans' starts."""
-    count = min(len(sequence), _LOOKED_AT)
-    index, cloud, shift = _first_cloud(sequence, range(count))
-    if cloud.times is None or not len(cloud):
-        sequence.notes.append(
-            f"the points of {sequence.topic.name} have no times (looked for {', '.join(TIME_NAMES[:4])} and the like)"
-        )
+def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
+    """Find out on a few scans how per-point times are meant; stamps move to the scans' starts."""
+
+    def sample(index: int) -> Sample:
+        cloud, shift = sequence.cloud(index)
+        return Sample(cloud, int(sequence.headers_ns[index]) + shift)
+
+    samples = read_samples(len(sequence), sample)
+    sequence.clock = open_clock(list(samples.values()), sequence.rate_hz, info, sequence.notes, sequence.problems)
+    if sequence.clock is None:
+        if not info.motion_compensated and not any(sample.cloud.clocks for sample in samples.values()):
+            sequence.notes.append(
+                f"the points of {sequence.topic.name} have no times (looked for {', '.join(TIME_NAMES[:4])} and the like)"
+            )
         return
-    stamp = int(sequence.headers_ns[index]) + shift
-    _, late, _ = _first_cloud(sequence, range(count - 1, index, -1))
-    try:
-        rule = rule_of_scans(
-            cloud.time_field, cloud.times, np.zeros(0) if late.times is None else late.times, stamp, sequence.rate_hz,
-            info.point_time_unit, info.point_time_reference,
-        )  # fmt: skip
-    except InputError as error:
-        sequence.problems.append(f"no deskew: {error}")
-        return
-    shift += apply_rule(rule, cloud.times, stamp)[1]
-    sequence.time_rule = rule
-    sequence.notes.append(rule.sentence)
+    index = sequence.clock.first_whole(samples)
+    first = sample(index)
+    shift = first.stamp_ns + sequence.clock.read(first.cloud, first.stamp_ns).shift_ns - int(sequence.headers_ns[index])
     if shift:
         sequence.stamps_ns = sequence.headers_ns + shift
     if abs(shift) >= _SAID_NS:
         sequence.notes.append(
             f"stamps of the scans moved by {shift * 1e-9:.6f} s, to where their first points were measured"
         )
-
-
-def _first_cloud(sequence: BagSequence, indices: range) -> tuple[int, PointCloud, int]:
-    """The first of the scans `indices` that can be read and has points, its cloud and what `cloud` says of it; else no points."""
-    for index in indices:
-        with suppress(InputError):
-            cloud, shift = sequence.cloud(index)
-            if len(cloud):
-                return index, cloud, shift
-    return 0, PointCloud(np.zeros((0, 3), np.float32)), 0
 
 
 def find_extrinsics(

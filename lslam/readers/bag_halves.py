@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,18 +80,25 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
         return a
     if not len(a):
         return b
-    times = _times_of_both(a, b, later_ns)
+    if later_ns:
+        a, b = _moved(a, 0), _moved(b, later_ns)
+    times = _times_of_both(a, b)
     if not _is_complement(a, b, times) or (a.rings is None) != (b.rings is None):
         return None
     first, last = a, b
     if times is not None and np.median(times[1]) < np.median(times[0]):
-        first, last, times = b, a, times[::-1]
-    return PointCloud(
-        np.concatenate([first.points, last.points]),
-        _both(first.intensity, last.intensity),
-        _both(first.rings, last.rings),
-        None if times is None else np.concatenate(times),
-        a.time_field,
+        first, last = b, a
+    of_last = {clock.name: clock.values for clock in last.clocks}
+    return replace(
+        first,
+        points=np.concatenate([first.points, last.points]),
+        intensity=_both(first.intensity, last.intensity),
+        rings=_both(first.rings, last.rings),
+        clocks=tuple(
+            replace(clock, values=np.concatenate([clock.values, of_last[clock.name]]))
+            for clock in first.clocks
+            if clock.name in of_last
+        ),
     )
 
 
@@ -119,12 +127,16 @@ def _parts(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[int, ...]
         return ()
 
 
-def _times_of_both(a: PointCloud, b: PointCloud, later_ns: int) -> tuple[NDArray[Any], NDArray[Any]] | None:
+def _moved(cloud: PointCloud, later_ns: int) -> PointCloud:
+    """The cloud with times in ns that count from an earlier base."""
+    clocks = (replace(clock, values=clock.values.astype(np.int64) + later_ns) for clock in cloud.clocks)
+    return replace(cloud, clocks=tuple(clocks))
+
+
+def _times_of_both(a: PointCloud, b: PointCloud) -> tuple[NDArray[Any], NDArray[Any]] | None:
     if a.times is None or b.times is None or a.times.dtype != b.times.dtype:
         return None
-    if not later_ns:
-        return a.times, b.times
-    return a.times.astype(np.int64), b.times.astype(np.int64) + later_ns
+    return a.times, b.times
 
 
 def _is_complement(a: PointCloud, b: PointCloud, times: tuple[NDArray[Any], NDArray[Any]] | None) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.state_files import DAMAGE
-from lslam.readers.point_times import TimeRule, apply_rule, azimuth_times
+from lslam.readers.point_clock import PointClock
+from lslam.readers.point_times import TimeRule, azimuth_times
 from lslam.readers.point_units import in_metres
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -30,7 +31,7 @@ class FolderSequence(Scans):
 
     files : one per scan; correction_deg : rotation of every point about p x z, 0 for none
     rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
-    time_rule : how the files' own per-point times are understood, None when they have none or are not to be used
+    clock : how the files' own per-point times are read, None when they have none or are not to be used
     sweep_s : (N, 2) begin and end of each sweep, s from its stamp, when per-point times follow from the azimuth; else None
     record : of the points, where the files do not name their fields; unit_m : of coordinates, None where nobody states it
     rings : number of beams, if known; sensor : its name, if known
@@ -53,7 +54,7 @@ class FolderSequence(Scans):
     rows: int | None = None
     cols: int | None = None
     per_point: Path | None = None
-    time_rule: TimeRule | None = None
+    clock: PointClock | None = None
     sweep_s: NDArray[np.float64] | None = None
     rings: int | None = None
     sensor: str | None = None
@@ -62,6 +63,11 @@ class FolderSequence(Scans):
 
     def __len__(self) -> int:
         return len(self.files)
+
+    @property
+    def time_rule(self) -> TimeRule | None:
+        """How per-point times are meant; None where `clock` is."""
+        return None if self.clock is None else self.clock.rule
 
     def scan(self, index: int) -> Scan:
         """Read scan `index`; an empty file gives an empty scan.
@@ -74,33 +80,34 @@ class FolderSequence(Scans):
         stamp = int(self.stamps_ns[index])
         is_kitti = path.suffix.lower() == ".bin" and self.record in (None, KITTI)
         cloud = in_metres(_split(read_bin(path)) if is_kitti else read_points(path, self.record), self.unit_m)
-        times, rings, stamp = self._times_and_rings(path, cloud, index, stamp)
+        cloud, times = self._times_and_rings(path, cloud, index)
+        fault = ""
+        if self.per_point is None and self.clock is not None:
+            cloud, times, shift_ns, fault, _ = self.clock.read(cloud, stamp)
+            stamp += shift_ns
         if self.correction_deg and len(cloud):
             from lslam.kernels.transform import rotate_up
 
             angle = math.radians(self.correction_deg)
             rotate_up(cloud.points, math.sin(angle), math.cos(angle))
-        return Scan(cloud.points, stamp, index, cloud.intensity, times, rings)
+        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings, fault=fault)
 
     def _times_and_rings(
-        self, path: Path, cloud: PointCloud, index: int, stamp: int
-    ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None, int]:
+        self, path: Path, cloud: PointCloud, index: int
+    ) -> tuple[PointCloud, NDArray[np.float32] | None]:
         times: NDArray[np.float32] | None = None
         rings = cloud.rings
         if self.per_point is not None and len(cloud):
             # Compensated scans have no times: nobody shall deskew them a second time.
             names = ("ring",) if self.motion_compensated else ("t", "ring")
             times, rings = _read_per_point(self.per_point / f"{path.stem}.npz", len(cloud), names)
-        elif self.time_rule is not None and cloud.times is not None:
-            times, shift_ns = apply_rule(self.time_rule, cloud.times, stamp)
-            stamp += shift_ns
         elif self.sweep_s is not None:
             times = azimuth_times(cloud.points, Span(*self.sweep_s[index].tolist()))
         if rings is None and self.rows is not None and self.cols is not None and len(cloud):
             if self.rows * self.cols != len(cloud):
                 raise InputError(f"{path}: {len(cloud)} points are not {self.rows} rows of {self.cols} columns")
             rings = np.repeat(np.arange(self.rows, dtype=np.uint16), self.cols)
-        return times, rings, stamp
+        return replace(cloud, rings=rings), times
 
 
 def _split(raw: NDArray[np.float32]) -> PointCloud:

@@ -17,7 +17,7 @@ from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_
 from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps
 from lslam.readers.lookup import sequence_number
 from lslam.readers.point_units import settle_unit
-from lslam.readers.scan_folder import time_rule
+from lslam.readers.scan_folder import clock_of_files
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
@@ -91,7 +91,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         sensor=info.sensor or (None if has_toml or record != KITTI else "HDL-64E"),
         record=record,
         unit_m=LENGTHS.get(info.point_unit or ""),
-        time_rule=time_rule(files, record, stamps, rate, info, voice) if has_times and not compensated else None,
+        clock=clock_of_files(files, record, stamps, rate, info, voice) if has_times and not compensated else None,
         notes=voice.notes,
         problems=voice.problems,
     )

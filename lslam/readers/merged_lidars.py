@@ -17,7 +17,7 @@ from lslam.errors import InputError
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.readers.selection import SequenceView, with_rings
 from lslam.readers.sidecars import read_info
-from lslam.types.scan import Scan, Span
+from lslam.types.scan import NO_RING, Scan, Span
 from lslam.types.sequence import Sequence
 
 # More than any LiDAR has: the rings of the k-th one begin at k times this.
@@ -220,8 +220,9 @@ def _moved(
     times = ((at_ns[kept] - stamp_ns) * 1e-9).astype(np.float32)
     rings = part.rings
     if rings is not None:
-        has_rings = not len(rings) or int(rings.max()) < RINGS_APART
-        rings = (rings + np.uint16(first_ring)).astype(np.uint16) if has_rings else None
+        known = rings != NO_RING
+        has_rings = int(rings[known].max(initial=0)) < RINGS_APART
+        rings = np.where(known, rings + np.uint16(first_ring), NO_RING).astype(np.uint16) if has_rings else None
     return replace(part, points=points, times=times, rings=rings)
 
 
@@ -237,7 +238,7 @@ def _joined(scan: Scan, parts: list[Scan], is_timed: bool) -> Scan:
 
     return replace(
         scan, points=np.concatenate([part.points for part in full]), intensity=column("intensity"), rings=column("rings"),
-        times=column("times") if is_timed else None,
+        times=column("times") if is_timed else None, fault="; ".join(filter(None, dict.fromkeys(part.fault for part in full))),
     )  # fmt: skip
 
 

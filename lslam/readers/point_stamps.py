@@ -38,9 +38,9 @@ def point_stamps(count: int, read: Callable[[int], PointCloud]) -> PointStamps |
             cloud = read(index)
         except InputError:
             continue
-        times = cloud.times
-        if times is not None and times.dtype.itemsize == 8 and len(cloud):
-            field = cloud.time_field
+        clock = next((clock for clock in cloud.clocks if clock.values.dtype.itemsize == 8), None)
+        if clock is not None and len(cloud):
+            field, times = clock.name, clock.values
             unit = unit or _unit_of(times)
             begin = _begin(times, unit) if unit else None
             if begin is not None:

@@ -1,20 +1,25 @@
-"""Per-point times of any sensor to seconds from the scan's stamp: the rule is decided once per sequence and said aloud."""
+"""Per-point times of any sensor to seconds from the scan's stamp: the rule is learnt on several scans and said aloud."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.types.scan import Span
+from lslam.formats.point_cloud import PointCloud, TimeColumn
+from lslam.types.scan import Span, is_measured
 
 _UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 # A field's unit is that in which the scan lasts so many of its periods; an offset that begins later is a clock's reading.
 _SHORTEST, _LONGEST = 0.05, 3.0
+# Times fill each of so many parts of a sweep with this share of the points at least, which real curvature, small nearly
+# everywhere, does not; and between neighbours they differ by less than this share of the sweep.
+_PARTS, _LEAST_IN_PART, _ALIKE = 10, 0.01, 0.05
 
 
 @dataclass(frozen=True)
@@ -24,78 +29,185 @@ class TimeRule:
     ns_per_unit : length of its unit, ns; is_absolute : clock readings instead of offsets
     is_before_stamp : offsets are negative, the stamp belongs to the scan's end and moves to its start
     sentence : the decision in words, for the log and the manifest
+    field : its name; sweep : usual length of a sweep, reach : how far from 0 an offset can be, both in its unit
+    points : usual number of points of a scan
     """
 
     ns_per_unit: float
     is_absolute: bool
     is_before_stamp: bool
     sentence: str
+    field: str = ""
+    sweep: float = np.inf
+    reach: float = np.inf
+    points: float = 0.0
 
 
-def decide_rule(
-    name: str,
-    values: NDArray[Any],
-    stamp_ns: int,
-    rate_hz: float,
-    unit: str | None = None,
-    reference: str | None = None,
-) -> TimeRule:
-    """Find unit and reference of a time field from one scan, unless they are stated.
+class Sample(NamedTuple):
+    """A scan by which a rule is learnt: its points, or every `step`-th of them, and the stamp of its header, ns."""
+
+    cloud: PointCloud
+    stamp_ns: int
+    step: int = 1
+
+    def thinned(self, most: int) -> Sample:
+        """The same with `most` points, or a few more where it has fewer than twice as many."""
+        step = max(len(self.cloud) // most, 1)
+        return (
+            self if step == 1 else Sample(self.cloud.select(np.arange(0, len(self.cloud), step)), self.stamp_ns, step)
+        )
+
+
+class _TimeReading(NamedTuple):
+    """What the times of one scan can be: unit, dtype, limits of the sweep in that unit, from which instant they count."""
+
+    unit: str
+    dtype: np.dtype[Any]
+    low: float
+    high: float
+    is_absolute: bool
+    instant: str
+
+
+def learn_rule(
+    samples: Sequence[Sample], rate_hz: float, unit: str | None = None, reference: str | None = None
+) -> TimeRule | None:
+    """Find the time field of a recording, its unit and reference, on several of its scans; None where no cloud has such a field.
 
     unit : s, ms, us or ns; reference : `start` or `end` of the scan, or `absolute`; None finds out
 
-    The unit is the one in which the scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that lie
-    about 0 refer to the scan's middle, others that are negative to its end, those that begin later than a scan can last are
-    readings of a clock, whatever its epoch (a sensor that was never told the time counts from where it was switched on).
-    Raises InputError with field, type, range and stamp when no unit fits.
+    A field is taken when it can hold times in half of the scans that have it; fields of most scans come first. The unit is the
+    one in which a scan lasts about 1 / `rate_hz`; integers are ns when that fits too. Offsets that lie about 0 refer to the
+    scan's middle, others that are negative to its end, those that begin later than a scan can last are readings of a clock,
+    whatever its epoch (a sensor that was never told the time counts from where it was switched on, a simulator from where the
+    recording begins).
+    Raises InputError with field, type, range and stamp when no field and unit fits.
     """
-    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
-    period_ns = 1e9 / rate_hz
-    fitting = [u for u, ns in _UNITS_NS.items() if _SHORTEST <= (high - low) * ns / period_ns <= _LONGEST]
-    if unit is not None:
-        fitting = [unit]
-    if not fitting or values.dtype.kind not in "fiu":
-        raise InputError(
-            f"per-point time field {name!r} ({values.dtype}, {low:.9g} to {high:.9g}, scan stamp {stamp_ns} ns) spans no "
-            f"scan of {1 / rate_hz:.3g} s in s, ms, us or ns; state rate_hz, or point_time_unit and point_time_reference, "
-            "in sequence.toml"
-        )
-    how = ", as stated" if unit or reference else ""
-    unit = "ns" if values.dtype.kind in "iu" and "ns" in fitting else fitting[0]
-    scale = _UNITS_NS[unit]
-    is_absolute = low * scale > _LONGEST * period_ns
-    is_about_stamp = reference is None and low < 0 and Span(low, high).instant == "scan_middle"
-    is_before_stamp = not is_absolute and low < 0 and not is_about_stamp
+    refusal: InputError | None = None
+    counts = Counter(clock.name for sample in samples for clock in sample.cloud.clocks)
+    for name in sorted(counts, key=lambda name: 2 * counts[name] < len(samples)):
+        readings, having = [], []
+        for sample in samples:
+            clock = next((c for c in sample.cloud.clocks if c.name == name), None)
+            if clock is None or not len(sample.cloud):
+                continue
+            having.append(sample)
+            try:
+                readings.append(_read(clock, sample, rate_hz, unit, reference))
+            except InputError as error:
+                refusal = refusal or (None if clock.is_doubtful else error)
+        if readings and 2 * len(readings) >= len(having):
+            return _agree(name, readings, having, rate_hz, unit, reference)
+    if refusal is not None:
+        raise refusal
+    return None
+
+
+def _agree(
+    name: str,
+    readings: list[_TimeReading],
+    having: list[Sample],
+    rate_hz: float,
+    unit: str | None,
+    reference: str | None,
+) -> TimeRule:
+    """The rule that most of the scans obey."""
+    usual = Counter(r.unit for r in readings).most_common(1)[0][0]
+    readings = [r for r in readings if r.unit == usual]
+    lows = np.array([r.low for r in readings])
+    # A clock that started with the recording looks like an offset in the first scans.
+    is_absolute = 2 * sum(r.is_absolute for r in readings) > len(readings) or (
+        readings[-1].is_absolute and bool((np.diff(lows) > 0).all())
+    )
+    instant = Counter(r.instant for r in readings if r.is_absolute == is_absolute).most_common(1)[0][0]
+    is_before_stamp = not is_absolute and instant == "scan_end"
     if reference is not None:
         is_absolute, is_before_stamp = reference == "absolute", reference == "end"
     words = (
         "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else
-        "relative to the scan's middle" if is_about_stamp else "since scan start"
+        "relative to the scan's middle" if instant == "scan_middle" and reference is None else "since scan start"
     )  # fmt: skip
+    how = ", as stated" if unit or reference else ""
+    ns = _UNITS_NS[usual]
+    farthest = max(max(abs(r.low), abs(r.high)) for r in readings)
     return TimeRule(
-        scale,
+        ns,
         is_absolute,
         is_before_stamp,
-        f"per-point times from field {name!r} ({values.dtype}), {unit}, {words}{how}",
+        f"per-point times from field {name!r} ({readings[0].dtype}), {usual}, {words}{how}",
+        name,
+        float(np.median([r.high - r.low for r in readings])),
+        np.inf if is_absolute else max(_LONGEST * 1e9 / rate_hz / ns, 1.5 * farthest),
+        float(np.median([sample.step * len(sample.cloud) for sample in having])),
     )
 
 
-def rule_of_scans(
-    name: str, first: NDArray[Any], later: NDArray[Any], stamp_ns: int, rate_hz: float, unit: str | None = None,
-    reference: str | None = None,
-) -> TimeRule:  # fmt: skip
-    """`decide_rule` for the first scan, and for a later one by which a clock that started with the recording is told.
+def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, reference: str | None) -> _TimeReading:
+    """What the times of one scan can be, by most of its points. Raises InputError when no unit fits."""
+    usable = is_usable(sample.cloud, clock.values)
+    values = clock.values[usable]
+    period_ns = 1e9 / rate_hz
+    limits = {u: _limits(values, _LONGEST * period_ns / ns) for u, ns in _UNITS_NS.items()}
+    fitting = [
+        u for u, ns in _UNITS_NS.items() if _SHORTEST <= (limits[u][1] - limits[u][0]) * ns / period_ns <= _LONGEST
+    ]
+    if clock.is_doubtful:
+        points = sample.cloud.points[usable]
+        fitting = [u for u in fitting if u == clock.unit and _is_swept(points, values, *limits[u])]
+    if unit is not None:
+        fitting = [unit]
+        limits[unit] = _limits(values, np.inf)
+    if not fitting:
+        low, high = _limits(values, np.inf)
+        raise InputError(
+            f"per-point time field {clock.name!r} ({values.dtype}, {low:.9g} to {high:.9g}, scan stamp {sample.stamp_ns} ns) "
+            f"spans no scan of {1 / rate_hz:.3g} s in s, ms, us or ns; state rate_hz, or point_time_unit and "
+            "point_time_reference, in sequence.toml"
+        )
+    usual = "ns" if values.dtype.kind in "iu" and "ns" in fitting else fitting[0]
+    usual = clock.unit if clock.unit in fitting else usual
+    low, high = limits[usual]
+    is_absolute = reference is None and low * _UNITS_NS[usual] > _LONGEST * period_ns
+    instant = "scan_start" if low >= 0 else Span(low, high).instant
+    return _TimeReading(usual, values.dtype, low, high, is_absolute, instant)
 
-    first, later : values of the field in two scans; stamp_ns : of the first
-    """
-    rule = decide_rule(name, first, stamp_ns, rate_hz, unit, reference)
-    if rule.is_absolute or rule.is_before_stamp or not len(later):
-        return rule
-    with suppress(InputError):
-        by_later = decide_rule(name, later, stamp_ns, rate_hz, unit, reference)
-        return by_later if by_later.is_absolute else rule
-    return rule
+
+def is_usable(cloud: PointCloud, values: NDArray[Any]) -> NDArray[np.bool_]:
+    """(N,) the points whose times count: measured ones, all where none is, whose time is a number."""
+    measured = is_measured(cloud.points)
+    if not measured.any():
+        measured[:] = True
+    return measured & np.isfinite(values) if values.dtype.kind == "f" else measured
+
+
+def _limits(values: NDArray[Any], width: float) -> tuple[float, float]:
+    """Smallest and largest value, or those of the densest part not wider than `width` when it holds more than half; else 0, 0."""
+    if not len(values):
+        return 0.0, 0.0
+    low, high = values.min(), values.max()
+    if not float(high) - float(low) <= width:
+        low, high = densest(values, width)
+        if 2 * np.count_nonzero((values >= low) & (values <= high)) <= len(values):
+            return 0.0, 0.0
+    return float(low), float(low) + float(high - low)
+
+
+def densest(values: NDArray[Any], width: float) -> tuple[Any, Any]:
+    """First and last value of the stretch of `width` that holds most of the values (N > 0,), which are finite."""
+    ordered = np.sort(values)
+    # From the first in the field's own type: absolute ns do not fit a float.
+    ahead = (ordered - ordered[0]).astype(np.float64)
+    held = np.searchsorted(ahead, ahead + width, "right") - np.arange(len(ahead))
+    k = int(np.argmax(held))
+    return ordered[k], ordered[k + int(held[k]) - 1]
+
+
+def _is_swept(points: NDArray[np.float32], values: NDArray[Any], low: float, high: float) -> bool:
+    """Whether values (N,) from `low` to `high` are as times: some of each part of the sweep, alike in points side by side."""
+    shares = np.histogram(values.astype(np.float64), _PARTS, (low, high))[0] / max(len(values), 1)
+    around = np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable")
+    apart = min(np.median(np.abs(np.diff(v.astype(np.float64)))) for v in (values, values[around]))
+    return bool(low >= 0 and shares.min() >= _LEAST_IN_PART and apart < _ALIKE * (high - low))
 
 
 def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +25,8 @@ from lslam.readers.listing import (
     list_scans,
     nominal_stamps,
 )
-from lslam.readers.point_times import TimeRule, rule_of_scans
+from lslam.readers.point_clock import PointClock, open_clock, read_samples
+from lslam.readers.point_times import Sample
 from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import StampedScans, stamp_scans
@@ -71,7 +70,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     correction = info.vertical_correction_deg or 0.0
     if correction:
         voice.notes.append(f"vertical correction {correction:g} deg, as stated")
-    rule = None if info.motion_compensated else time_rule(files, record, stamps, rate, info, voice)
+    clock = clock_of_files(files, record, stamps, rate, info, voice)
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     sequence = FolderSequence(
@@ -90,7 +89,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         rows=info.rows,
         cols=info.cols,
         per_point=per_point_folder(folder, info),
-        time_rule=rule,
+        clock=clock,
         rings=info.rings or info.rows,
         sensor=info.sensor,
         record=record,
@@ -202,37 +201,16 @@ def _mcd_extrinsics(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
     return None
 
 
-def time_rule(
+def clock_of_files(
     files: list[Path],
     record: PointRecord | None,
     stamps: NDArray[np.int64],
     rate: float,
     info: SequenceInfo,
     voice: Voice,
-) -> TimeRule | None:
-    """How per-point times of the files are read, decided on the first scans that have any."""
+) -> PointClock | None:
+    """How per-point times of the files are read, learnt on a few scans."""
     if record == KITTI:
         return None
-    count = min(len(files), 5)
-    index, name, first = _first_times(files, record, range(count))
-    _, _, later = _first_times(files, record, range(count - 1, index, -1))
-    if not len(first):
-        return None
-    begin = int(stamps[index])
-    try:
-        rule = rule_of_scans(name, first, later, begin, rate, info.point_time_unit, info.point_time_reference)
-    except InputError as error:
-        voice.problems.append(f"no deskew: {error}")
-        return None
-    voice.notes.append(rule.sentence)
-    return rule
-
-
-def _first_times(files: list[Path], record: PointRecord | None, indices: range) -> tuple[int, str, NDArray[Any]]:
-    """The first of the files `indices` whose points have times, the field's name and its values; else no values."""
-    for index in indices:
-        with suppress(InputError):
-            cloud = read_points(files[index], record)
-            if cloud.times is not None and len(cloud):
-                return index, cloud.time_field, cloud.times
-    return len(files), "", np.zeros(0)
+    samples = read_samples(len(files), lambda k: Sample(read_points(files[k], record), int(stamps[k])))
+    return open_clock(list(samples.values()), rate, info, voice.notes, voice.problems)

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
 from lslam.preprocessing.rings import RingRule, decide_rings
-from lslam.types.scan import Scan
+from lslam.types.scan import NO_RING, Scan
 from lslam.types.sequence import Scans, Sequence
 
 # Scans the rule is decided on: the first that can be read.
-_LOOKED_AT = 3
+_LOOKED_AT = 5
 
 
 class SequenceView(Scans):
@@ -83,9 +83,26 @@ class Ringed(SequenceView):
         self.rule = rule
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` and find its rings. Raises InputError when either fails."""
+        """Read scan `index` and find its rings, by itself where it does not obey the rule; points that have none are left out.
+
+        Raises InputError when either fails.
+        """
         scan = self.whole.scan(index)
-        return replace(scan, rings=self.rule.rings_of(scan)) if len(scan) else scan
+        if not len(scan):
+            return scan
+        try:
+            rings = self.rule.rings_of(scan)
+        except InputError as error:
+            try:
+                rule = decide_rings([scan])
+            except InputError:
+                raise error from None
+            rings = rule.rings_of(scan)
+            why = f"{error}: {rule}"
+            scan = replace(scan, fault="; ".join(filter(None, (scan.fault, why))))
+        scan = replace(scan, rings=rings)
+        has_ring = rings != NO_RING
+        return scan if has_ring.all() else scan.select(has_ring)
 
 
 def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:

@@ -9,6 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+# m along each axis: no LiDAR that is carried along the ground or a little above sees as far.
+FARTHEST_M = 10_000.0
+# In `Scan.rings`: the recording gives this point no ring. Methods that need rings leave it out.
+NO_RING = 65535
+
+
+def is_measured(points: NDArray[Any]) -> NDArray[np.bool_]:
+    """(N,) whether points (N, 3), m, are somewhere a LiDAR sees: NaN, zeros and numbers beyond reason stand for no return."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray((np.abs(points) < FARTHEST_M).all(axis=1) & (points != 0).any(axis=1))
+
 
 class Span(NamedTuple):
     """When a sweep begins and ends, s from the stamp of its scan; both 0 where all its points belong to one instant."""
@@ -41,7 +52,8 @@ class Scan:
     index : position in the recording, counted from 0 before any --start or --skip-frames
     intensity : (N,) float32 or None
     times : (N,) float32 seconds from the stamp, negative before it, or None; None means compensated or unknown
-    rings : (N,) uint16 or None
+    rings : (N,) uint16, `NO_RING` where a point has none, or None
+    fault : what is wrong with the scan though it is of use, a sentence without its number; empty: nothing
     """
 
     points: NDArray[np.float32]
@@ -50,6 +62,7 @@ class Scan:
     intensity: NDArray[np.float32] | None = None
     times: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
+    fault: str = ""
 
     def __len__(self) -> int:
         return len(self.points)

@@ -44,6 +44,7 @@ class ScanResult:
     gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
     inertial : the state of the IMU that a smoother found, for the motion model, which takes it off
     imu : what was known of the IMU after the scan; None without one, and once it was refused
+    fault : what was wrong with the scan though it was of use; empty: nothing
     stages : seconds per stage, by name, in the order they ran
     """
 
@@ -74,6 +75,7 @@ class ScanResult:
     gravity: GravityDirection | None = None
     inertial: MotionState | None = None
     imu: ImuState | None = None
+    fault: str = ""
     stages: dict[str, float] = field(default_factory=dict)
 
     @property

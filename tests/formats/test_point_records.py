@@ -170,7 +170,7 @@ def test_structured_arrays_may_hold_places_as_one_field(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", table)
     read = read_points(tmp_path / "a.npy")
     np.testing.assert_array_equal(read.points, table["xyz"])
-    assert (read.time_field, read.rings is not None) == ("t", True)
+    assert ([clock.name for clock in read.clocks], read.rings is not None) == (["t"], True)
 
 
 def test_ranges_and_flags_are_no_times_and_no_rings() -> None:

@@ -124,7 +124,7 @@ def _npz(folder: Path) -> list[Files]:
 
 _CLOUD = {
     "height": 1, "width": 4, "point_step": 16, "row_step": 64, "is_bigendian": False, "size": 64,
-    "fields": [{"name": n, "offset": 4 * k, "datatype": 7} for k, n in enumerate(("x", "y", "z", "time"))],
+    "fields": [{"name": n, "offset": 4 * k, "datatype": 7, "count": 1} for k, n in enumerate(("x", "y", "z", "time"))],
 }  # fmt: skip
 
 
@@ -135,7 +135,12 @@ def _read_message(folder: Path) -> None:
         tree = json.loads(where.read_bytes())
         u32 = {name: int(tree[name]) % 2**32 for name in ("height", "width", "point_step", "row_step")}
         fields = [
-            SimpleNamespace(name=str(f["name"]), offset=int(f["offset"]) % 2**32, datatype=int(f["datatype"]) % 256)
+            SimpleNamespace(
+                name=str(f["name"]),
+                offset=int(f["offset"]) % 2**32,
+                datatype=int(f["datatype"]) % 256,
+                count=int(f["count"]) % 2**32,
+            )
             for f in tree["fields"]
         ]
         data = np.zeros(int(tree["size"]) % 4096, np.uint8)

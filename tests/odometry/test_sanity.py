@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
-from lslam.odometry.sanity import FARTHEST_M, measurable, plausible
-from lslam.types.scan import Scan
+from lslam.odometry.sanity import measurable, plausible
+from lslam.types.scan import FARTHEST_M, Scan
 from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]

@@ -82,6 +82,6 @@ def test_a_recording_without_rings_is_refused_by_name_and_a_scan_that_differs_is
 
     with pytest.raises(InputError, match=r"block-0: --rings auto: .* --method loam-livox or icp"):
         with_rings(bare(turned))
-    later = with_rings(bare(lambda scan: shuffled(scan) if scan.index == 7 else scan))
+    later = with_rings(bare(lambda scan: turned(scan) if scan.index == 7 else scan))
     with pytest.raises(InputError, match="scan 7 is not in ring order"):
         later.scan(7)
