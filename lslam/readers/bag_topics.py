@@ -21,7 +21,7 @@ from lslam.formats.pointcloud2 import livox_id
 from lslam.formats.pose_rows import seconds_text
 from lslam.readers.bag_halves import find_halves
 from lslam.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
-from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, stands_still
+from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, jitter_notes, stands_still
 from lslam.readers.ground_truth import Voice
 
 CLOUDS = ("PointCloud2", "CustomMsg")
@@ -152,6 +152,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
         own = mine & is_own & ~np.isin(messages, [k for others in halves.values() for k in others])
         what = f"{topic.name}: scans" if len(chosen) == 1 else f"{topic.name}: scans of {name}"
         order, ordered = put_in_order(headers[own], recorded[own], what, voice)
+        voice.notes.extend(jitter_notes(ordered, what))
         frame = next((frames[k] for k in np.flatnonzero(mine) if frames[k]), "")
         indices.append(ScanIndex(topic, name, frame, messages[own][order], ordered, halves))
     return indices

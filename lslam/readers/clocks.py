@@ -25,6 +25,8 @@ _SNAP = 0.3  # of the interval, how far an interval across a step may lie from w
 _MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others are brought onto
 MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
 _JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
+_OFFSETS = 100  # of different clocks that are tried
+_JITTER = 0.03  # of the interval, by which stamps of arrival vary and those of a sensor do not
 _FAR = 1000  # durations of a recording, by which nothing pauses within it
 _MANY, _UNEVEN = 0.3, 0.25  # share of all messages; of the interval
 
@@ -113,6 +115,57 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
         f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
     )
     return OneClock(stamps, (problem,), tuple(notes))
+
+
+def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str) -> OneClock:
+    """Stamps (N,) of a stream without a second clock, moved as `repaired` (M,) from `scans` (M,), where it steps as these did.
+
+    A stream that does not step at the same instants by the same amount is on another clock and stays.
+    """
+    interval = float(np.median(np.diff(repaired))) if len(scans) > 1 else 0.0
+    removed = np.diff(scans) - np.diff(repaired)
+    at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
+    if not len(at) or len(stamps) < 3:
+        return OneClock(stamps)
+    steps = np.diff(stamps)
+    slack = 0.5 * interval + float(np.median(steps))
+    offset = np.full(len(stamps), scans[0] - repaired[0])
+    last = -1
+    for k, size in zip(at.tolist(), removed[at].tolist(), strict=True):
+        is_alike = (np.abs(steps - size) < slack) & (np.abs(stamps[:-1] - scans[k]) < 2 * interval + slack)
+        is_alike[: last + 1] = False
+        if not is_alike.any():
+            return OneClock(stamps)
+        last = int(np.argmax(is_alike))
+        offset[last + 1 :] += size
+    problem = f"{what}: its stamps step with those of the scans, {len(at)} times: moved alike"
+    return OneClock(stamps - offset, (problem,))
+
+
+def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
+    """`repaired` (M,) on that of the clocks of `scans` (M,) on which it shares the most time with another stream (N,)."""
+    shared = {
+        int(offset): np.count_nonzero((repaired + offset >= stamps.min()) & (repaired + offset <= stamps.max()))
+        for offset in [0, *np.unique(scans - repaired)[:_OFFSETS]]
+    }
+    best: Stamps = repaired + max(shared, key=lambda offset: (shared[offset], offset == 0))
+    return best
+
+
+def jitter_notes(stamps: Stamps, what: str) -> tuple[str, ...]:
+    """That intervals vary more than those of a sensor do, (N,) stamps that increase."""
+    steps = np.diff(stamps).astype(np.float64)
+    if len(steps) < _SPREAD_SAMPLES:
+        return ()
+    period = float(np.median(steps))
+    off = steps - np.maximum(np.rint(steps / period), 1) * period
+    sigma = 1.4826 * float(np.median(np.abs(off)))
+    if sigma < _JITTER * period:
+        return ()
+    return (
+        f"{what} follow each other unevenly, {sigma * 1e-6:.1f} ms (one sigma) about {period * 1e-6:.1f} ms: stamps of arrival, "
+        "not of the sensor",
+    )
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:

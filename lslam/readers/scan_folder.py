@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from lslam.formats.point_files import SUFFIXES, read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.printable import printable
+from lslam.readers.clocks import follow
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Numbered, Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
 from lslam.readers.listing import (
@@ -31,9 +33,12 @@ from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import StampedScans, stamp_scans
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
+Stream = TypeVar("Stream", ImuStream, GnssStream)
 KIND = "scan-folder"
 Read = Callable[[Path], PointCloud]
 SUBFOLDERS = ("data", "scans", "lidar", "points", "clouds", "pcd", "ply", "bin")
@@ -66,7 +71,10 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
     record = scan_record(files, info, voice)
     read = partial(read_points, record=record)
-    files, stamps, rate, truth = _stamps_and_truth(folder, info, files, read, calibration, voice)
+    imu, gnss = load_imu(folder, info, voice.problems), load_gnss(folder, info, voice.problems)
+    beside = [stream.stamps_ns for stream in (imu, gnss) if stream is not None and len(stream)]
+    scans_of, truth = _stamps_and_truth(folder, info, files, read, beside, calibration, voice)
+    files, stamps, rate, _ = scans_of
     correction = info.vertical_correction_deg or 0.0
     if correction:
         voice.notes.append(f"vertical correction {correction:g} deg, as stated")
@@ -83,8 +91,8 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         motion_compensated=info.motion_compensated,
         calibration=calibration,
         ground_truth=truth,
-        imu=load_imu(folder, info, voice.problems),
-        gnss=load_gnss(folder, info, voice.problems),
+        imu=_with_scans(imu, scans_of, "IMU", voice),
+        gnss=_with_scans(gnss, scans_of, "GNSS", voice),
         correction_deg=correction,
         rows=info.rows,
         cols=info.cols,
@@ -120,14 +128,19 @@ def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
 
 
 def _stamps_and_truth(
-    folder: Path, info: SequenceInfo, files: list[Path], read: Read, calibration: Calibration, voice: Voice
-) -> tuple[list[Path], NDArray[np.int64], float, Trajectory | None]:
+    folder: Path,
+    info: SequenceInfo,
+    files: list[Path],
+    read: Read,
+    beside: list[NDArray[np.int64]],
+    calibration: Calibration,
+    voice: Voice,
+) -> tuple[StampedScans, Trajectory | None]:
     """Stamps from their file, the file names, or the ground truth that goes with the scans by index; else nominal."""
-    found = _own_stamps(folder, info, files, read, voice)
+    found = _own_stamps(folder, info, files, read, beside, voice)
     truth_file = find_ground_truth(folder, info, voice)
     if found is not None:
-        files, stamps, rate = found
-        return files, stamps, rate, _truth(truth_file, folder, info, files, stamps, calibration, voice)
+        return found, _truth(truth_file, folder, info, found.files, found.stamps_ns, calibration, voice)
     rate = info.rate_hz or DEFAULT_RATE_HZ
     nominal = nominal_stamps(len(files), rate)
     truth = _truth(truth_file, folder, info, files, nominal, calibration, voice)
@@ -145,7 +158,8 @@ def _stamps_and_truth(
                     "their stamps follow from their numbers, ground truth is of the others"
                 )
             stamps, rate = check_stamps(numbered.stamps_ns, info.rate_hz, truth_file, voice.problems)
-            return files, stamps, rate, replace(numbered.truth, stamps_ns=stamps[numbered.have])
+            truth = replace(numbered.truth, stamps_ns=stamps[numbered.have])
+            return StampedScans(files, stamps, rate, numbered.stamps_ns), truth
         voice.problems.append(
             f"{truth_file} has {len(truth)} stamped poses for {len(files)} scans without stamps: ground truth is not used; "
             "add times.txt"
@@ -154,15 +168,26 @@ def _stamps_and_truth(
     voice.notes.append(
         f"no stamps of the scans (looked for {', '.join(STAMP_NAMES[:3])} and stamps in file names): stamped at {rate:g} Hz"
     )
-    return files, nominal, rate, truth
+    return StampedScans(files, nominal, rate, nominal), truth
 
 
-def _own_stamps(folder: Path, info: SequenceInfo, files: list[Path], read: Read, voice: Voice) -> StampedScans | None:
+def _with_scans(stream: Stream | None, scans: StampedScans, what: str, voice: Voice) -> Stream | None:
+    """An IMU or GNSS stream, moved where it steps with the clock of the scans."""
+    if stream is None:
+        return None
+    moved = follow(stream.stamps_ns, scans.raw_ns, scans.stamps_ns, what)
+    voice.problems.extend(moved.problems)
+    return replace(stream, stamps_ns=moved.stamps_ns)
+
+
+def _own_stamps(
+    folder: Path, info: SequenceInfo, files: list[Path], read: Read, beside: list[NDArray[np.int64]], voice: Voice
+) -> StampedScans | None:
     names = STAMP_NAMES if info.stamps is None else (info.stamps,)
     path = next((p for p in (folder / name for name in names) if p.is_file()), None)
     if path is None and info.stamps is not None:
         voice.problems.append(f"stamps {folder / info.stamps}, named by sequence.toml, do not exist")
-    return stamp_scans(files, path, read, info.rate_hz, voice)
+    return stamp_scans(files, path, read, info.rate_hz, beside, voice)
 
 
 def _truth(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.pose_rows import read_rows
-from lslam.readers.clocks import Clock, agree, stands_still
+from lslam.readers.clocks import Clock, agree, jitter_notes, onto, stands_still
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import check_stamps, file_numbers, load_stamps, rows_of
 from lslam.readers.name_stamps import stamps_in_names
@@ -26,17 +26,25 @@ _NEAR = 0.25  # of the interval, how far a gap may lie from whole ones
 
 
 class StampedScans(NamedTuple):
-    """Scan files in the order of their stamps (N,) ns, which increase, and their rate, Hz."""
+    """Scan files in the order of their stamps (N,) ns, which increase, their rate, Hz, and the stamps before they were mended."""
 
     files: list[Path]
     stamps_ns: Stamps
     rate_hz: float
+    raw_ns: Stamps
 
 
 def stamp_scans(
-    files: list[Path], path: Path | None, read: Callable[[Path], PointCloud], rate_hz: float | None, voice: Voice
+    files: list[Path],
+    path: Path | None,
+    read: Callable[[Path], PointCloud],
+    rate_hz: float | None,
+    beside: Sequence[Stamps],
+    voice: Voice,
 ) -> StampedScans | None:
     """The scans with the stamps of the file `path`, else those in their names, else by their points; None without any.
+
+    read : the points of a file; beside : stamps of other streams, with one of which the scans share time
 
     A clock that goes back, stands still or steps gives way to the next one that contradicts it, which is said. Raises
     InputError when the file has another number of rows than there are scans and nothing tells which belong together.
@@ -58,11 +66,15 @@ def stamp_scans(
         return None
     voice.notes.append(f"scan stamps from {words}")
     source = clocks[0].name if own is not None else files[0].parent
-    checked, rate = check_stamps(_agreed(clocks, voice), rate_hz, source, voice.problems)
+    agreed, raw = _agreed(clocks, voice), clocks[0].stamps_ns
+    for stamps in beside[:1]:
+        agreed = onto(stamps, raw, agreed)
+    checked, rate = check_stamps(agreed, rate_hz, source, voice.problems)
     if points is not None and rate_hz is None and rate * points.sweep_s < 0.5:
         rate = round(1 / points.sweep_s, 1)
         voice.notes.append(f"scans lie farther apart than sweeps of {points.sweep_s:.3g} s last: rate {rate:g} Hz")
-    return StampedScans(files, checked, rate)
+    voice.notes.extend(jitter_notes(checked, "scans"))
+    return StampedScans(files, checked, rate, raw)
 
 
 def _named(files: list[Path], voice: Voice) -> tuple[list[Path], list[Clock], str]:

@@ -236,3 +236,43 @@ def test_scans_lost_from_numbered_files_go_by_their_numbers(tmp_path: Path) -> N
     for k in (4, 11):
         (tmp_path / "a" / f"{k:06d}.bin").unlink()
     np.testing.assert_allclose(open_sequence(tmp_path / "a").stamps_ns, np.delete(stamps, [4, 11]), atol=1000)
+
+
+# -- what rides along
+
+
+def with_imu(folder: Path, shift_s: np.ndarray, imu_shift_s: float, words: str = "") -> np.ndarray:
+    """How far, ns, an IMU shifted from scan 8 on lies off 20 scans, whose stamps file is shifted by `shift_s` (20,)."""
+    folder.mkdir()
+    true = 1_700_000_000 * 10**9 + np.arange(20) * 100_000_000
+    for k in range(20):
+        timed(folder / f"{k:02d}.pcd", 55.0 + 0.1 * k + WITHIN_S)
+    (folder / "stamps.txt").write_text("\n".join(map(str, (true + np.rint(shift_s * 1e9).astype(np.int64)).tolist())))
+    imu = true[0] + np.arange(200) * 10_000_000
+    shifted = imu + int(imu_shift_s * 1e9) * (imu > true[8] - 40_000_000)
+    rows = [f"{ns},0,0,9.81,0,0,{k}" for k, ns in enumerate(shifted.tolist())]
+    (folder / "imu.csv").write_text("\n".join(["stamp_ns,ax,ay,az,wx,wy,wz", *rows]))
+    s = open_sequence(folder)
+    np.testing.assert_array_equal(np.diff(s.stamps_ns), 100_000_000)
+    assert words or s.stamps_ns[0] == true[0]
+    assert s.imu is not None
+    np.testing.assert_array_equal(s.imu.gyro[:, 2], np.arange(200))
+    assert any("IMU: its stamps step with those of the scans" in p for p in s.problems) == bool(words)
+    return s.imu.stamps_ns - imu - (s.stamps_ns[0] - true[0])
+
+
+@pytest.mark.parametrize("shift_s", [37.0, -37.0, 0.7])
+def test_an_imu_on_the_clock_of_the_scans_is_moved_as_they_are(tmp_path: Path, shift_s: float) -> None:
+    steps = shift_s * (np.arange(20) >= 8)
+    np.testing.assert_array_equal(with_imu(tmp_path / "same", steps, shift_s, "moved"), 0)
+    np.testing.assert_array_equal(with_imu(tmp_path / "other", steps, 0.0), 0)
+
+
+def test_stamps_of_arrival_are_named(tmp_path: Path) -> None:
+    folder = scans(tmp_path / "a", 60)
+    jitter = np.clip(np.random.default_rng(1).normal(0, 0.01, 60), -0.045, 0.045)
+    (folder / "times.txt").write_text("\n".join(f"{t:.6f}" for t in 100 + 0.1 * np.arange(60) + jitter))
+    (note,) = [n for n in open_sequence(folder).notes if "unevenly" in n]
+    assert 10 < float(note.split("unevenly, ")[1].split(" ms")[0]) < 20, "steps of two stamps of 10 ms each"
+    (folder / "times.txt").write_text("\n".join(f"{t:.6f}" for t in 100 + 0.1 * np.arange(60) + 0.1 * jitter))
+    assert not [n for n in open_sequence(folder).notes if "unevenly" in n]
