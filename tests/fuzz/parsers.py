@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from fuzz import points, sequences, texts
+from fuzz import parts, points, sequences, texts
 
-PARSERS = [*sequences.PARSERS, *points.PARSERS, *texts.PARSERS]
+PARSERS = [*sequences.PARSERS, *parts.PARSERS, *points.PARSERS, *texts.PARSERS]
