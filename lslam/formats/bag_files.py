@@ -138,7 +138,7 @@ class Bag:
         for recording in recordings:
             for topic in recording.topics:
                 kind = _OLD_NAMES.get(topic.type, topic.type)
-                key = (topic.name, kind, topic.encoding)
+                key = (topic.name, kind or _type_elsewhere(topic, recordings), topic.encoding)
                 topics.setdefault(key, BagTopic(*key)).parts.append((recording, topic))
         self.topics = sorted(topics.values(), key=lambda t: t.name)
         _check_encodings(path, self.topics)
@@ -211,6 +211,14 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
         what = "is compressed as a whole" if len(packed) == 1 else "are compressed as a whole"
         notes.append(f"{', '.join(packed)} {what}: unpacked in the user's cache for as long as the recording is read")
     return recordings
+
+
+def _type_elsewhere(topic: Topic, recordings: list[Recording]) -> str:
+    """What the other files say of the type of a topic whose own file lost it; empty where they say nothing, or several things."""
+    types = {
+        t.type for r in recordings for t in r.topics if (t.name, t.encoding) == (topic.name, topic.encoding) and t.type
+    }
+    return types.pop() if len(types) == 1 else ""
 
 
 def _check_encodings(path: Path, topics: list[BagTopic]) -> None:

@@ -88,7 +88,7 @@ class BagSequence(Scans):
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
     uses: dict[str, str] = field(default_factory=dict)
-    halves: Halves = field(default_factory=dict)
+    halves: Halves = field(default_factory=Halves)
     revolutions: Revolutions | None = None
     unit_m: float | None = None
 
@@ -182,6 +182,8 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
     if gnss is not None:
         sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
     if own is not None and own.imu is not None:
+        if left_out := [t.name for t in bag.of_type("Imu")]:
+            voice.notes.append(f"IMU from the sensor's packets: {', '.join(left_out)} left out; --imu-topic reads one")
         sequence.imu = own.imu
         T_lidar_imu = own.T_lidar_imu if info.T_lidar_imu is None else info.T_lidar_imu
         sequence.calibration = replace(sequence.calibration, T_lidar_imu=T_lidar_imu)
@@ -201,7 +203,7 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
     if is_decoded(topic):
         opened, frame = open_packets(bag, topic, voice)
         stamps = opened.revolutions.stamps_ns
-        index = ScanIndex(topic, frame or UNNAMED, frame, np.arange(len(stamps)), stamps, {})
+        index = ScanIndex(topic, frame or UNNAMED, frame, np.arange(len(stamps)), stamps, Halves())
         found: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
     else:
         found = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]
@@ -229,6 +231,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
             rings=info.rings or opened.rings,
             sensor=info.sensor or opened.sensor,
             revolutions=opened.revolutions,
+            uses=dict(opened.uses),
         )
     settle_unit(sequence)
     _stamp_by_points(sequence)
@@ -256,7 +259,7 @@ def _stamp_by_points(sequence: BagSequence) -> None:
 
 def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:
     """By the name of a topic."""
-    uses = {INFO_TOPIC: "sequence.toml"}
+    uses = {INFO_TOPIC: "sequence.toml", **sequence.uses}
     for topic in sequence.bag.of_type("TFMessage"):
         if links.static if is_static(topic) else links.is_tf_used:
             uses[topic.name] = "extrinsics"
@@ -264,7 +267,7 @@ def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links:
         uses[truth_topics(sequence.bag)[0].name] = "ground truth"
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None:
-            uses[stream.topic] = what
+            uses = {name: use for name, use in uses.items() if use != what} | {stream.topic: what}
     return uses
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,9 @@ from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.readers.ground_truth import Voice
+from lslam.types.scan import NO_RING, is_measured
 
 Stamps = NDArray[np.int64]
-# Messages of one stamp by the first of them.
-Halves = Mapping[int, tuple[int, ...]]
 
 _MOST = 40  # parts of a revolution; more messages of one stamp come from a clock that stands still
 _LOOKED_AT = 40  # stamps; of more of them so many are looked at before the recording is read
@@ -26,6 +25,20 @@ _BINS = 90  # of azimuth
 _FULL = 5 / 6  # of all directions, by 12 deg: the sensor turns, and what it sees again is another revolution
 _SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
 _SAME = 0.1  # of the points: a repeat, or another return of the same beams
+_CELL_RAD = 1e-3  # of directions: those of another return are the same, those between two columns are not
+_BURST = 0.25  # of the time between scans: what is recorded together was measured together
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Further messages of a scan by the first of them; what is recorded within `burst_ns` is taken to be measured together."""
+
+    others: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
+    burst_ns: float = 0.0
+
+    def is_burst(self, topic: BagTopic, first: int, other: int) -> bool:
+        """Whether two messages were recorded together; a bag whose times of recording are the stamps does not tell."""
+        return 0 < int(topic.stamps_ns[other]) - int(topic.stamps_ns[first]) <= self.burst_ns
 
 
 def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
@@ -46,9 +59,10 @@ def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
 def read_whole(bag: Bag, topic: BagTopic, k: int, halves: Halves) -> tuple[PointCloud, int]:
     """As `read_cloud`, with what the other messages of its stamp add."""
     cloud, shift = read_cloud(bag, topic, k)
-    for other in halves.get(k, ()):
+    for other in halves.others.get(k, ()):
         more, base = read_cloud(bag, topic, other)
-        cloud = join(cloud, more, base - shift) or cloud
+        whole = join(cloud, more, base - shift, halves.is_burst(topic, k, other))
+        cloud = cloud if whole is None else whole
     return cloud, shift
 
 
@@ -58,23 +72,25 @@ def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, fra
     On many stamps not all are looked at: what is no part of a scan after all is left out when the scan is read.
     """
     groups = _groups(messages, stamps, frames)
+    steps = np.diff(np.unique(stamps))
+    none = Halves(burst_ns=_BURST * float(np.median(steps)) if len(steps) else 0.0)
     looked_at = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _LOOKED_AT)).round().astype(int)).tolist()
-    parts = {n: _parts(bag, topic, groups[n]) for n in (looked_at if groups else [])}
+    parts = {n: _parts(bag, topic, groups[n], none) for n in (looked_at if groups else [])}
     if not any(parts.values()):
-        return {}
+        return none
     found = {group[0]: parts.get(n, group[1:]) for n, group in enumerate(groups) if parts.get(n, group[1:])}
     said = "" if len(parts) == len(groups) else f", as {sum(map(bool, parts.values()))} of {len(parts)} looked at are"
     voice.notes.append(
         f"{topic.name}: {len(found)} scans come in several messages of one stamp, which see other directions, rings or times: "
         f"put together{said}"
     )
-    return found
+    return replace(none, others=found)
 
 
-def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
+def join(a: PointCloud, b: PointCloud, later_ns: int = 0, is_burst: bool = False) -> PointCloud | None:
     """Both as one cloud in the order they were measured, where they are parts of one scan; None where they are not.
 
-    later_ns : of the base of b's times, which are ns then
+    later_ns : of the base of b's times, which are ns then; is_burst : they were recorded together
     """
     if not len(b):
         return a
@@ -83,10 +99,11 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
     if later_ns:
         a, b = _moved(a, 0), _moved(b, later_ns)
     times = _times_of_both(a, b)
-    if not _is_complement(a, b, times) or (a.rings is None) != (b.rings is None):
+    is_alike = (a.times is None) == (b.times is None) and (a.rings is None) == (b.rings is None)
+    if not is_alike or not _adds(a.select(is_measured(a.points)), b.select(is_measured(b.points)), is_burst):
         return None
     first, last = a, b
-    if times is not None and np.median(times[1]) < np.median(times[0]):
+    if times is not None and _when(times[1])[1] < _when(times[0])[1]:
         first, last = b, a
     of_last = {clock.name: clock.values for clock in last.clocks}
     return replace(
@@ -111,14 +128,14 @@ def _groups(messages: Stamps, stamps: Stamps, frames: list[str]) -> list[tuple[i
     return [tuple(group) for group in by_stamp.values() if 1 < len(group) <= _MOST]
 
 
-def _parts(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[int, ...]:
+def _parts(bag: Bag, topic: BagTopic, group: tuple[int, ...], halves: Halves) -> tuple[int, ...]:
     """Which messages of a group add to the first."""
     try:
         cloud, shift = read_cloud(bag, topic, group[0])
         parts = []
         for k in group[1:]:
             more, base = read_cloud(bag, topic, k)
-            whole = join(cloud, more, base - shift)
+            whole = join(cloud, more, base - shift, halves.is_burst(topic, group[0], k))
             if whole is not None and len(more):
                 cloud = whole
                 parts.append(k)
@@ -139,17 +156,37 @@ def _times_of_both(a: PointCloud, b: PointCloud) -> tuple[NDArray[Any], NDArray[
     return a.times, b.times
 
 
-def _is_complement(a: PointCloud, b: PointCloud, times: tuple[NDArray[Any], NDArray[Any]] | None) -> bool:
-    """Whether b sees what a does not: other azimuths, other rings, or, of a sensor that does not turn, at another time."""
-    if (a.times is None) != (b.times is None) or np.isin(_keys(b), _keys(a)).mean() > _SAME:
+def _adds(a: PointCloud, b: PointCloud, is_burst: bool) -> bool:
+    """Whether b sees what a does not; of both only what was measured."""
+    if not len(a) or not len(b):
+        return len(b) > 0
+    if np.isin(_keys(b), _keys(a)).mean() > _SAME:
         return False
+    return _is_complement(a, b) or (is_burst and _sees_between(a, b))
+
+
+def _is_complement(a: PointCloud, b: PointCloud) -> bool:
+    """Whether b sees other azimuths, other rings, or, of a sensor that does not turn, at another time."""
     of_a, of_b = _azimuths(a), _azimuths(b)
     if np.minimum(of_a, of_b).sum() <= _SHARED * min(of_a.sum(), of_b.sum()):
         return True
-    if a.rings is not None and b.rings is not None and not np.isin(b.rings, a.rings).any():
-        return True
+    if a.rings is not None and b.rings is not None:
+        own = b.rings[b.rings != NO_RING]
+        if len(own) and not np.isin(own, a.rings).any():
+            return True
     is_turning = max(float(of.reshape(-1, 3).any(axis=1).mean()) for of in (of_a, of_b)) > _FULL
+    times = _times_of_both(a, b)
     return times is not None and not is_turning and _overlap(*times) <= _SHARED
+
+
+def _sees_between(a: PointCloud, b: PointCloud) -> bool:
+    """Whether b sees directions between those of a, every second column, say; another return of the same beams does not."""
+    of_a, of_b = (
+        np.round(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]) / _CELL_RAD).astype(np.int64)
+        @ [1 << 20, 1]
+        for x, y, z in (cloud.points.T.astype(np.float64) for cloud in (a, b))
+    )
+    return bool(np.isin(of_b, of_a).mean() <= _SHARED)
 
 
 def _keys(cloud: PointCloud) -> NDArray[np.uint64]:
@@ -168,9 +205,17 @@ def _azimuths(cloud: PointCloud) -> NDArray[np.int64]:
 
 def _overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
     """Which part of the shorter span of times the other shares."""
-    (a0, a1), (b0, b1) = (np.percentile(t.astype(np.float64), (1, 99)) for t in (a, b))
+    (a0, _, a1), (b0, _, b1) = _when(a), _when(b)
     shorter = min(a1 - a0, b1 - b0)
     return float((min(a1, b1) - max(a0, b0)) / shorter) if shorter > 0 else 1.0
+
+
+def _when(times: NDArray[Any]) -> tuple[float, float, float]:
+    """Beginning, middle and end of times, in their unit, strays left out; zeros where there are none."""
+    values = times.astype(np.float64)
+    values = values[np.isfinite(values)]
+    begin, middle, end = np.percentile(values, (1, 50, 99)) if len(values) else (0.0, 0.0, 0.0)
+    return float(begin), float(middle), float(end)
 
 
 def _both(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:

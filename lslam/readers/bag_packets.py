@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +77,8 @@ def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
     positions = (p.frame, p.frame + 1, *range(p.head, p.head + 8))
     inertial = [t for t in bag.of_type(PACKET) if _namespace(t) == _namespace(topic) and is_imu(bag, t)]
     packets, _ = _gather(bag, [topic, *inertial], positions, voice)
-    return open_with_metadata(where, packets, sensor, source, voice), _OUSTER_FRAME
+    uses = {source: "metadata", **{t.name: "IMU" for t in inertial}}
+    return replace(open_with_metadata(where, packets, sensor, source, voice), uses=uses), _OUSTER_FRAME
 
 
 def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice: Voice) -> tuple[BagPackets, str]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -64,7 +64,7 @@ class Revolutions(Protocol):
 
 @dataclass(frozen=True)
 class Opened:
-    """Revolutions and their sensor."""
+    """Revolutions and their sensor; `uses` says what further topics of a bag are used for."""
 
     revolutions: Revolutions
     rate_hz: float
@@ -72,6 +72,7 @@ class Opened:
     sensor: str
     imu: ImuStream | None = None
     T_lidar_imu: NDArray[np.float64] | None = None
+    uses: Mapping[str, str] = field(default_factory=dict)
 
 
 def read_scan(revolutions: Revolutions, index: int, is_timed: bool) -> Scan:

@@ -390,3 +390,12 @@ def test_what_unpacks_to_more_than_it_says_takes_no_memory(tmp_path: Path, store
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert most < 100_000_000
+
+
+def test_a_type_that_one_part_lost_is_taken_from_another(tmp_path: Path, store: Any) -> None:
+    parts = messages(store, 4)
+    mcap(tmp_path / "a_0.mcap", names(schema=""), *parts[:2])
+    mcap(tmp_path / "a_1.mcap", names(), *parts[2:])
+    sequence = open_sequence(tmp_path)
+    assert len(sequence) == 4
+    assert_prefix(sequence)

@@ -105,6 +105,17 @@ def test_blocks_of_rings_are_put_together(tmp_path: Path) -> None:
     assert_whole(open_sequence(write(tmp_path / "a.mcap", messages)), 4)
 
 
+COLUMNS = np.arange(1440) // 8 % 2 == 0
+
+
+def test_every_second_column_is_put_together_where_both_are_recorded_at_once(tmp_path: Path) -> None:
+    """A stamp that stands still for two turns gives the same picture, but for the times of recording."""
+    messages = [m for k in range(4) for m in parted(k, [COLUMNS, ~COLUMNS])]
+    assert_whole(open_sequence(write(tmp_path / "a.mcap", messages)), 4)
+    apart = [m for k in range(4) for m in parted(2 * k, [COLUMNS, ~COLUMNS], STEP_NS)]
+    assert max(map(len, open_sequence(write(tmp_path / "b.mcap", apart)))) == 720
+
+
 def test_halves_of_a_sensor_that_does_not_turn_are_told_by_their_times(tmp_path: Path) -> None:
     """Seventy degrees, scanned twice in a sweep: all directions are seen by both halves."""
 
@@ -186,3 +197,18 @@ def test_a_half_without_points_leaves_the_other(tmp_path: Path) -> None:
     messages[3] = (*messages[3][:2], messages[3][2][:0], "lidar")
     sequence = open_sequence(write(tmp_path / "a.mcap", messages))
     assert [len(sequence.scan(k)) for k in range(4)] == [1440, 720, 1440, 1440]
+
+
+def test_points_without_a_return_have_no_say(tmp_path: Path) -> None:
+    """Zeros of both halves are alike, and lie in no direction."""
+
+    def halves(k: int) -> list[Message]:
+        messages = parted(k, sectors(2))
+        for _, _, table, _ in messages:
+            for axis in "xyz":
+                table[axis][::3] = 0
+        return messages
+
+    sequence = open_sequence(write(tmp_path / "a.mcap", [m for k in range(4) for m in halves(k)]))
+    assert [int((sequence.scan(k).points != 0).any(axis=1).sum()) for k in range(4)] == [960] * 4
+    assert not sequence.problems

@@ -98,6 +98,29 @@ def test_ouster_packets_with_their_imu_and_metadata(tmp_path: Path, kind: str, p
     np.testing.assert_array_equal(sequence.calibration.T_lidar_imu, capture.calibration.T_lidar_imu)
     assert not sequence.has_assumed_extrinsics
     assert sequence.problems == []
+    assert (sequence.uses["/ouster/imu_packets"], sequence.uses["/ouster/lidar_packets"]) == ("IMU", "scans")
+    assert (sequence.uses.get("/ouster/metadata") == "metadata") == is_in_bag
+
+
+def test_another_imu_is_left_out_unless_it_is_named(tmp_path: Path) -> None:
+    spec = OusterSpec()
+    frames, _ = ouster(spec, 3)
+
+    def fill(writer: BagWriter) -> None:
+        ouster_packets(writer, frames, "lidar")
+        ouster_packets(writer, ouster_imu(30), "imu")
+
+    (tmp_path / "a.json").write_text(json.dumps(spec.metadata()))
+    path = bag(tmp_path / "a.bag", together(fill, imu(7, START_NS)))
+    sequence = open_sequence(path)
+    assert sequence.imu is not None
+    assert len(sequence.imu) == 30
+    assert any("IMU from the sensor's packets: /imu left out" in note for note in sequence.notes)
+    other = open_sequence(path, imu_topic="/imu")
+    assert other.imu is not None
+    assert len(other.imu) == 7
+    assert isinstance(other, BagSequence)
+    assert [name for name, use in other.uses.items() if use == "IMU"] == ["/imu"]
 
 
 def test_ouster_packets_need_metadata(tmp_path: Path) -> None:
