@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats import bag_streams
-from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
+from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag
 from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
@@ -18,12 +18,12 @@ from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
+from lslam.readers.bag_clocks import points_off, stamps_by_points
 from lslam.readers.bag_halves import Halves, read_whole
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex
 from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
-    HEADER,
     check_parts,
     choose_clouds,
     index_scans,
@@ -37,7 +37,7 @@ from lslam.readers.listing import measured_rate
 from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_clock import PointClock, open_clock, read_samples
-from lslam.readers.point_stamps import point_stamps
+from lslam.readers.point_stamps import step_against
 from lslam.readers.point_times import Sample, TimeRule
 from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.sidecars import compensation_note
@@ -49,7 +49,6 @@ from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")
-_OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 _SAID_NS = 1000  # shorter shifts are what absolute seconds are rounded by
 CAMERA = "cam0"
 # Odometry in a bag is somebody's estimate, unless its name says that it is the truth.
@@ -115,10 +114,15 @@ class BagSequence(Scans):
         if self.clock is None:
             return Scan(cloud.points, stamp, index, cloud.intensity, None, cloud.rings)
         timed = self.clock.read(cloud, stamp)
-        cloud = timed.cloud
-        return Scan(
-            cloud.points, stamp + timed.shift_ns, index, cloud.intensity, timed.times, cloud.rings, fault=timed.fault
-        )
+        cloud, fault = timed.cloud, timed.fault
+        stamp += timed.shift_ns
+        off = points_off(self.clock, self.headers_ns, self.stamps_ns, index, stamp, timed.times)
+        if off:
+            fault = "; ".join(
+                filter(None, (fault, f"the clock of its points is {off * 1e-9:+.3f} s off: the header counts"))
+            )
+            stamp = int(self.stamps_ns[index])
+        return Scan(cloud.points, stamp, index, cloud.intensity, timed.times, cloud.rings, fault=fault)
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
         """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
@@ -234,27 +238,12 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
             uses=dict(opened.uses),
         )
     settle_unit(sequence)
-    _stamp_by_points(sequence)
+    by_points = stamps_by_points(bag, index.topic, index.messages, index.stamps_ns, lambda k: sequence.cloud(k)[0])
+    if by_points is not None:
+        sequence.headers_ns = sequence.stamps_ns = by_points.stamps_ns
+        voice.notes.extend(by_points.notes)
     _open_clock(sequence, info)
     return sequence
-
-
-def _stamp_by_points(sequence: BagSequence) -> None:
-    """Where the headers stand still, the absolute times of the points are better stamps than the times of recording."""
-    bag, topic, messages = sequence.bag, sequence.topic, sequence.messages.tolist()
-    headers = {read_header(topic, bag.message(topic, k, HEADER)).stamp_ns for k in (messages[0], messages[-1])}
-    if len(messages) < 2 or len(headers) > 1:
-        return
-    points = point_stamps(len(messages), lambda index: sequence.cloud(index)[0])
-    if points is None:
-        return
-    # A clock of another epoch is brought onto that of the recording, by the scan that was recorded with the least delay.
-    ahead = int((points.stamps_ns - sequence.headers_ns).max())
-    is_other = abs(ahead) > _OTHER_EPOCH_NS
-    sequence.headers_ns = points.stamps_ns - (ahead if is_other else 0)
-    sequence.stamps_ns = sequence.headers_ns
-    how = f", {-ahead * 1e-9:+.3f} s to the clock of the recording" if is_other else ""
-    sequence.notes.append(f"scan stamps from the absolute times of the points, field {points.field!r}{how}")
 
 
 def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:
@@ -294,6 +283,12 @@ def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
                 f"the points of {sequence.topic.name} have no times (looked for {', '.join(TIME_NAMES[:4])} and the like)"
             )
         return
+    stamps_and_clouds = [(sample.stamp_ns, sample.cloud) for sample in samples.values()]
+    step = step_against(stamps_and_clouds, sequence.rate_hz) if sequence.clock.rule.is_absolute else 0.0
+    if step:
+        sequence.problems.append(
+            f"the absolute times of the points step by {step:.3f} s against the stamps of the headers: the headers count"
+        )
     index = sequence.clock.first_whole(samples)
     first = sample(index)
     shift = first.stamp_ns + sequence.clock.read(first.cloud, first.stamp_ns).shift_ns - int(sequence.headers_ns[index])

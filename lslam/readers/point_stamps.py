@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,6 +52,18 @@ def point_stamps(count: int, read: Callable[[int], PointCloud]) -> PointStamps |
     at = np.array(list(begins), np.int64)
     known = np.array([begin for begin, _ in begins.values()], np.int64)
     return PointStamps(_filled(count, at, known), float(np.median([s for _, s in begins.values()])), field)
+
+
+def step_against(headers: Sequence[tuple[int, PointCloud]], rate_hz: float) -> float:
+    """By how much, s, absolute times of points step against the headers' stamps, ns, of a few scans; 0 below a period."""
+    ahead = []
+    for stamp, cloud in headers:
+        unit = "" if cloud.times is None else _unit_of(cloud.times)
+        begin = _begin(cloud.times, unit) if unit and cloud.times is not None else None
+        if begin is not None:
+            ahead.append(begin[0] - stamp)
+    step = (max(ahead) - min(ahead)) * 1e-9 if ahead else 0.0
+    return step if step > 1 / rate_hz else 0.0
 
 
 def _is_clock(begins: dict[int, tuple[int, float]]) -> bool:

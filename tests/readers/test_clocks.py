@@ -236,3 +236,30 @@ def test_a_recording_that_was_played_in_a_loop_is_read_once(tmp_path: Path) -> N
         p for p in sequence.problems if "30 messages, message 30 the first, are copies of earlier ones: left out" in p
     ]
     assert len(said) == 2
+
+
+@pytest.mark.parametrize("at_end", [False, True])
+@pytest.mark.parametrize("step_s", [0.3, -0.3, 37.0, -5.0])
+def test_a_step_of_the_points_clock_does_not_move_scans_whose_headers_go_on(
+    tmp_path: Path, step_s: float, at_end: bool
+) -> None:
+    """Headers of the scans' begin or end; a sliver of a sweep, as recordings begin with, is no step."""
+
+    def fill(writer: BagWriter) -> None:
+        for k in range(COUNT):
+            within = np.linspace(0, 0.0999, 50)[45 if at_end and k == 0 else 0 :]
+            table = np.zeros(len(within), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("timestamp", "<f8")])
+            table["x"] = 1 + np.arange(len(within))
+            table["timestamp"] = TRUE[k] * 1e-9 + within + step_s * (k >= 8)
+            message = raw_cloud(writer.store, int(TRUE[k]) + 99_900_000 * at_end, table)
+            writer.write("/points", int(TRUE[k]) + 110_000_000, message)
+
+    sequence = open_sequence(bag(tmp_path / "a.mcap", fill, "mcap"))
+    first = 1 if at_end else 0
+    stamps = np.array([sequence.scan(k).stamp_ns for k in range(first, COUNT)])
+    np.testing.assert_allclose(stamps, TRUE[first:], atol=1000)
+    assert at_end is False or abs(sequence.scan(0).stamp_ns - TRUE[0] - 91_700_000) < 200_000
+    assert abs(step_s) > 1 or "the clock of its points is" in sequence.scan(9).fault
+    (problem,) = [p for p in sequence.problems if "against the stamps of the headers: the headers count" in p]
+    assert abs(float(problem.split("step by ")[1].split(" s")[0]) - abs(step_s)) < 0.1
+    assert not sequence.scan(3).fault
