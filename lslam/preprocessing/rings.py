@@ -90,7 +90,7 @@ def decide_rings(scans: list[Scan], wanted: str = "auto", known: int | None = No
     first = next(scan for scan in scans if 2 * len(scan) >= usual)
     tried = {
         "field": lambda: _decide_field(scans),
-        "rows": lambda: _decide_rows(first, count or known),
+        "rows": lambda: organised_rows(first, count or known),
         "order": lambda: _decide_order(first),
         "elevation": lambda: _decide_elevation(scans, count, known),
     }
@@ -123,17 +123,28 @@ def elevations(points: NDArray[Any]) -> NDArray[np.float32]:
 def rings_by_order(points: NDArray[Any]) -> NDArray[np.uint16] | None:
     """(N,) rings of points stored ring after ring, as in KITTI: a new one begins where the azimuth passes the seam.
 
-    The seam is the azimuth at which most jumps of elevation happen, since all rings begin there. None when the points are
-    not ordered so.
+    None when the points are not ordered so.
     """
+    return _cut_rings(points)[0]
+
+
+def ring_seam(points: NDArray[Any]) -> float | None:
+    """Angle, rad, from the first point, in the sense of rotation, to the azimuth at which all rings begin; None as above."""
+    rings, seam = _cut_rings(points)
+    return None if rings is None else seam
+
+
+def _cut_rings(points: NDArray[Any]) -> tuple[NDArray[np.uint16] | None, float]:
+    """Rings and their seam: the angle at which most jumps of elevation happen, since all rings begin there."""
     turned, slope, jumps, ahead = ring_order.follow(np.ascontiguousarray(points, np.float32), _BACKWARD, _TILT)
     if ahead < _AHEAD:
-        return None
+        return None, 0.0
     before = np.maximum(jumps - 1, 0)
-    rings, slopes, counts = ring_order.cut(turned, slope, _stab(turned[before], turned[jumps]))
+    seam = _stab(turned[before], turned[jumps])
+    rings, slopes, counts = ring_order.cut(turned, slope, seam)
     if not FEWEST <= len(counts) <= MOST or counts.mean() < _LEAST_PER_RING or not _is_staircase(slopes):
-        return None
-    return rings
+        return None, seam
+    return rings, seam
 
 
 def _is_staircase(values: Floats) -> bool:
@@ -169,7 +180,8 @@ def _decide_field(scans: list[Scan]) -> RingRule | None:
     return RingRule("field", len(values)) if len(values) > 1 else None
 
 
-def _decide_rows(scan: Scan, count: int | None) -> RingRule | None:
+def organised_rows(scan: Scan, count: int | None = None) -> RingRule | None:
+    """The rule of an organised cloud, of `count` rows where that is known; None for other clouds."""
     for rows in (count,) if count else _USUAL_ROWS:
         if len(scan) % rows or len(scan) // rows < _LEAST_PER_RING or rows < FEWEST:
             continue

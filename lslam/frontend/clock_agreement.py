@@ -1,0 +1,185 @@
+"""How well scans agree under a candidate clock of their points: odometry over a few of them, judged by points kept out of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.config.preprocess import PreprocessConfig
+from lslam.errors import InputError
+from lslam.frontend.tracker import Loaded, Tracker
+from lslam.geometry import se3, so3
+from lslam.odometry import create_odometry
+from lslam.preprocessing.deskew import deskew_points
+from lslam.preprocessing.prepare import gate_points
+from lslam.preprocessing.sweep_clock import SweepClock
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
+
+Floats = NDArray[np.float64]
+
+# Scans of a window. The speed is not known before the second scan: those before are not judged.
+SCANS, SKIPPED = 12, 2
+# Points of a scan that odometry has, that the surfaces are made of, and that are kept out to be laid on them.
+_REGISTERED, _SURFACE, _KEPT_OUT = 6000, 4000, 800
+_SHARE_KEPT_OUT = 0.15
+_SOURCE = 1200, 2400
+# Neighbours that make a surface, within m, and the fewest of other scans among them.
+_NEIGHBOURS, _RADIUS_M, _FEWEST = 16, 1.0, 6
+# m; distances from a surface count by d^2 / (d^2 + _SCALE_M^2): thickness counts, what is no surface does not.
+_SCALE_M = 0.05
+# A window that moves by less in a sweep, m and rad, decides nothing.
+STILL_M, STILL_RAD = 0.03, float(np.deg2rad(0.4))
+# Student's t of paired differences, the share of scans with the same sign and the relative difference of a clear decision.
+_T, _SAME_SIGN, _RELATIVE = 4.0, 0.75, 0.02
+
+
+class Comparison(NamedTuple):
+    """Two clocks over the same scans: Student's t and the sign of the paired differences, and the relative difference."""
+
+    t: float
+    same_sign: float
+    relative: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the first clock is better beyond doubt."""
+        return self.t >= _T and self.same_sign >= _SAME_SIGN and self.relative >= _RELATIVE
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """One scan: what odometry has of it, and what is kept out."""
+
+    registered: Scan
+    kept_out: Scan
+
+
+class ClockWindow:
+    """Consecutive scans, over which clocks are tried; the same clock is tried once."""
+
+    def __init__(self, scans: list[Scan], preprocess: PreprocessConfig) -> None:
+        gate = preprocess.model_dump(include={"range_min", "range_max", "range_shape", "ego_box"})
+        few = {"source_points_min": _SOURCE[0], "source_points_max": _SOURCE[1]}
+        self._config = Config.model_validate({"preprocess": gate | few, "recovery": {"start_search": False}})
+        self.scans = [scan for scan in scans if len(scan) > 0]
+        self._masks = [self._split(scan) for scan in self.scans]
+        self._scores: dict[SweepClock | None, Floats] = {}
+        # Path and rotation per sweep without a clock.
+        self.motion = (0.0, 0.0)
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether the sensor moves so that a clock can make a difference."""
+        self.scores(None)
+        return self.motion[0] > STILL_M or self.motion[1] > STILL_RAD
+
+    def scores(self, clock: SweepClock | None) -> Floats:
+        """(S,) how far the points that were kept out lie from the surfaces of the other scans, 0 to 1, of each scan judged."""
+        if clock not in self._scores:
+            self._scores[clock] = self._judged(clock)
+        return self._scores[clock]
+
+    def _judged(self, clock: SweepClock | None) -> Floats:
+        odometry = create_odometry(self._config)
+        tracker = Tracker(odometry)
+        surfaces: list[Floats] = []
+        kept_out: list[Floats] = []
+        poses: list[Floats] = []
+        for number, (scan, masks) in enumerate(zip(self.scans, self._masks, strict=True)):
+            timed = replace(scan, times=None if clock is None else clock.times_of(scan.points)[0])
+            parts = _Parts(timed.select(masks[0]), timed.select(masks[1]))
+            loaded = Loaded(number, scan.stamp_ns, parts.registered, odometry.prepare(parts.registered))
+            pose = tracker.track(loaded).T_world_lidar
+            poses.append(pose)
+            if number < SKIPPED - 1:
+                continue
+            surface = parts.registered.select(_thinned(len(parts.registered), _SURFACE))
+            surfaces.append(self._placed(surface, tracker, pose))
+            kept_out.append(self._placed(parts.kept_out, tracker, pose))
+        if clock is None:
+            self.motion = _motion(poses)
+        return _distances(surfaces, kept_out)[1:]
+
+    @staticmethod
+    def _placed(scan: Scan, tracker: Tracker, pose: Floats) -> Floats:
+        return se3.apply(pose, deskew_points(scan.points, scan.times, tracker.sweep).astype(np.float64))
+
+    def _split(self, scan: Scan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Indices of the points for odometry and of those that are kept out, in their order, by chance."""
+        usable = gate_points(np.ascontiguousarray(scan.points, np.float32), self._config.preprocess)
+        order = np.random.default_rng((len(usable), scan.index)).permutation(usable)
+        first = round(_SHARE_KEPT_OUT * len(order))
+        return np.sort(order[first : first + _REGISTERED]), np.sort(order[: min(first, _KEPT_OUT)])
+
+
+def read_window(sequence: Sequence, first: int, preprocess: PreprocessConfig) -> ClockWindow | None:
+    """The scans from `first` on; None where too few of them can be read."""
+    scans = []
+    for index in range(first, min(first + SCANS, len(sequence))):
+        try:
+            scans.append(sequence.scan(index))
+        except InputError:
+            continue
+    window = ClockWindow(scans, preprocess)
+    return window if len(window.scans) >= SKIPPED + 5 else None
+
+
+def compare_clocks(windows: list[ClockWindow], better: SweepClock | None, worse: SweepClock | None) -> Comparison:
+    """By how much the scans of the windows agree better under one clock than under another."""
+    good, bad = (np.concatenate([window.scores(clock) for window in windows]) for clock in (better, worse))
+    difference = bad - good
+    spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
+    return Comparison(
+        float(difference.mean()) / max(spread, 1e-12), float((difference > 0).mean()),
+        float(difference.sum()) / max(float(good.sum()), 1e-12),
+    )  # fmt: skip
+
+
+def mean_score(windows: list[ClockWindow], clock: SweepClock | None) -> float:
+    """The mean of the scores of all windows."""
+    return float(np.concatenate([window.scores(clock) for window in windows]).mean())
+
+
+def _motion(poses: list[Floats]) -> tuple[float, float]:
+    """Median translation, m, and rotation, rad, from scan to scan."""
+    steps = [se3.relative(a, b) for a, b in pairwise(poses)]
+    moved = [float(np.linalg.norm(step[:3, 3])) for step in steps]
+    return float(np.median(moved)), float(np.median([so3.angle(step[:3, :3]) for step in steps]))
+
+
+def _thinned(count: int, most: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
+
+
+def _distances(surfaces: list[Floats], kept_out: list[Floats]) -> Floats:
+    """(S,) mean of the bounded distances of each scan's points from the surfaces that the other scans make."""
+    from scipy.spatial import cKDTree
+
+    cloud = np.concatenate(surfaces)
+    owner = np.repeat(np.arange(len(surfaces)), [len(s) for s in surfaces])
+    tree = cKDTree(cloud)
+    return np.array([_distance(tree, cloud, owner, number, points) for number, points in enumerate(kept_out)])
+
+
+def _distance(tree: Any, cloud: Floats, owner: NDArray[np.int64], number: int, points: Floats) -> float:
+    away, near = tree.query(points, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_M)
+    is_there = np.isfinite(away)
+    near = np.where(is_there, near, 0)
+    weight = (is_there & (owner[near] != number)).astype(np.float64)
+    count = weight.sum(axis=1)
+    kept = count >= _FEWEST
+    if not kept.any():
+        return 1.0
+    points, near, weight, count = points[kept], near[kept], weight[kept], count[kept, None]
+    neighbours = cloud[near]
+    middle = np.einsum("nk,nki->ni", weight, neighbours) / count
+    apart = (neighbours - middle[:, None]) * weight[..., None]
+    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", apart, apart))[1][:, :, 0]
+    squares = np.einsum("ni,ni->n", points - middle, normal) ** 2
+    return float((squares / (squares + _SCALE_M**2)).mean())

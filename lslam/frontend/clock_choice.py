@@ -1,0 +1,155 @@
+"""Which clock the points of a turning sensor have where no field says when they were measured.
+
+The order of the points and their azimuths propose clocks; the agreement of scans decides. A clock is taken only where it is
+better beyond doubt than no times at all, than its reverse and than sweeps that begin elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.frontend.clock_agreement import SCANS, ClockWindow, compare_clocks, mean_score, read_window
+from lslam.preprocessing.clock_proposals import Proposal, propose_clock
+from lslam.preprocessing.sweep_clock import SweepClock, is_same_motion
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence
+
+Verdict = Literal["stated", "clear", "compensated", "unclear", "standing", "unknown"]
+
+# Windows of moving scans that may be asked, and places along the recording where they are looked for.
+_MOST_WINDOWS, _PLACES = 3, 9
+# Turns of the sweep's beginning that are tried, and the finer ones about the best.
+_TURNS, _FINER = (0.25, 0.5, 0.75), (0.125, 0.0625)
+# Turns nearer than this are the same clock, nearly.
+_NEAR = 0.2
+# A sweep of half the length must not fit better than by so many standard deviations.
+_HALF_T = 2.0
+
+
+@dataclass(frozen=True)
+class ClockChoice:
+    """The clock of a recording's points, None for no times, and how it was found.
+
+    scores : mean distance of the points that were kept out from the surfaces of other scans, 0 to 1, by clock
+    """
+
+    clock: SweepClock | None
+    verdict: Verdict
+    sentence: str
+    scores: dict[str, float] = field(default_factory=dict)
+
+    def facts(self) -> dict[str, Any]:
+        """As plain values, for the manifest."""
+        return {
+            "clock": None if self.clock is None else self.clock.facts(),
+            "verdict": self.verdict,
+            "scores": {name: round(value, 5) for name, value in self.scores.items()},
+        }
+
+
+def choose_clock(
+    sequence: Sequence, scans: list[Scan], preprocess: PreprocessConfig, rows: int | None, is_stamp_at_end: bool
+) -> ClockChoice:
+    """Decide for a recording without per-point times, by the first of its scans in which the sensor moves.
+
+    scans : some of the recording, which propose the clocks; rows : of organised clouds, where that is stated
+    """
+    proposal = propose_clock(scans, 1 / sequence.rate_hz, rows, is_stamp_at_end)
+    if proposal is None:
+        return ClockChoice(
+            None, "unknown", "point times: the scans are no full turns of a sensor, their order tells no times"
+        )
+    windows: list[ClockWindow] = []
+    choice = None
+    for window in _moving(sequence, preprocess):
+        windows.append(window)
+        choice = _judge(windows, proposal, scans[0])
+        if choice.verdict in ("clear", "compensated") or len(windows) == _MOST_WINDOWS:
+            return choice
+    if choice is not None:
+        return choice
+    return ClockChoice(
+        None, "standing", f"point times: {proposal.clock} may tell them; the sensor does not move enough to decide"
+    )
+
+
+def _moving(sequence: Sequence, preprocess: PreprocessConfig) -> Iterator[ClockWindow]:
+    """Windows in which the sensor moves, the first ones first."""
+    last = max(len(sequence) - SCANS, 0)
+    places = [first for first in (0, SCANS, 2 * SCANS) if first < last]
+    for first in sorted({0, *places, *np.linspace(0, last, _PLACES).round().astype(int).tolist()}):
+        window = read_window(sequence, first, preprocess)
+        if window is not None and window.is_moving:
+            yield window
+
+
+def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> ClockChoice:
+    """The clock under which the scans of the windows agree best, where that is clear."""
+    forward = proposal.clock
+    backward = replace(forward, is_reversed=True)
+    tried: list[SweepClock | None] = [None, forward, backward]
+    best = _best(windows, tried)
+    if proposal.is_guess or best is None:
+        tried += [replace(clock, turn=turn) for clock in (forward, backward) for turn in _TURNS]
+    else:
+        tried += [replace(best, turn=turn) for turn in _TURNS]
+    best = _best(windows, tried)
+    if best is not None and (best.turn or proposal.is_guess):
+        for step in _FINER:
+            near = [replace(best, turn=(best.turn + sign * step) % 1.0) for sign in (-1, 1)]
+            tried += near
+            best = min((best, *near), key=lambda clock: mean_score(windows, clock))
+    return _verdict(windows, tried, best, sample)
+
+
+def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepClock | None:
+    return min(clocks, key=lambda clock: mean_score(windows, clock))
+
+
+def _verdict(
+    windows: list[ClockWindow], tried: list[SweepClock | None], best: SweepClock | None, sample: Scan
+) -> ClockChoice:
+    scores = {_name(clock): mean_score(windows, clock) for clock in tried}
+    rivals = [clock for clock in tried if clock is not best and not _is_alike(best, clock, sample)]
+    results = {_name(clock): compare_clocks(windows, best, clock) for clock in rivals}
+    closest = min(results, key=lambda name: results[name].t)
+    count = sum(len(window.scores(None)) for window in windows)
+    margin = f"t = {results[closest].t:.1f} against {closest}, {count} scans"
+    is_clear = all(result.is_clear for result in results.values())
+    moving = best or next(clock for clock in tried if clock is not None)
+    half = replace(moving, seconds=0.5 * moving.seconds)
+    if is_clear and compare_clocks(windows, half, best).t > _HALF_T:
+        is_clear, margin = False, "a sweep of half the time between scans fits better"
+    if not is_clear:
+        return ClockChoice(
+            None, "unclear",
+            f"point times: not clear whether {_name(best)} tells them ({margin}): left without, point_times states them", scores,
+        )  # fmt: skip
+    if best is None:
+        return ClockChoice(
+            None, "compensated",
+            f"point times: none fits, the scans agree best as they are, as motion compensated ones do ({margin})", scores,
+        )  # fmt: skip
+    return ClockChoice(best, "clear", f"point times: by {best}; clear by the agreement of scans ({margin})", scores)
+
+
+def _is_alike(best: SweepClock | None, other: SweepClock | None, sample: Scan) -> bool:
+    """Whether the two need not, or cannot, be told apart."""
+    if best is None or other is None:
+        return best is other
+    apart = abs((best.turn - other.turn + 0.5) % 1.0 - 0.5)
+    if best.is_reversed == other.is_reversed and apart < _NEAR:
+        return True
+    return is_same_motion(best, other, sample.points)
+
+
+def _name(clock: SweepClock | None) -> str:
+    if clock is None:
+        return "no times"
+    turn = f", begun {clock.turn:g} of a turn later" if clock.turn else ""
+    return f"{clock.kind}{' reversed' if clock.is_reversed else ''}{turn}"
