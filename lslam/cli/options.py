@@ -105,9 +105,14 @@ def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], d
 
 
 def reading(function: F) -> F:
-    """--lidar-topic, --lidar-frame, --imu-topic, --gnss-topic and --extrinsics."""
+    """--lidar-topic, --lidar-frame, --imu-topic, --gnss-topic, --point-times and --extrinsics."""
     function = click.option(
         "--extrinsics", metavar="T|FILE", help="The IMU in the LiDAR's frame: 12, 16 or 7 numbers, or a file with them."
+    )(function)
+    function = click.option(
+        "--point-times",
+        type=click.Choice(("auto", "field", "columns", "order", "azimuth", "none")),
+        help="What tells when each point was measured.  [default: auto]",
     )(function)
     function = click.option(
         "--lidar-frame",
@@ -124,7 +129,8 @@ def reading(function: F) -> F:
 
 def reading_of(given: dict[str, Any]) -> dict[str, Any]:
     """Arguments of `open_sequence` from the options of `reading`."""
-    return {name: given[name] for name in ("lidar_topic", "lidar_frame", "imu_topic", "gnss_topic", "extrinsics")}
+    names = ("lidar_topic", "lidar_frame", "imu_topic", "gnss_topic", "point_times", "extrinsics")
+    return {name: given[name] for name in names}
 
 
 def manual(function: F) -> F:

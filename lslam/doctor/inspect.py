@@ -7,6 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.preprocess import PreprocessConfig
 from lslam.doctor.examine_bag import examine_bag
 from lslam.doctor.examine_gnss import examine_gnss
 from lslam.doctor.examine_imu import examine_imu
@@ -16,6 +17,7 @@ from lslam.doctor.examine_turns import examine_turns
 from lslam.doctor.examine_units import examine_units
 from lslam.doctor.findings import Facts, Finding
 from lslam.formats.bag_files import Bag
+from lslam.frontend.point_times import with_point_times
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -41,14 +43,16 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     n = len(sequence)
     wanted = n if samples is None else min(n, samples)
     indices = np.unique(np.linspace(0, n - 1, wanted).round().astype(int)) if n else np.zeros(0, int)
-    notes = list(sequence.notes)
     time = examine_stamps(sequence, findings)
-    points = examine_points(sequence, indices, findings)
-    examine_times(sequence, points, findings)
+    clocked = with_point_times(sequence, PreprocessConfig(), is_stated_only=is_quick)
+    notes = list(clocked.notes)
+    points = examine_points(clocked, indices, findings)
+    examine_times(clocked, points, findings)
     rule, sentence = rings_rule(sequence)
     if sentence:
         notes.append(sentence)
     limits = points["per_point_times"]
+    choice = getattr(clocked, "clock_choice", None)
     units = examine_units(sequence, sequence.ground_truth, sweep=None if limits is None else Span(*limits))
     findings += units
     imu = examine_imu(sequence, findings)
@@ -71,8 +75,9 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         "scans": n,
         "time": time,
         "points": points,
+        "point_times": None if choice is None else choice.facts(),
         "rings_rule": rule,
-        "motion_compensated": sequence.motion_compensated,
+        "motion_compensated": clocked.motion_compensated,
         "vertical_correction_deg": float(getattr(sequence, "correction_deg", 0.0)),
         "extrinsics": {
             key: None if T is None else np.asarray(T).tolist() for key, T in vars(sequence.calibration).items()

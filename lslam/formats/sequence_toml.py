@@ -23,6 +23,7 @@ INSTANTS = ("scan_start", "scan_middle", "scan_end")
 UNITS = ("s", "ms", "us", "ns")
 LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # m
 REFERENCES = ("start", "end", "absolute")
+POINT_TIMES = ("field", "columns", "order", "azimuth", "none")
 FRAMES = ("lidar", "cam0", "imu")
 EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
 
@@ -42,6 +43,7 @@ class SequenceInfo:
         `REFERENCES`: the scan's start or end, which is its stamp then, or absolute
     bin_record : what a point of a `.bin` file or of a plain array consists of, see `parse_record`
     point_unit : of the coordinates of points, one of `LENGTHS`
+    point_times : what tells the times of points, one of `POINT_TIMES`
     stamps, imu, gnss, ground_truth : files, relative to the sequence folder
     ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read; lidar_frame : which of the LiDARs that share one, by
@@ -64,6 +66,7 @@ class SequenceInfo:
     point_time_reference: str | None = None
     bin_record: str | None = None
     point_unit: str | None = None
+    point_times: str | None = None
     stamps: str | None = None
     imu: str | None = None
     gnss: str | None = None
@@ -175,6 +178,7 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "point_time_reference": (lambda v: v in REFERENCES, "one of " + ", ".join(REFERENCES)),
     "bin_record": (is_record, 'columns like "x y z intensity ring:u2 time:f8", float32 where no type is named'),
     "point_unit": (lambda v: v in (*LENGTHS,), "one of " + ", ".join(LENGTHS)),
+    "point_times": (lambda v: v in POINT_TIMES, "one of " + ", ".join(POINT_TIMES)),
     "stamps": (_is_text, "a file"),
     "imu": (_is_text, "a file"),
     "gnss": (_is_text, "a file"),

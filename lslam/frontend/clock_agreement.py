@@ -24,7 +24,7 @@ from lslam.types.sequence import Sequence
 Floats = NDArray[np.float64]
 
 # Scans of a window. The speed is not known before the second scan: those before are not judged.
-SCANS, SKIPPED = 12, 2
+SCANS, SKIPPED, FEWEST_SCANS = 12, 2, 8
 # Points of a scan that odometry has, that the surfaces are made of, and that are kept out to be laid on them.
 _REGISTERED, _SURFACE, _KEPT_OUT = 6000, 4000, 800
 _SHARE_KEPT_OUT = 0.15
@@ -66,7 +66,7 @@ class ClockWindow:
     def __init__(self, scans: list[Scan], preprocess: PreprocessConfig) -> None:
         gate = preprocess.model_dump(include={"range_min", "range_max", "range_shape", "ego_box"})
         few = {"source_points_min": _SOURCE[0], "source_points_max": _SOURCE[1]}
-        self._config = Config.model_validate({"preprocess": gate | few, "recovery": {"start_search": False}})
+        self._config = Config.model_validate({"preprocess": gate | few})
         self.scans = [scan for scan in scans if len(scan) > 0]
         self._masks = [self._split(scan) for scan in self.scans]
         self._scores: dict[SweepClock | None, Floats] = {}
@@ -127,7 +127,7 @@ def read_window(sequence: Sequence, first: int, preprocess: PreprocessConfig) ->
         except InputError:
             continue
     window = ClockWindow(scans, preprocess)
-    return window if len(window.scans) >= SKIPPED + 5 else None
+    return window if len(window.scans) >= FEWEST_SCANS else None
 
 
 def compare_clocks(windows: list[ClockWindow], better: SweepClock | None, worse: SweepClock | None) -> Comparison:

@@ -14,7 +14,7 @@ import numpy as np
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.frontend.clock_agreement import SCANS, ClockWindow, compare_clocks, mean_score, read_window
-from lslam.preprocessing.clock_proposals import Proposal, propose_clock
+from lslam.preprocessing.clock_proposals import Proposal
 from lslam.preprocessing.sweep_clock import SweepClock, is_same_motion
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
@@ -52,23 +52,16 @@ class ClockChoice:
         }
 
 
-def choose_clock(
-    sequence: Sequence, scans: list[Scan], preprocess: PreprocessConfig, rows: int | None, is_stamp_at_end: bool
-) -> ClockChoice:
+def choose_clock(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
     """Decide for a recording without per-point times, by the first of its scans in which the sensor moves.
 
-    scans : some of the recording, which propose the clocks; rows : of organised clouds, where that is stated
+    sample : any scan of the recording
     """
-    proposal = propose_clock(scans, 1 / sequence.rate_hz, rows, is_stamp_at_end)
-    if proposal is None:
-        return ClockChoice(
-            None, "unknown", "point times: the scans are no full turns of a sensor, their order tells no times"
-        )
     windows: list[ClockWindow] = []
     choice = None
     for window in _moving(sequence, preprocess):
         windows.append(window)
-        choice = _judge(windows, proposal, scans[0])
+        choice = _judge(windows, proposal, sample)
         if choice.verdict in ("clear", "compensated") or len(windows) == _MOST_WINDOWS:
             return choice
     if choice is not None:

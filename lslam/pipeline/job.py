@@ -18,6 +18,7 @@ from lslam.doctor.examine_units import examine_units
 from lslam.errors import InputError, InterruptedRunError
 from lslam.evaluation.frames import main_axis
 from lslam.frontend.inertial_start import with_imu_settings
+from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
@@ -79,10 +80,12 @@ def prepare(
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:
-    """What --start, --count and --skip-frames leave, with rings where the method needs them.
+    """What --start, --count and --skip-frames leave, with the times of points, and rings where the method needs them.
 
-    Raises UsageError when nothing is left, InputError naming --rings when there are no rings to be found.
+    Raises UsageError when nothing is left, InputError naming --rings when there are no rings to be found, and when stated
+    times do not fit.
     """
+    sequence = with_point_times(sequence, config.preprocess)
     if getattr(odometry, "needs_rings", False):
         sequence = with_rings(sequence, config.input.rings)
     return select(sequence, config.input.start, config.input.count, config.input.skip_frames)

@@ -162,6 +162,7 @@ class Manifest:
                 "scans": len(s),
                 "rate_hz": s.rate_hz,
                 "motion_compensated": s.motion_compensated,
+                **({"point_times": choice.facts()} if (choice := getattr(s, "clock_choice", None)) is not None else {}),
                 "decisions": list(s.notes),
                 "problems": list(s.problems),
             },

@@ -43,7 +43,9 @@ from lslam.pipeline.map_files import (
 )
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
+from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.readers import open_sequence
+from lslam.readers.clocked import Clocked
 from lslam.readers.selection import select
 from lslam.remote import as_path
 from lslam.reports.evaluations import run_document
@@ -55,7 +57,7 @@ from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import parse_json
+from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 EVALUATION, REPORT = "evaluation.json", "report.html"
@@ -150,13 +152,26 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
     known = run.topics if sequence is None else {}
     given = {name: value for name, value in reading.items() if value is not None}
     opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **(known | given))
-    chosen = select(opened, section.start, section.count, section.skip_frames)
+    chosen = select(_clocked(run, opened), section.start, section.count, section.skip_frames)
     count = len(run.trajectory)
     if len(chosen) < count or np.any(np.abs(chosen.stamps_ns[:count] - run.trajectory.stamps_ns) > 1000):
         raise InputError(
             f"{path} does not fit {run.folder}: its {len(chosen)} scans have other stamps than the {count} poses"
         )
     return chosen
+
+
+def _clocked(run: EarlierRun, opened: Sequence) -> Sequence:
+    """The recording with the times of its points that the run decided on."""
+    facts = run.manifest.get("sequence", {}).get("point_times")
+    if facts is None:
+        return opened
+    try:
+        clock = None if facts["clock"] is None else SweepClock(**facts["clock"])
+        is_stated = facts["verdict"] == "stated"
+    except MISFIT as error:
+        raise InputError(f"{run.folder / MANIFEST}: point_times: {error}; run the sequence again") from None
+    return opened if clock is None and not is_stated else Clocked(opened, clock)
 
 
 def rebuild(

@@ -18,43 +18,59 @@ Floats = NDArray[np.float64]
 _COVERED, _BINS = 0.5, 36
 # rad; the sweeps of a sensor begin at one azimuth when most of its scans begin within this of their middle.
 _FIXED_RAD = np.radians(10.0)
+# Share of the scans that must have the same order.
+_MOST = 0.8
 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A clock that runs forward; `is_guess` : neither its sense nor where it begins follows from the order of the points."""
+    """A clock that runs forward; `is_guess` : its sense, or where it begins, does not follow from the order of the points."""
 
     clock: SweepClock
     is_guess: bool = False
 
 
-def propose_clock(scans: list[Scan], seconds: float, rows: int | None, is_stamp_at_end: bool) -> Proposal | None:
+def propose_clock(scans: list[Scan], nominal: SweepClock, rows: int | None) -> Proposal | None:
     """The clock that the points of some scans of a recording allow for; None where the sensor makes no full turns.
 
-    seconds : length of a sweep, s; rows : of organised clouds, stored row after row, where that is stated
+    nominal : length and stamp of a sweep; rows : of organised clouds, stored row after row, where that is stated
     """
     if not scans or _coverage(scans) < _COVERED:
         return None
-    clock = SweepClock("azimuth", seconds, is_stamp_at_end, sense=1, begin_rad=-np.pi)
-    is_columnwise = _organised(scans, rows)
-    if is_columnwise is not None:
-        count, columnwise = is_columnwise
-        return Proposal(SweepClock("columns", seconds, is_stamp_at_end, count, columnwise))
-    sweeps = [follow_sweep(scan.points) for scan in scans]
-    followed = [sweep for sweep in sweeps if sweep is not None]
-    if len(followed) > 0.8 * len(scans) and len({sweep.sense for sweep in followed}) == 1:
-        begin = _common(np.array([sweep.begin_rad for sweep in followed]))
-        return Proposal(SweepClock("order", seconds, is_stamp_at_end, sense=followed[0].sense, begin_rad=begin))
-    return _by_rings(scans, clock) or Proposal(clock, is_guess=True)
+    clock = columns_clock(scans, nominal, rows) or order_clock(scans, nominal)
+    return azimuth_proposal(scans, nominal) if clock is None else Proposal(clock)
 
 
-def _by_rings(scans: list[Scan], clock: SweepClock) -> Proposal | None:
-    """The azimuth from where rings begin; None where the points are not stored ring after ring."""
-    rings = [follow_rings(scan.points) for scan in scans]
-    known = [ring for ring in rings if ring is not None]
-    if len(known) <= 0.8 * len(scans) or len({ring.sense for ring in known}) != 1:
+def columns_clock(scans: list[Scan], nominal: SweepClock, rows: int | None) -> SweepClock | None:
+    """The columns of organised clouds; None for other clouds."""
+    if rows:
+        is_organised = all(len(scan) % rows == 0 for scan in scans)
+        return replace(nominal, kind="columns", rows=rows) if is_organised else None
+    rules = {None if rule is None else (rule.count, rule.columns) for rule in map(organised_rows, scans)}
+    rule = rules.pop() if len(rules) == 1 else None
+    return None if rule is None else replace(nominal, kind="columns", rows=rule[0], is_columnwise=rule[1])
+
+
+def order_clock(scans: list[Scan], nominal: SweepClock) -> SweepClock | None:
+    """The order of points that go round once in it, as they were fired; None for other orders."""
+    sweeps = [sweep for sweep in (follow_sweep(scan.points) for scan in scans) if sweep is not None]
+    if len(sweeps) <= _MOST * len(scans) or len({sweep.sense for sweep in sweeps}) != 1:
         return None
-    sense = known[0].sense
+    begin = _common(np.array([sweep.begin_rad for sweep in sweeps]))
+    return replace(nominal, kind="order", sense=sweeps[0].sense, begin_rad=begin)
+
+
+def azimuth_proposal(scans: list[Scan], nominal: SweepClock) -> Proposal:
+    """The azimuth, its sense and where sweeps begin by the order of the points as far as that tells them."""
+    guess = replace(nominal, kind="azimuth", sense=1, begin_rad=-np.pi)
+    by_order = order_clock(scans, nominal)
+    if by_order is not None and by_order.begin_rad is not None:
+        return Proposal(replace(by_order, kind="azimuth"))
+    rings = [follow_rings(scan.points) for scan in scans]
+    senses = {ring.sense for ring in rings if ring is not None}
+    if sum(ring is not None for ring in rings) <= _MOST * len(scans) or len(senses) != 1:
+        return Proposal(guess, is_guess=True)
+    sense = senses.pop()
     begins = []
     for scan, ring in zip(scans, rings, strict=True):
         seam = ring_seam(scan.points)
@@ -63,22 +79,7 @@ def _by_rings(scans: list[Scan], clock: SweepClock) -> Proposal | None:
         elif ring is not None:
             begins.append(ring.begin_rad)
     begin = _common(np.array(begins))
-    if begin is None:
-        return Proposal(replace(clock, sense=sense), is_guess=True)
-    return Proposal(replace(clock, sense=sense, begin_rad=begin))
-
-
-def _organised(scans: list[Scan], rows: int | None) -> tuple[int, bool] | None:
-    """Rows of organised clouds and whether they are stored column after column; None for other clouds."""
-    if rows:
-        return (rows, False) if all(len(scan) % rows == 0 for scan in scans) else None
-    rules = [organised_rows(scan) for scan in scans]
-    first = rules[0]
-    if first is None or any(
-        rule is None or (rule.count, rule.columns) != (first.count, first.columns) for rule in rules
-    ):
-        return None
-    return first.count, first.columns
+    return Proposal(replace(guess, sense=sense, begin_rad=-np.pi if begin is None else begin), is_guess=begin is None)
 
 
 def _coverage(scans: list[Scan]) -> float:
@@ -89,8 +90,8 @@ def _coverage(scans: list[Scan]) -> float:
 
 def _first_azimuth(scan: Scan) -> float:
     points = scan.points
-    known = np.flatnonzero(np.isfinite(points).all(axis=1) & (points[:, :2] != 0).any(axis=1))
-    return float(np.arctan2(points[known[0], 1], points[known[0], 0])) if len(known) else 0.0
+    usable = np.flatnonzero(np.isfinite(points).all(axis=1) & (points[:, :2] != 0).any(axis=1))
+    return float(azimuths(points[usable[:1]])[0]) if len(usable) else 0.0
 
 
 def _common(angles: Floats) -> float | None:

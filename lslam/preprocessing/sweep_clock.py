@@ -90,7 +90,7 @@ class SweepClock:
             sense = self.sense * (-1 if self.is_reversed else 1)
             details.append("counter-clockwise" if sense > 0 else "clockwise")
             begin = self.begin_deg
-            details.append("each from its first point" if begin is None else f"from azimuth {begin:.0f} deg")
+            details.append("each from its first point" if begin is None else f"from azimuth {round(begin)} deg")
         elif self.is_reversed:
             details.append("backwards")
         instant = "end" if self.is_stamp_at_end else "start"

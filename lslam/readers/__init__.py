@@ -44,6 +44,7 @@ def open_sequence(
     lidar_frame: str | None = None,
     imu_topic: str | None = None,
     gnss_topic: str | None = None,
+    point_times: str | None = None,
     extrinsics: str | None = None,
     imu: bool = False,
     gnss: bool = False,
@@ -59,6 +60,7 @@ def open_sequence(
     vertical_correction_deg : rotation of every point about p x z; None leaves it to the reader
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read, where it has several
     lidar_frame : which of the LiDARs that share a topic, by the frame of their messages, or `all`
+    point_times : what tells the times of points: field, columns, order, azimuth or none; None and auto find out
     extrinsics : T_lidar_imu, as numbers or a file (see `transform_text`)
         What is given wins over `sequence.toml`, which wins over what the layout implies.
     imu, gnss : the stream is asked for: where the recording has none it is sought, as in the raw drive of a KITTI sequence
@@ -92,6 +94,7 @@ def open_sequence(
         lidar_frame=lidar_frame,
         imu_topic=imu_topic,
         gnss_topic=gnss_topic,
+        point_times=None if point_times == "auto" else point_times,
     )
     try:
         sequence = _open(folder, overrides)

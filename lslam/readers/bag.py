@@ -40,11 +40,11 @@ from lslam.readers.point_clock import PointClock, open_clock, read_samples
 from lslam.readers.point_stamps import step_against
 from lslam.readers.point_times import Sample, TimeRule
 from lslam.readers.point_units import in_metres, settle_unit
-from lslam.readers.sidecars import compensation_note
+from lslam.readers.sidecars import compensation_note, stated_times
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans, Sequence, no_shared_time
+from lslam.types.sequence import Calibration, Scans, Sequence, StatedTimes, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
@@ -83,6 +83,7 @@ class BagSequence(Scans):
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     clock: PointClock | None = None
+    stated_times: StatedTimes = field(default_factory=StatedTimes)
     rings: int | None = None
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
@@ -227,6 +228,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
         info.rate_hz or (measured_rate(index.stamps_ns) if opened is None else opened.rate_hz),
         motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
         notes=voice.notes, problems=voice.problems, halves=index.halves,
+        stated_times=stated_times(info),
         unit_m=LENGTHS.get(info.point_unit or ""),
     )  # fmt: skip
     if opened is not None:

@@ -21,7 +21,7 @@ from lslam.readers.point_units import in_metres
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan, Span
-from lslam.types.sequence import Calibration, Scans
+from lslam.types.sequence import Calibration, Scans, StatedTimes
 from lslam.types.trajectory import Trajectory
 
 
@@ -50,6 +50,7 @@ class FolderSequence(Scans):
     gnss: GnssStream | None = None
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    stated_times: StatedTimes = field(default_factory=StatedTimes)
     correction_deg: float = 0.0
     rows: int | None = None
     cols: int | None = None

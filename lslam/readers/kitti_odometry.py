@@ -27,6 +27,7 @@ from lslam.readers.sidecars import (
     load_imu,
     per_point_folder,
     read_info,
+    stated_times,
     vertical_correction,
 )
 from lslam.types.sequence import Calibration
@@ -67,7 +68,8 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     record = scan_record(files, info, voice)
     # The benchmark's points have no times: scans with times are of another sensor.
     has_times = record is not None and "time" in record.names
-    is_benchmark = info.motion_compensated is None and info.per_point is None and not has_times
+    has_times_stated = info.per_point is not None or info.point_times not in (None, "none")
+    is_benchmark = info.motion_compensated is None and not has_times and not has_times_stated
     compensated = True if is_benchmark else info.motion_compensated
     if info.motion_compensated is None and compensated:
         voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
@@ -94,6 +96,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         clock=clock_of_files(files, record, stamps, rate, info, voice) if has_times and not compensated else None,
         notes=voice.notes,
         problems=voice.problems,
+        stated_times=stated_times(info),
     )
     return settle_unit(sequence)
 

@@ -45,6 +45,7 @@ from lslam.readers.sidecars import (
     load_imu,
     per_point_folder,
     read_info,
+    stated_times,
     vertical_correction,
 )
 from lslam.types.gnss import GnssStream
@@ -134,6 +135,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         unit_m=LENGTHS.get(info.point_unit or ""),
         notes=voice.notes,
         problems=voice.problems,
+        stated_times=stated_times(info),
     )
     return settle_unit(sequence)
 

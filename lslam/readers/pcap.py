@@ -21,11 +21,11 @@ from lslam.readers.listing import list_scans
 from lslam.readers.pcap_ouster import open_ouster
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.pcap_velodyne import open_velodyne
-from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, read_info
+from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, read_info, stated_times
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans, no_shared_time
+from lslam.types.sequence import Calibration, Scans, StatedTimes, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "pcap"
@@ -54,6 +54,7 @@ class PcapSequence(Scans):
     gnss: GnssStream | None = None
     notes: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
+    stated_times: StatedTimes = field(default_factory=StatedTimes)
     has_assumed_extrinsics: bool = False
 
     def __len__(self) -> int:
@@ -99,6 +100,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
         info.name or printable(path.stem), path, revolutions, revolutions.stamps_ns,
         info.rate_hz or opened.rate_hz, info.rings or opened.rings, info.sensor or opened.sensor,
         motion_compensated=bool(info.motion_compensated), notes=voice.notes, problems=voice.problems,
+        stated_times=stated_times(info),
         calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),
     )  # fmt: skip
     beside = load_imu(path.parent, info, voice.problems)

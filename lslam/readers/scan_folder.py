@@ -32,7 +32,15 @@ from lslam.readers.point_times import Sample
 from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import StampedScans, stamp_scans
-from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, per_point_folder, read_info
+from lslam.readers.sidecars import (
+    calibration_over,
+    compensation_note,
+    load_gnss,
+    load_imu,
+    per_point_folder,
+    read_info,
+    stated_times,
+)
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Calibration
@@ -104,6 +112,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         unit_m=LENGTHS.get(info.point_unit or ""),
         notes=voice.notes,
         problems=voice.problems,
+        stated_times=stated_times(info),
     )
     return settle_unit(sequence)
 

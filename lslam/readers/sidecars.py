@@ -16,7 +16,7 @@ from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_t
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
-from lslam.types.sequence import Calibration
+from lslam.types.sequence import Calibration, StatedTimes
 
 T = TypeVar("T")
 
@@ -42,6 +42,18 @@ def compensation_note(info: SequenceInfo) -> list[str]:
         return ["scans are motion distorted, as stated"]
     instant = f", to {info.compensated_to}: the stamp is taken as that instant" if info.compensated_to else ""
     return [f"scans are motion compensated, as stated{instant}"]
+
+
+def stated_times(info: SequenceInfo) -> StatedTimes:
+    """What `sequence.toml` or the user states about the times of points.
+
+    Raises InputError where scans are also stated to be motion compensated: their points have no times.
+    """
+    if info.motion_compensated and info.point_times not in (None, "none"):
+        raise InputError(
+            f"point_times = {info.point_times!r} and motion_compensated = true contradict each other: state one of them"
+        )
+    return StatedTimes(info.point_times, info.point_time_reference)
 
 
 def vertical_correction(info: SequenceInfo, files: list[Path], record: PointRecord | None, notes: list[str]) -> float:

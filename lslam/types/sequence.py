@@ -28,6 +28,17 @@ class Calibration:
     T_lidar_gnss: NDArray[np.float64] | None = None
 
 
+@dataclass(frozen=True)
+class StatedTimes:
+    """What the user or `sequence.toml` states about the times of points; None where nothing is.
+
+    kind : field, columns, order, azimuth or none; reference : start or end, the instant of a sweep to which its stamp belongs
+    """
+
+    kind: str | None = None
+    reference: str | None = None
+
+
 def no_shared_time(stream: str) -> str:
     """The problem of a recording whose `stream`, IMU or GNSS, lies wholly before or after its scans."""
     return f"{stream}: it shares no time with the scans"

@@ -1,0 +1,114 @@
+"""Times for the points of a recording: its own field, what is stated, or a clock that the agreement of scans decides on."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.errors import InputError
+from lslam.frontend.clock_agreement import FEWEST_SCANS
+from lslam.frontend.clock_choice import ClockChoice, choose_clock
+from lslam.kernels import jit
+from lslam.locks import one_at_a_time
+from lslam.preprocessing.clock_proposals import azimuth_proposal, columns_clock, order_clock, propose_clock
+from lslam.preprocessing.sweep_clock import SweepClock
+from lslam.readers.clocked import Clocked
+from lslam.readers.selection import SequenceView
+from lslam.types.scan import Scan
+from lslam.types.sequence import Sequence, StatedTimes
+
+log = logging.getLogger("lslam")
+
+# Scans that propose a clock, spread over the recording.
+_SAMPLES = 5
+
+
+def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated_only: bool = False) -> Sequence:
+    """The sequence with the times of its points where no field has them; what was decided is among its notes.
+
+    is_stated_only : no scan is registered, so nothing is found out
+
+    A sequence with times, one that is motion compensated and one whose points no clock fits come back as they are. The
+    recording decides, whatever part of it is used. Raises InputError when what is stated does not fit the scans.
+    """
+    stated = getattr(sequence, "stated_times", StatedTimes())
+    if stated.kind is None and (sequence.motion_compensated or is_stated_only):
+        return sequence
+    if stated.kind == "none":
+        return _with(sequence, ClockChoice(None, "stated", "point times: none, as stated"))
+    scans = _samples(sequence)
+    if not scans:
+        return sequence  # nothing can be read, which is said in its turn
+    has_times = scans[0].times is not None
+    if stated.kind == "field" and not has_times:
+        raise InputError(f"{sequence.path}: point_times = 'field', and the points have no time field that can be read")
+    if stated.kind == "field" or (stated.kind is None and has_times):
+        return sequence
+    nominal = SweepClock("order", 1 / sequence.rate_hz, stated.reference == "end")
+    if stated.kind is not None:
+        return _with(sequence, _as_stated(sequence, scans, stated.kind, nominal, preprocess))
+    if len(sequence) < FEWEST_SCANS:
+        return sequence
+    proposal = propose_clock(scans, nominal, getattr(sequence, "rows", None))
+    if proposal is None:
+        return sequence
+    with one_at_a_time(jit.lock_file(), "compiles kernels"), jit.announced(log):
+        return _with(sequence, choose_clock(sequence, proposal, scans[0], preprocess))
+
+
+def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
+    """The sequence with the clock of the choice, which the manifest finds as `clock_choice`."""
+    notes = [*sequence.notes, choice.sentence]
+    if choice.verdict == "compensated":
+        return SequenceView(sequence, notes=notes, clock_choice=choice, motion_compensated=True)
+    if choice.clock is None and choice.verdict != "stated":
+        return SequenceView(sequence, notes=notes, clock_choice=choice)
+    return Clocked(sequence, choice.clock, notes=notes, clock_choice=choice)
+
+
+def _as_stated(
+    sequence: Sequence, scans: list[Scan], kind: str, nominal: SweepClock, preprocess: PreprocessConfig
+) -> ClockChoice:
+    """The clock that is stated. Raises InputError where the scans do not have it."""
+    clock: SweepClock | None
+    if kind == "columns":
+        clock = columns_clock(scans, nominal, getattr(sequence, "rows", None))
+        if clock is None:
+            raise InputError(
+                f"{sequence.path}: point_times = 'columns', and the clouds are not organised in rows of equal length: state "
+                "rows and cols, or point_times = 'order' or 'azimuth'"
+            )
+    elif kind == "order":
+        clock = order_clock(scans, nominal) or nominal
+    else:
+        proposal = azimuth_proposal(scans, nominal)
+        clock = proposal.clock
+        if proposal.is_guess:
+            choice = choose_clock(sequence, proposal, scans[0], preprocess)
+            if choice.clock is None:
+                raise InputError(
+                    f"{sequence.path}: point_times = 'azimuth', and neither the order of the points nor the agreement of "
+                    f"scans tells in which sense the sensor turns and where it begins ({choice.sentence})"
+                )
+            return choice
+    return ClockChoice(clock, "stated", f"point times: by {clock}, as stated")
+
+
+def _samples(sequence: Sequence) -> list[Scan]:
+    """Some scans with points, from the first on; the first alone where it has times."""
+    scans: list[Scan] = []
+    last = len(sequence) - 1
+    for index in sorted({*range(min(10, last + 1)), *np.linspace(0, last, _SAMPLES).astype(int).tolist()}):
+        if len(scans) > 1 and index < 10:
+            continue
+        try:
+            scan = sequence.scan(index)
+        except InputError:
+            continue
+        if len(scan):
+            scans.append(scan)
+        if scans and scans[0].times is not None:
+            break
+    return scans
