@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.config.preprocess import PreprocessConfig
+from lslam.config.recovery import RecoveryConfig
 from lslam.errors import InputError
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
@@ -18,6 +19,7 @@ from lslam.odometry import create_odometry
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import gate_points
 from lslam.preprocessing.sweep_clock import SweepClock
+from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
@@ -29,10 +31,16 @@ SCANS, SKIPPED, FEWEST_SCANS = 12, 2, 8
 _REGISTERED, _SURFACE, _KEPT_OUT = 6000, 4000, 800
 _SHARE_KEPT_OUT = 0.15
 _SOURCE = 1200, 2400
+# A motion over the window that differs by more than this share of it, m, and the largest rotation in a sweep on a lever of so
+# many m, from that without a clock is another one.
+_ASTRAY, _ASTRAY_M, _LEVER_M = 0.15, 0.3, 5.0
+_NO_SEARCH = RecoveryConfig(start_search=False)
 # Neighbours that make a surface, within m, and the fewest of other scans among them.
 _NEIGHBOURS, _RADIUS_M, _FEWEST = 16, 1.0, 6
 # m; distances from a surface count by d^2 / (d^2 + _SCALE_M^2): thickness counts, what is no surface does not.
 _SCALE_M = 0.05
+# The score where nothing is to compare.
+_LOST = 1.0
 # A window that moves by less in a sweep, m and rad, decides nothing.
 STILL_M, STILL_RAD = 0.03, float(np.deg2rad(0.4))
 # Student's t of paired differences, the share of scans with the same sign and the relative difference of a clear decision.
@@ -72,6 +80,8 @@ class ClockWindow:
         self._scores: dict[SweepClock | None, Floats] = {}
         # Path and rotation per sweep without a clock.
         self.motion = (0.0, 0.0)
+        self._moved, self._tolerance_m = np.zeros(3), 0.0
+        self._first_step = np.eye(4)
 
     @property
     def is_moving(self) -> bool:
@@ -85,9 +95,18 @@ class ClockWindow:
             self._scores[clock] = self._judged(clock)
         return self._scores[clock]
 
+    def is_astray(self, clock: SweepClock | None) -> bool:
+        """Whether odometry found another motion under the clock than without one, so that its scores say nothing."""
+        return bool((self.scores(clock) >= _LOST).all())
+
     def _judged(self, clock: SweepClock | None) -> Floats:
-        odometry = create_odometry(self._config)
-        tracker = Tracker(odometry)
+        config, motion = self._config, None
+        if clock is not None:
+            # The speed at the start is sought once, without a clock.
+            self.scores(None)
+            config, motion = config.model_copy(update={"recovery": _NO_SEARCH}), self._moving_on()
+        odometry = create_odometry(config)
+        tracker = Tracker(odometry, motion=motion)
         surfaces: list[Floats] = []
         kept_out: list[Floats] = []
         poses: list[Floats] = []
@@ -102,9 +121,24 @@ class ClockWindow:
             surface = parts.registered.select(_thinned(len(parts.registered), _SURFACE))
             surfaces.append(self._placed(surface, tracker, pose))
             kept_out.append(self._placed(parts.kept_out, tracker, pose))
+        moved = se3.relative(poses[SKIPPED - 1], poses[-1])[:3, 3]
+        if clock is not None and np.linalg.norm(moved - self._moved) > self._tolerance_m:
+            # Rings on flat ground agree best with themselves where the motion is lost: that is no evidence.
+            return np.full(len(surfaces) - 1, _LOST)
         if clock is None:
-            self.motion = _motion(poses)
+            self.motion, self._moved = _motion(poses), moved
+            turn = max(so3.angle(se3.relative(a, b)[:3, :3]) for a, b in pairwise(poses))
+            self._tolerance_m = _ASTRAY * float(np.linalg.norm(moved)) + _ASTRAY_M + _LEVER_M * float(turn)
+            self._first_step = se3.relative(poses[0], poses[1])
         return _distances(surfaces, kept_out)[1:]
+
+    def _moving_on(self) -> ConstantVelocity:
+        """Constant velocity through the first scan, as the first two scans moved without a clock."""
+        first, second = (scan.stamp_ns for scan in self.scans[:2])
+        motion, back = ConstantVelocity(), se3.inverse(self._first_step)
+        motion.correct(2 * first - second - (second - first), back @ back)
+        motion.correct(2 * first - second, back)
+        return motion
 
     @staticmethod
     def _placed(scan: Scan, tracker: Tracker, pose: Floats) -> Floats:
@@ -175,7 +209,7 @@ def _distance(tree: Any, cloud: Floats, owner: NDArray[np.int64], number: int, p
     count = weight.sum(axis=1)
     kept = count >= _FEWEST
     if not kept.any():
-        return 1.0
+        return _LOST
     points, near, weight, count = points[kept], near[kept], weight[kept], count[kept, None]
     neighbours = cloud[near]
     middle = np.einsum("nk,nki->ni", weight, neighbours) / count

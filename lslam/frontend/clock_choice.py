@@ -97,7 +97,7 @@ def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> Cloc
             near = [replace(best, turn=(best.turn + sign * step) % 1.0) for sign in (-1, 1)]
             tried += near
             best = min((best, *near), key=lambda clock: mean_score(windows, clock))
-    return _verdict(windows, tried, best, sample)
+    return _verdict(windows, tried, best, sample, proposal.is_guess)
 
 
 def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepClock | None:
@@ -105,8 +105,9 @@ def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepC
 
 
 def _verdict(
-    windows: list[ClockWindow], tried: list[SweepClock | None], best: SweepClock | None, sample: Scan
-) -> ClockChoice:
+    windows: list[ClockWindow], tried: list[SweepClock | None], best: SweepClock | None, sample: Scan,
+    is_guess: bool,
+) -> ClockChoice:  # fmt: skip
     scores = {_name(clock): mean_score(windows, clock) for clock in tried}
     rivals = [clock for clock in tried if clock is not best and not _is_alike(best, clock, sample)]
     results = {_name(clock): compare_clocks(windows, best, clock) for clock in rivals}
@@ -114,6 +115,9 @@ def _verdict(
     count = sum(len(window.scores(None)) for window in windows)
     margin = f"t = {results[closest].t:.1f} against {closest}, {count} scans"
     is_clear = all(result.is_clear for result in results.values())
+    if not is_guess and (best is None or best.turn):
+        # The clock that is proposed must have been judged before another one, or none, is taken.
+        is_clear &= not any(window.is_astray(clock) for window in windows for clock in tried[:3])
     moving = best or next(clock for clock in tried if clock is not None)
     half = replace(moving, seconds=0.5 * moving.seconds)
     if is_clear and compare_clocks(windows, half, best).t > _HALF_T:

@@ -18,6 +18,8 @@ Floats = NDArray[np.float64]
 _COVERED, _BINS = 0.5, 36
 # rad; the sweeps of a sensor begin at one azimuth when most of its scans begin within this of their middle.
 _FIXED_RAD = np.radians(10.0)
+# rad; columns are even where nine in ten of the points lie so near to their azimuth, lasers being offset by some degrees.
+_EVEN_RAD = np.radians(12.0)
 # Share of the scans that must have the same order.
 _MOST = 0.8
 
@@ -42,13 +44,16 @@ def propose_clock(scans: list[Scan], nominal: SweepClock, rows: int | None) -> P
 
 
 def columns_clock(scans: list[Scan], nominal: SweepClock, rows: int | None) -> SweepClock | None:
-    """The columns of organised clouds; None for other clouds."""
+    """The columns of organised clouds that turn evenly; None for other clouds."""
     if rows:
-        is_organised = all(len(scan) % rows == 0 for scan in scans)
-        return replace(nominal, kind="columns", rows=rows) if is_organised else None
-    rules = {None if rule is None else (rule.count, rule.columns) for rule in map(organised_rows, scans)}
-    rule = rules.pop() if len(rules) == 1 else None
-    return None if rule is None else replace(nominal, kind="columns", rows=rule[0], is_columnwise=rule[1])
+        layouts = {(rows, False) if len(scan) % rows == 0 else None for scan in scans}
+    else:
+        layouts = {None if rule is None else (rule.count, rule.columns) for rule in map(organised_rows, scans)}
+    layout = layouts.pop() if len(layouts) == 1 else None
+    if layout is None:
+        return None
+    clock = replace(nominal, kind="columns", rows=layout[0], is_columnwise=layout[1])
+    return clock if all(_is_even(clock, scan) for scan in scans) else None
 
 
 def order_clock(scans: list[Scan], nominal: SweepClock) -> SweepClock | None:
@@ -80,6 +85,22 @@ def azimuth_proposal(scans: list[Scan], nominal: SweepClock) -> Proposal:
             begins.append(ring.begin_rad)
     begin = _common(np.array(begins))
     return Proposal(replace(guess, sense=sense, begin_rad=-np.pi if begin is None else begin), is_guess=begin is None)
+
+
+def _is_even(clock: SweepClock, scan: Scan) -> bool:
+    """Whether columns turn on by equal angles, as they do where none is left out."""
+    points = scan.points
+    is_used = np.isfinite(points).all(axis=1) & (points[:, :2] != 0).any(axis=1)
+    if not is_used.any():
+        return True
+    turned = clock.times_of(points)[0][is_used] * (2 * np.pi / clock.seconds)
+    angle = azimuths(points[is_used])
+    for sense in (-1, 1):
+        apart = np.exp(1j * (angle - sense * turned))
+        off = np.abs(np.angle(apart * np.conj(apart.mean())))
+        if np.percentile(off, 90) < _EVEN_RAD:
+            return True
+    return False
 
 
 def _coverage(scans: list[Scan]) -> float:
