@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,21 +21,23 @@ from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import gate_points
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.registration.constant_velocity import ConstantVelocity
+from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]
 
 # Scans of a window. The speed is not known before the second scan: those before are not judged.
-SCANS, SKIPPED, FEWEST_SCANS = 12, 2, 8
+SCANS, SKIPPED, FEWEST_SCANS = 13, 3, 8
 # Points of a scan that odometry has, that the surfaces are made of, and that are kept out to be laid on them.
 _REGISTERED, _SURFACE, _KEPT_OUT = 6000, 4000, 800
 _SHARE_KEPT_OUT = 0.15
-_SOURCE = 1200, 2400
+_SOURCE = 2000, 3500
 # A motion over the window that differs by more than this share of it, m, and the largest rotation in a sweep on a lever of so
 # many m, from that without a clock is another one.
-_ASTRAY, _ASTRAY_M, _LEVER_M = 0.15, 0.3, 5.0
-_NO_SEARCH = RecoveryConfig(start_search=False)
+_ASTRAY, _ASTRAY_M, _LEVER_M = 0.08, 0.3, 5.0
+# With the speed of the start known, nothing is searched far from where it leads: rings on flat ground lure to a standstill.
+_NO_SEARCH = RecoveryConfig(start_search=False, coarse_to_fine=False)
 # Neighbours that make a surface, within m, and the fewest of other scans among them.
 _NEIGHBOURS, _RADIUS_M, _FEWEST = 16, 1.0, 6
 # m; distances from a surface count by d^2 / (d^2 + _SCALE_M^2): thickness counts, what is no surface does not.
@@ -47,7 +50,7 @@ STILL_M, STILL_RAD = 0.03, float(np.deg2rad(0.4))
 _T, _SAME_SIGN, _RELATIVE = 4.0, 0.75, 0.02
 
 
-class Comparison(NamedTuple):
+class ClockComparison(NamedTuple):
     """Two clocks over the same scans: Student's t and the sign of the paired differences, and the relative difference."""
 
     t: float
@@ -61,15 +64,20 @@ class Comparison(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Parts:
-    """One scan: what odometry has of it, and what is kept out."""
+class _Placed:
+    """A scan where odometry has it, deskewed: its pose, points for surfaces (N, 3) and points that were kept out (M, 3), m."""
 
-    registered: Scan
-    kept_out: Scan
+    pose: Floats
+    surface: Floats
+    kept_out: Floats
 
 
 class ClockWindow:
-    """Consecutive scans, over which clocks are tried; the same clock is tried once."""
+    """Consecutive scans, over which clocks are tried; the same clock is tried once.
+
+    Where the sensor goes is found once, without a clock. Under each clock, and without one, odometry then begins with the speed
+    of its first step and searches nothing.
+    """
 
     def __init__(self, scans: list[Scan], preprocess: PreprocessConfig) -> None:
         gate = preprocess.model_dump(include={"range_min", "range_max", "range_shape", "ego_box"})
@@ -78,71 +86,63 @@ class ClockWindow:
         self.scans = [scan for scan in scans if len(scan) > 0]
         self._masks = [self._split(scan) for scan in self.scans]
         self._scores: dict[SweepClock | None, Floats] = {}
-        # Path and rotation per sweep without a clock.
-        self.motion = (0.0, 0.0)
-        self._moved, self._tolerance_m = np.zeros(3), 0.0
-        self._first_step = np.eye(4)
+
+    @cached_property
+    def _steps(self) -> list[Floats]:
+        """Motion (4, 4) from scan to scan, without a clock."""
+        poses = [placed.pose for placed in self._placed(None, self._config, None)]
+        return [se3.relative(a, b) for a, b in pairwise(poses)]
 
     @property
     def is_moving(self) -> bool:
         """Whether the sensor moves so that a clock can make a difference."""
-        self.scores(None)
-        return self.motion[0] > STILL_M or self.motion[1] > STILL_RAD
+        moved = float(np.median([np.linalg.norm(step[:3, 3]) for step in self._steps]))
+        return moved > STILL_M or float(np.median([so3.angle(step[:3, :3]) for step in self._steps])) > STILL_RAD
 
     def scores(self, clock: SweepClock | None) -> Floats:
         """(S,) how far the points that were kept out lie from the surfaces of the other scans, 0 to 1, of each scan judged."""
         if clock not in self._scores:
-            self._scores[clock] = self._judged(clock)
+            config = self._config.model_copy(update={"recovery": _NO_SEARCH})
+            placed = self._placed(clock, config, self._moving_on())[SKIPPED - 1 :]
+            is_judged = self._is_same_motion(placed)
+            # Rings on flat ground agree best with themselves where the motion is lost: that is no evidence.
+            self._scores[clock] = _distances(placed)[1:] if is_judged else np.full(len(placed) - 1, _LOST)
         return self._scores[clock]
 
     def is_astray(self, clock: SweepClock | None) -> bool:
-        """Whether odometry found another motion under the clock than without one, so that its scores say nothing."""
+        """Whether odometry found another motion under the clock than the window has, so that its scores say nothing."""
         return bool((self.scores(clock) >= _LOST).all())
 
-    def _judged(self, clock: SweepClock | None) -> Floats:
-        config, motion = self._config, None
-        if clock is not None:
-            # The speed at the start is sought once, without a clock.
-            self.scores(None)
-            config, motion = config.model_copy(update={"recovery": _NO_SEARCH}), self._moving_on()
+    def _placed(self, clock: SweepClock | None, config: Config, motion: ConstantVelocity | None) -> list[_Placed]:
+        """The scans where odometry has them under the clock."""
         odometry = create_odometry(config)
         tracker = Tracker(odometry, motion=motion)
-        surfaces: list[Floats] = []
-        kept_out: list[Floats] = []
-        poses: list[Floats] = []
-        for number, (scan, masks) in enumerate(zip(self.scans, self._masks, strict=True)):
+        placed = []
+        for number, (scan, (used, unused)) in enumerate(zip(self.scans, self._masks, strict=True)):
             timed = replace(scan, times=None if clock is None else clock.times_of(scan.points)[0])
-            parts = _Parts(timed.select(masks[0]), timed.select(masks[1]))
-            loaded = Loaded(number, scan.stamp_ns, parts.registered, odometry.prepare(parts.registered))
+            registered, kept_out = timed.select(used), timed.select(unused)
+            loaded = Loaded(number, scan.stamp_ns, registered, odometry.prepare(registered))
             pose = tracker.track(loaded).T_world_lidar
-            poses.append(pose)
-            if number < SKIPPED - 1:
-                continue
-            surface = parts.registered.select(_thinned(len(parts.registered), _SURFACE))
-            surfaces.append(self._placed(surface, tracker, pose))
-            kept_out.append(self._placed(parts.kept_out, tracker, pose))
-        moved = se3.relative(poses[SKIPPED - 1], poses[-1])[:3, 3]
-        if clock is not None and np.linalg.norm(moved - self._moved) > self._tolerance_m:
-            # Rings on flat ground agree best with themselves where the motion is lost: that is no evidence.
-            return np.full(len(surfaces) - 1, _LOST)
-        if clock is None:
-            self.motion, self._moved = _motion(poses), moved
-            turn = max(so3.angle(se3.relative(a, b)[:3, :3]) for a, b in pairwise(poses))
-            self._tolerance_m = _ASTRAY * float(np.linalg.norm(moved)) + _ASTRAY_M + _LEVER_M * float(turn)
-            self._first_step = se3.relative(poses[0], poses[1])
-        return _distances(surfaces, kept_out)[1:]
+            surface = registered.select(_thinned(len(registered), _SURFACE))
+            both = (se3.apply(pose, _deskewed(part, tracker.sweep)) for part in (surface, kept_out))
+            placed.append(_Placed(pose, *both))
+        return placed
 
     def _moving_on(self) -> ConstantVelocity:
-        """Constant velocity through the first scan, as the first two scans moved without a clock."""
+        """Constant velocity through the first scan, that of the first step."""
         first, second = (scan.stamp_ns for scan in self.scans[:2])
-        motion, back = ConstantVelocity(), se3.inverse(self._first_step)
-        motion.correct(2 * first - second - (second - first), back @ back)
-        motion.correct(2 * first - second, back)
+        motion, back = ConstantVelocity(), se3.inverse(self._steps[0])
+        motion.correct(first - 2 * (second - first), back @ back)
+        motion.correct(first - (second - first), back)
         return motion
 
-    @staticmethod
-    def _placed(scan: Scan, tracker: Tracker, pose: Floats) -> Floats:
-        return se3.apply(pose, deskew_points(scan.points, scan.times, tracker.sweep).astype(np.float64))
+    def _is_same_motion(self, placed: list[_Placed]) -> bool:
+        """Whether the scans end where they do without a clock, as far as rotations within their sweeps allow."""
+        expected = reduce(np.matmul, self._steps[SKIPPED - 1 :])[:3, 3]
+        moved = se3.relative(placed[0].pose, placed[-1].pose)[:3, 3]
+        turn = max(float(so3.angle(step[:3, :3])) for step in self._steps)
+        allowed = _ASTRAY * float(np.linalg.norm(expected)) + _ASTRAY_M + _LEVER_M * turn
+        return float(np.linalg.norm(moved - expected)) <= allowed
 
     def _split(self, scan: Scan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Indices of the points for odometry and of those that are kept out, in their order, by chance."""
@@ -164,12 +164,12 @@ def read_window(sequence: Sequence, first: int, preprocess: PreprocessConfig) ->
     return window if len(window.scans) >= FEWEST_SCANS else None
 
 
-def compare_clocks(windows: list[ClockWindow], better: SweepClock | None, worse: SweepClock | None) -> Comparison:
+def compare_clocks(windows: list[ClockWindow], better: SweepClock | None, worse: SweepClock | None) -> ClockComparison:
     """By how much the scans of the windows agree better under one clock than under another."""
     good, bad = (np.concatenate([window.scores(clock) for window in windows]) for clock in (better, worse))
     difference = bad - good
     spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
-    return Comparison(
+    return ClockComparison(
         float(difference.mean()) / max(spread, 1e-12), float((difference > 0).mean()),
         float(difference.sum()) / max(float(good.sum()), 1e-12),
     )  # fmt: skip
@@ -180,25 +180,22 @@ def mean_score(windows: list[ClockWindow], clock: SweepClock | None) -> float:
     return float(np.concatenate([window.scores(clock) for window in windows]).mean())
 
 
-def _motion(poses: list[Floats]) -> tuple[float, float]:
-    """Median translation, m, and rotation, rad, from scan to scan."""
-    steps = [se3.relative(a, b) for a, b in pairwise(poses)]
-    moved = [float(np.linalg.norm(step[:3, 3])) for step in steps]
-    return float(np.median(moved)), float(np.median([so3.angle(step[:3, :3]) for step in steps]))
+def _deskewed(scan: Scan, sweep: MotionPrior) -> Floats:
+    return np.asarray(deskew_points(scan.points, scan.times, sweep), np.float64)
 
 
 def _thinned(count: int, most: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def _distances(surfaces: list[Floats], kept_out: list[Floats]) -> Floats:
+def _distances(scans: list[_Placed]) -> Floats:
     """(S,) mean of the bounded distances of each scan's points from the surfaces that the other scans make."""
     from scipy.spatial import cKDTree
 
-    cloud = np.concatenate(surfaces)
-    owner = np.repeat(np.arange(len(surfaces)), [len(s) for s in surfaces])
+    cloud = np.concatenate([scan.surface for scan in scans])
+    owner = np.repeat(np.arange(len(scans)), [len(scan.surface) for scan in scans])
     tree = cKDTree(cloud)
-    return np.array([_distance(tree, cloud, owner, number, points) for number, points in enumerate(kept_out)])
+    return np.array([_distance(tree, cloud, owner, number, scan.kept_out) for number, scan in enumerate(scans)])
 
 
 def _distance(tree: Any, cloud: Floats, owner: NDArray[np.int64], number: int, points: Floats) -> float:

@@ -74,8 +74,12 @@ def choose_clock(sequence: Sequence, proposal: Proposal, sample: Scan, preproces
 def _moving(sequence: Sequence, preprocess: PreprocessConfig) -> Iterator[ClockWindow]:
     """Windows in which the sensor moves, the first ones first."""
     last = max(len(sequence) - SCANS, 0)
-    places = [first for first in (0, SCANS, 2 * SCANS) if first < last]
-    for first in sorted({0, *places, *np.linspace(0, last, _PLACES).round().astype(int).tolist()}):
+    places = [0, SCANS, *np.linspace(0, last, _PLACES).round().astype(int).tolist()]
+    end = 0
+    for first in sorted(places):
+        if not end <= first <= last:
+            continue
+        end = first + SCANS
         window = read_window(sequence, first, preprocess)
         if window is not None and window.is_moving:
             yield window
