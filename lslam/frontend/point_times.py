@@ -61,7 +61,7 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
 def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
     """The sequence with the clock of the choice, which the manifest finds as `clock_choice`."""
     notes = [*sequence.notes, choice.sentence]
-    if choice.verdict == "compensated":
+    if choice.verdict == "compensated" and sequence.motion_compensated is None:
         return SequenceView(sequence, notes=notes, clock_choice=choice, motion_compensated=True)
     if choice.clock is None and choice.verdict != "stated":
         return SequenceView(sequence, notes=notes, clock_choice=choice)

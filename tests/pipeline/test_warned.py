@@ -57,7 +57,8 @@ def _levels_stay() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("changes", "settings"),
     [
-        ({"motion_compensated": None}, ()),
+        # Twelve scans, found to be compensated, are stated not to be.
+        ({"motion_compensated": False}, ()),
         ({"motion_compensated": False}, ("preprocess.deskew=false",)),
         ({"scans": [*sample(8).scans, "000008.bin: 1001 bytes are not whole points", *sample(3).scans]}, ()),
         ({"problems": ["calibration is not used: calib.txt is empty"]}, ()),
