@@ -141,7 +141,7 @@ def test_warnings_of_consecutive_and_concurrent_runs_do_not_mix(tmp_path: Path) 
 def test_a_resumed_run_keeps_its_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     settings = config_of("report.html=false", f"input.threads={threads}")
-    stub = replace(sample(COUNT), motion_compensated=None)
+    stub = replace(sample(COUNT), motion_compensated=False)
     lslam.run(replace(stub, on_read=saying(3, "scan 3 looks odd")), settings, out=tmp_path / "whole")
     assert manifest(tmp_path / "whole")["problems"][1:] == ["scan 3 looks odd"]
 
