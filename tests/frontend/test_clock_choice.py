@@ -89,8 +89,8 @@ def test_the_order_of_firing_is_told_by_the_agreement_of_scans() -> None:
     untimed = Untimed(columns_first)
     sequence: Any = with_point_times(untimed, PREPROCESS)  # type: ignore[arg-type]
     assert sequence.clock_choice.verdict == "clear"
-    assert sequence.clock.kind == "order"
-    assert not sequence.clock.is_reversed
+    assert sequence.sweep_clock.kind == "order"
+    assert not sequence.sweep_clock.is_reversed
     assert wrong_share(sequence, untimed) < 0.01
     assert sequence.notes[-1].startswith(
         "point times: by the order of the points, clockwise, from azimuth 0 deg, 0.1 s"
@@ -103,7 +103,7 @@ def test_the_order_of_firing_is_told_by_the_agreement_of_scans() -> None:
 def test_points_in_reverse_order_are_told_too() -> None:
     untimed = Untimed(lambda scan: columns_first(scan).select(slice(None, None, -1)))
     sequence: Any = with_point_times(untimed, PREPROCESS)  # type: ignore[arg-type]
-    assert sequence.clock.is_reversed
+    assert sequence.sweep_clock.is_reversed
     assert wrong_share(sequence, untimed) < 0.01
 
 
@@ -144,7 +144,7 @@ def test_a_stated_clock_is_taken_without_evidence(kind: str, monkeypatch: pytest
     monkeypatch.setattr("lslam.frontend.point_times.choose_clock", None)
     untimed = Untimed(columns_first, stated_times=StatedTimes(kind, "end"))
     sequence: Any = with_point_times(untimed, PREPROCESS)  # type: ignore[arg-type]
-    assert sequence.clock.kind == kind
+    assert sequence.sweep_clock.kind == kind
     times, true = sequence.scan(2).times, untimed.timed(2).times
     # Noise puts a few points on the other side of where sweeps begin.
     assert (np.abs(times - (true - SECONDS)) > 0.002).mean() < 0.002
