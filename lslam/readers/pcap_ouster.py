@@ -12,7 +12,15 @@ from lslam.formats.ouster_packets import IMU_SIZE, OusterSensor, frames_and_time
 from lslam.formats.point_cloud import PointCloud
 from lslam.geometry import se3
 from lslam.readers.ground_truth import Voice
-from lslam.readers.pcap_revolutions import Integers, Opened, Packets, in_order, metadata_beside, of_one_sender
+from lslam.readers.pcap_revolutions import (
+    Integers,
+    Opened,
+    Packets,
+    in_order,
+    metadata_beside,
+    no_slivers,
+    of_one_sender,
+)
 from lslam.types.imu import ImuStream
 
 _UNIX_NS = 10**18  # a clock that tells less was never told the time
@@ -71,6 +79,7 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
     first = np.flatnonzero(np.concatenate([[True], np.diff(frames) != 0]))
     count = np.diff(np.concatenate([first, [len(frames)]])).astype(np.int64)
     whole = _whole(count, voice)
+    whole = whole[no_slivers(count[whole] / count.max(), voice)]
     first, count = first[whole], count[whole]
     voice.notes.append(f"{len(which)} packets of an {sensor.name} with {sensor.beams} beams, metadata from {metadata}")
     revolutions = OusterRevolutions(datagrams, sensor, which, first, count, times[first] + shift, shift)

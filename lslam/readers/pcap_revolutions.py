@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 
 Integers = NDArray[np.int64]
+# Shares of a revolution: less is no scan, and so much is one where it is the only one.
+SLIVER, ALONE = 0.1, 0.9
 
 
 class Packets(Protocol):
@@ -92,6 +94,20 @@ def of_one_sender(datagrams: Packets, which: Integers, what: str, voice: Voice) 
     others = ", ".join(_address(int(sender)) for sender in senders if sender != chosen)
     voice.problems.append(f"{what} of {len(senders)} senders: those of {_address(chosen)} are read, not of {others}")
     return np.asarray(which[datagrams.sources[which] == chosen], np.int64)
+
+
+def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> NDArray[np.bool_]:
+    """Which revolutions are scans, by the share of its packets that each has.
+
+    Where revolutions are missing, a packet or two of the one before are kept with the next: that is no scan.
+    """
+    keep = shares >= SLIVER
+    if keep.all() or not keep.any():
+        return np.ones(len(shares), np.bool_)
+    voice.problems.append(
+        f"revolutions are missing: {int((~keep).sum())} of which less than {SLIVER:.0%} was captured are left out"
+    )
+    return keep
 
 
 def in_order(times_ns: Integers, what: str, voice: Voice) -> Integers:

@@ -23,7 +23,7 @@ from lslam.formats.velodyne_packets import (
     split_blocks,
 )
 from lslam.readers.ground_truth import Voice
-from lslam.readers.pcap_revolutions import Integers, Opened, Packets, in_order, of_one_sender
+from lslam.readers.pcap_revolutions import ALONE, Integers, Opened, Packets, in_order, no_slivers, of_one_sender
 
 _HOUR_NS = HOUR_US * 1000
 _SAID_NS = 10**9  # clocks that are nearer are the same clock, and the way of a packet
@@ -74,13 +74,17 @@ def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
     azimuth, rate = _unwrapped(path, angle, times)
     per_packet = BLOCKS // 2 if mode == DUAL else BLOCKS
     end = int(azimuth[-1]) + round(rate * model.block_ns * per_packet)
-    turns = np.unique(azimuth // TURN)
+    turns, counts = np.unique(azimuth // TURN, return_counts=True)
     # The last block reaches to where the next one would begin, give or take its rounding.
-    turns = turns[turns < (end + round(rate * model.block_ns)) // TURN]
-    if not len(turns):
+    is_whole = turns < (end + round(rate * model.block_ns)) // TURN
+    if not is_whole.any() and end < ALONE * TURN:
         raise InputError(f"{path} holds {end / TURN:.2f} of a revolution of the {model.name}: one is needed")
-    if end % TURN > TURN // 100:
+    if not is_whole.any():
+        voice.notes.append(f"the capture holds {end / TURN:.2f} of one revolution: it is the only scan")
+        is_whole[0] = True
+    elif end % TURN > TURN // 100:
         voice.notes.append(f"the last {end % TURN / TURN:.2f} of a revolution are no scan")
+    turns = turns[is_whole][no_slivers(counts[is_whole] * (rate * model.block_ns * per_packet / TURN), voice)]
     revolutions = VelodyneRevolutions(
         datagrams, model, int(angle[0]), which, azimuth, times, turns,
         _stamps(datagrams, which, azimuth, times, turns, model),

@@ -319,3 +319,44 @@ def test_imu_samples_that_are_not_finite_are_left_out(tmp_path: Path) -> None:
     assert len(imu.stamps_ns) == 7
     assert np.isfinite(imu.accel).all()
     assert np.isfinite(imu.gyro).all()
+
+
+def saved_by_scan(revolutions: float, kept: range, before: int, cut: int = 0) -> list[tuple[int, bytes]]:
+    """Packets of the revolutions `kept`, each with `before` packets of the one before and without its last `cut`."""
+    frames, _ = velodyne("VLP-16", revolutions, first_deg=0.0)
+    turn = [int((at - START_NS - 1_330_000) / 1e8) for at, _ in frames]
+    chosen: list[tuple[int, bytes]] = []
+    for k in kept:
+        first, end = turn.index(k), turn.index(k + 1)
+        chosen += frames[max(first - before, 0) : end - cut]
+    return chosen
+
+
+@pytest.mark.parametrize("before", [0, 1, 5])
+def test_a_sliver_of_the_sweep_before_is_no_scan(before: int, tmp_path: Path) -> None:
+    """Captures saved scan by scan: two of three revolutions are missing, packets of the one before are kept."""
+    sequence = open_sequence(write_pcap(tmp_path / "a.pcap", saved_by_scan(10.2, range(0, 10, 3), before)))
+    np.testing.assert_allclose((sequence.stamps_ns - START_NS) / 1e8, [0, 3, 6, 9], atol=0.02)
+    assert [len(sequence.scan(k)) > 28_000 for k in range(4)] == [True] * 4
+    assert sum("revolutions are missing: 3 of which" in problem for problem in sequence.problems) == (before > 0)
+
+
+def test_a_capture_of_one_scan_is_one(tmp_path: Path) -> None:
+    whole = open_sequence(write_pcap(tmp_path / "a.pcap", saved_by_scan(3.2, range(1, 2), 0)))
+    assert (len(whole), whole.problems) == (1, [])
+    most = open_sequence(write_pcap(tmp_path / "b.pcap", saved_by_scan(3.2, range(1, 2), 0, cut=4)))
+    assert len(most) == 1
+    assert any("0.96 of one revolution: it is the only scan" in note for note in most.notes)
+    np.testing.assert_array_equal(most.scan(0).points, whole.scan(0).points[: len(most.scan(0))])
+    with pytest.raises(InputError, match=r"0\.81 of a revolution"):
+        open_sequence(write_pcap(tmp_path / "c.pcap", saved_by_scan(3.2, range(1, 2), 0, cut=15)))
+
+
+def test_a_packet_of_an_ouster_frame_that_is_missing_is_no_scan(tmp_path: Path) -> None:
+    spec = OusterSpec("RNG15_RFL8_NIR8", width=256)
+    frames, _ = ouster(spec, 5)
+    per_frame = len(frames) // 5
+    kept = [f for k, f in enumerate(frames) if k // per_frame != 2 or k % per_frame == per_frame - 1]
+    sequence = open_sequence(write_ouster(tmp_path, spec, kept))
+    assert len(sequence) == 4
+    assert any("1 of which less than 10%" in problem for problem in sequence.problems)
