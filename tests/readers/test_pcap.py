@@ -348,7 +348,8 @@ def test_a_capture_of_one_scan_is_one(tmp_path: Path) -> None:
     most = open_sequence(write_pcap(tmp_path / "b.pcap", saved_by_scan(3.2, range(1, 2), 0, cut=4)))
     assert len(most) == 1
     assert any(re.search(r"0\.9\d of one revolution: it is the only scan", note) for note in most.notes)
-    np.testing.assert_array_equal(most.scan(0).points, whole.scan(0).points[: len(most.scan(0))])
+    n = len(most.scan(0)) - 100  # the last block turns by the rate, which the next one would tell
+    np.testing.assert_allclose(most.scan(0).points[:n], whole.scan(0).points[:n], atol=ATOL_M)
     with pytest.raises(InputError, match=r"0\.81 of a revolution"):
         open_sequence(write_pcap(tmp_path / "c.pcap", saved_by_scan(3.2, range(1, 2), 0, cut=15)))
 
