@@ -64,6 +64,10 @@ def associate(estimate: Trajectory, truth: Trajectory, max_diff: float = 0.01, o
         matches = _interpolated(estimate, stamps, truth, limit)
     else:
         matches = _nearest(estimate, stamps, truth, limit)
+        # Moved by part of a sweep, no stamp meets one of the truth.
+        if offset_ns and len(matches.stamps_ns) < LEAST_OVERLAP * matches.possible:
+            between = _interpolated(estimate, stamps, truth, limit, "ground truth interpolated at the moved stamps")
+            matches = max(between, matches, key=lambda m: len(m.stamps_ns))
     if len(matches.stamps_ns) < LEAST:
         raise InputError(_no_overlap(estimate, stamps, truth, len(matches.stamps_ns), max_diff))
     return matches
@@ -129,7 +133,13 @@ def _nearest(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int
     )
 
 
-def _interpolated(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int) -> Matches:
+def _interpolated(
+    estimate: Trajectory,
+    stamps: Stamps,
+    truth: Trajectory,
+    limit: int,
+    recipe: str = "denser ground truth interpolated at the estimate's stamps",
+) -> Matches:
     known = truth.stamps_ns
     after = np.clip(np.searchsorted(known, stamps, side="left"), 1, len(known) - 1)
     gap = known[after] - known[after - 1]
@@ -144,7 +154,7 @@ def _interpolated(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit
         stamps_ns=stamps[i],
         seconds=_seconds(stamps[i]),
         possible=len(estimate),
-        recipe="denser ground truth interpolated at the estimate's stamps",
+        recipe=recipe,
     )
 
 

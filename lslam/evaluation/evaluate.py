@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.eval import EvalConfig
 from lslam.errors import InputError
-from lslam.evaluation.absolute import AbsoluteTrajectoryError
+from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset
 from lslam.evaluation.frames import body_turn, reconcile
 from lslam.evaluation.kitti_drift import KittiOdometry
@@ -19,7 +19,9 @@ from lslam.evaluation.metric import MatchedPoses, TrajectoryMetric
 from lslam.evaluation.relative import RelativePoseError
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.thesis import DelTufo, Girolimetto
+from lslam.evaluation.time_offset import fit_offset
 from lslam.geometry import se3, so3
+from lslam.printable import metres
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
@@ -37,6 +39,8 @@ STRAIGHT = 0.01
 # Spread of the truth's positions per metre of the estimate's, and the unit that they then seem to have. What is left of a path in
 # km may be the motion of a lever arm.
 UNITS = ((1 / 0.33, 1 / 0.28, "feet"), (67.0, 150.0, "cm"), (670.0, 1500.0, "mm"), (0.0, 0.03, "km"))
+# An ATE that grows so much at another offset speaks against it; drift alone makes it grow or shrink a little.
+WORSE = 1.25
 # m; a spread below is noise.
 SPREAD = 5.0
 # Chi-square of three degrees of freedom that chance exceeds once in a million times.
@@ -77,6 +81,7 @@ def evaluate(
         _check(which, trajectory)
     offset_ns, notes = _offset(estimate, ground_truth, config)
     matches = associate(estimate, ground_truth, config.max_diff, offset_ns)
+    notes += _better_offset(estimate, ground_truth, matches, config)
     if len(matches.stamps_ns) < matches.possible:
         notes.append(f"{matches.possible - len(matches.stamps_ns)} of {matches.possible} poses found no partner")
     notes += [
@@ -227,5 +232,31 @@ def _offset(estimate: Trajectory, truth: Trajectory, config: EvalConfig) -> tupl
         if offset and not (estimate.has_stamps and truth.has_stamps):
             raise InputError("a time offset needs stamps in both trajectories: give --times for the KITTI file")
         return offset, [f"time offset {config.time_offset:g} s added to the estimate"] if offset else []
-    offset, score = estimate_offset(estimate, truth)
-    return offset, [f"time offset auto: {offset / 1e9:.6f} s added to the estimate (correlation of motion {score:.3f})"]
+    try:
+        offset, score = estimate_offset(estimate, truth)
+        how = f"correlation of motion {score:.3f}"
+    except InputError:
+        fit = fit_offset(estimate, truth)
+        if fit is None or not fit.is_clearly_off():
+            raise
+        offset = 0
+    fit = fit_offset(estimate, truth, offset)
+    if fit is not None and fit.is_clearly_off(offset):
+        offset, how = fit.offset_ns, f"ways and turns of both, one sigma {fit.sigma_ns / 1e9:.4f} s"
+    return offset, [f"time offset auto: {offset / 1e9:.6f} s added to the estimate ({how})"]
+
+
+def _better_offset(estimate: Trajectory, truth: Trajectory, matches: Matches, config: EvalConfig) -> list[str]:
+    """A note when the estimate clearly fits the truth at another instant of the sweep than the stamps say."""
+    fit = fit_offset(estimate, truth) if config.time_offset == 0 else None
+    if fit is None or not fit.is_clearly_off():
+        return []
+    moved = associate(estimate, truth, config.max_diff, fit.offset_ns)
+    now, then = (absolute_error(m.estimate, m.truth, "se3").translation for m in (matches, moved))
+    if now is None or then is None or then.rmse > WORSE * now.rmse:
+        return []
+    gain = f": ATE se3 {metres(then.rmse)} m, {metres(now.rmse)} m as they are" if then.rmse < now.rmse else ""
+    return [
+        f"the estimate fits best with {fit.offset_ns / 1e9:+.3f} s added to its stamps (one sigma {fit.sigma_ns / 1e9:.3f} s)"
+        f"{gain}; the two may name other instants of the sweep: --time-offset auto takes it"
+    ]
