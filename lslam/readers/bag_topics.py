@@ -152,6 +152,11 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
         own = mine & is_own & ~np.isin(messages, [k for others in halves.others.values() for k in others])
         what = f"{topic.name}: scans" if len(chosen) == 1 else f"{topic.name}: scans of {name}"
         order, ordered = put_in_order(headers[own], recorded[own], what, voice)
+        if np.array_equal(ordered, headers[own][order]):
+            delay_s = float(np.median(recorded[own][order] - ordered)) * 1e-9
+            voice.notes.append(
+                f"{what} have the stamps of their headers; they were recorded {delay_s:.3f} s after (median)"
+            )
         voice.notes.extend(jitter_notes(ordered, what))
         frame = next((frames[k] for k in np.flatnonzero(mine) if frames[k]), "")
         indices.append(ScanIndex(topic, name, frame, messages[own][order], ordered, halves))

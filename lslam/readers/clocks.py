@@ -25,6 +25,7 @@ _SNAP = 0.3  # of the interval, how far an interval across a step may lie from w
 _MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others are brought onto
 MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
 _JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
+_LARGEST = 2.0**61
 _OFFSETS = 100  # of different clocks that are tried
 _JITTER = 0.03  # of the interval, by which stamps of arrival vary and those of a sensor do not
 _FAR = 1000  # durations of a recording, by which nothing pauses within it
@@ -81,7 +82,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
             f"{what}: {witness.name} run {speed:.3g} times as fast as the stamps of the headers, as of a recording that was "
             "played back or written anew: the headers count"
         )
-        w = w[0] + np.rint((w - w[0]) * speed).astype(np.int64)
+        w = w[0] + np.rint(np.clip((w - w[0]) * speed, -_LARGEST, _LARGEST)).astype(np.int64)
     steps, jumps = np.diff(h), np.diff(w)
     spread = _recording_spread(w, period)
     limit = max(0.5 * period, spread, 0.5 * period + float(late_ns.max()) if late_ns.any() else 0.0)
@@ -155,7 +156,7 @@ def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
 def jitter_notes(stamps: Stamps, what: str) -> tuple[str, ...]:
     """That intervals vary more than those of a sensor do, (N,) stamps that increase."""
     steps = np.diff(stamps).astype(np.float64)
-    if len(steps) < _SPREAD_SAMPLES:
+    if len(steps) < _SPREAD_SAMPLES or steps.min() <= 0:
         return ()
     period = float(np.median(steps))
     off = steps - np.maximum(np.rint(steps / period), 1) * period

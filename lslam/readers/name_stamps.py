@@ -74,7 +74,7 @@ def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[i
     """Seconds and the number behind them."""
     for k, separator in enumerate(between):
         whole, rest = groups[k], groups[k + 1]
-        is_alone = len(groups) == 2 and all(len(text) == 9 for text in rest)
+        is_alone = len(groups) == 2 and all(len(text) == 9 for text in rest) and max(map(len, whole)) < 9
         if separator not in tuple("._-,") or max(map(len, rest)) > 9 or not (_is_time(whole, 10**9) or is_alone):
             continue
         if _counts(rest):
@@ -101,11 +101,15 @@ def _numbers(groups: list[list[str]]) -> Iterator[tuple[list[int], str]]:
             if _is_time(texts, scale) and not (len(texts) > 1 and len(set(texts)) == 1):
                 yield [int(text) * scale for text in texts], f"{unit} since 1970"
     varying = [texts for texts in groups if len(set(texts)) > 1]
-    if len(varying) == 1 and len(varying[0]) > 2:
-        values = np.sort(np.array([int(text[-18:]) for text in varying[0]], np.int64))
+    if len(varying) == 1 and len(varying[0]) > 2 and max(map(len, varying[0])) <= 18:
+        values = np.sort(np.array([int(text) for text in varying[0]], np.int64))
         step = float(np.median(np.diff(values)))
         for unit, scale in _UNITS.items():
-            if step >= _NO_COUNT and _SHORTEST_NS <= step * scale <= _LONGEST_NS and values[-1] * scale < _EARLIEST_NS:
+            if (
+                step >= _NO_COUNT
+                and _SHORTEST_NS <= step * scale <= _LONGEST_NS
+                and int(values[-1]) * scale < _EARLIEST_NS
+            ):
                 yield [int(text) * scale for text in varying[0]], f"{unit} of a clock that began elsewhere"
 
 

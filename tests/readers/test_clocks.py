@@ -263,3 +263,32 @@ def test_a_step_of_the_points_clock_does_not_move_scans_whose_headers_go_on(
     (problem,) = [p for p in sequence.problems if "against the stamps of the headers: the headers count" in p]
     assert abs(float(problem.split("step by ")[1].split(" s")[0]) - abs(step_s)) < 0.1
     assert not sequence.scan(3).fault
+
+
+def test_any_two_clocks_give_increasing_stamps_of_different_messages() -> None:
+    rng = np.random.default_rng(5)
+
+    def clock(count: int) -> Stamps:
+        base = int(rng.choice([0, START_NS, -2 * 10**18, 4 * 10**18, 12 * SECOND]))
+        even = base + np.arange(count) * int(10 ** rng.uniform(3, 10))
+        kinds = [
+            even,
+            even + rng.normal(0, 1e8, count).astype(np.int64),
+            np.full(count, base),
+            rng.integers(-(2**61), 2**61, count),
+            even + np.where(rng.random(count) < 0.1, int(rng.choice([S37, -(10**18)])), 0),
+        ]
+        return np.asarray(kinds[int(rng.integers(len(kinds)))], np.int64)
+
+    for _ in range(400):
+        count = int(rng.integers(0, 60))
+        order, stamps, _ = ordered(clock(count), clock(count))
+        assert len(np.unique(order)) == len(order) == len(stamps)
+        assert (stamps[1:] > stamps[:-1]).all()
+
+
+def test_the_clock_that_counts_is_said(tmp_path: Path) -> None:
+    sequence = open_sequence(bag(tmp_path / "a.mcap", on_a_clock(lambda ns: 0), "mcap"))
+    assert (
+        "/points: scans have the stamps of their headers; they were recorded 0.015 s after (median)" in sequence.notes
+    )
