@@ -4,21 +4,30 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence as Many
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.fix_faults import (
+    Faults,
+    Fixes,
+    aligned,
+    clock_of,
+    clock_said,
+    on_clock_of_scans,
+    with_actual_sigmas,
+)
 from lslam.config.config import Config
 from lslam.config.gnss import GnssConfig
 from lslam.config.graph import GraphConfig
 from lslam.errors import InputError
-from lslam.geometry import geodesy, noise, se3
+from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.chi_square import quantile
 from lslam.graph.drift import chains, drift_covariance
 from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
-from lslam.graph.gnss_alignment import GnssAlignment, align
+from lslam.graph.gnss_alignment import GnssAlignment
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
 from lslam.types.gnss import Georeference, GnssStream
@@ -45,31 +54,13 @@ AMBIGUOUS = 0.4
 
 
 @dataclass(frozen=True)
-class Fixes:
-    """The usable fixes of a run, m, and odometry's positions of the antenna.
-
-    stamps_ns : (F,); positions : (F, 3) east, north, up from `origin` (3,) lat, lon, height; sigmas : (F, 3)
-    antenna : (F, 3) in the world of odometry; slack : (F,) one sigma of odometry's drift
-    is_stated : whether the sigmas are those of the recording
-    """
-
-    stamps_ns: NDArray[np.int64]
-    positions: Floats
-    sigmas: Floats
-    antenna: Floats
-    slack: Floats
-    origin: Floats
-    given: int
-    is_stated: bool
-
-
-@dataclass(frozen=True)
 class Placement:
     """A georeference and, for the graph, position factors of the fixes with their correlated noise.
 
     walk : factor on odometry's random-walk drift, estimated from the fixes
     tilt_sigma : rad, of the tilt that the georeference gives the first pose
     problem : why there is none, or what was left out
+    faults : what is wrong with the fixes beside, and was set right
     """
 
     georeference: Georeference | None = None
@@ -78,6 +69,7 @@ class Placement:
     walk: float = 0.0
     problem: str = ""
     tilt_sigma: float = PoseGraph.tilt_sigma
+    faults: Faults = field(default_factory=Faults)
 
 
 def require_gnss(sequence: Sequence, config: GnssConfig) -> None:
@@ -117,15 +109,18 @@ def place(
     assert stream is not None
     T_lidar_gnss = sequence.calibration.T_lidar_gnss
     arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
-    fixes = _usable(stream, results, arm, config.gnss, config.graph)
+    direction, sigma = (np.array([0.0, 0, 1.0]), UNLEVELLED) if up is None else (up, LEVELLED)
+    level = so3.least_rotation(direction, np.array([0.0, 0.0, 1.0]))
+    fixes, faults = _on_one_clock(stream, results, arm, level, config)
     if isinstance(fixes, str):
         return Placement(problem=fixes)
-    direction, sigma = (np.array([0.0, 0, 1.0]), UNLEVELLED) if up is None else (up, LEVELLED)
-    found = align(fixes.antenna, fixes.positions, fixes.sigmas, fixes.slack, direction, sigma, config.gnss.min_fixes)
+    fixes, faults = with_actual_sigmas(fixes, level, config.gnss.max_sigma, config.graph.probability, faults)
+    found, fixes, faults = aligned(fixes, direction, sigma, config.gnss.min_fixes, faults)
     if found is None:
         return Placement(
+            faults=faults,
             problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and "
-            f"{config.gnss.min_fixes} at the least (gnss.min_fixes): all rejected"
+            f"{config.gnss.min_fixes} at the least (gnss.min_fixes): all rejected",
         )
     georeference, shift = _at_first(found, fixes, config.gnss)
     log.info(
@@ -136,7 +131,8 @@ def place(
     if config.gnss.mode == "graph":
         fix_noise, walk = _fix_noise(fixes, found, keyframes, graph, config.graph)
     factors = _as_factors(fixes, found, shift, results, keyframes, arm, fix_noise)
-    return Placement(georeference, factors, fix_noise, walk, _elsewhere(found) or contradicted(found, fixes))
+    problem = _elsewhere(found) or contradicted(found, fixes)
+    return Placement(georeference, factors, fix_noise, walk, problem, faults=faults)
 
 
 def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
@@ -149,6 +145,24 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
         graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread,
         fix_noise=placement.fix_noise, walk=max(graph.walk, placement.walk), tilt_sigma=placement.tilt_sigma,
     )  # fmt: skip
+
+
+def _on_one_clock(
+    stream: GnssStream, results: Many[ScanResult], arm: Floats, level: Floats, config: Config
+) -> tuple[Fixes | str, Faults]:
+    """As `_usable`, with the stamps set right where they are clearly late or early."""
+    fixes = _usable(stream, results, arm, config.gnss, config.graph)
+    if isinstance(fixes, str):
+        return fixes, Faults()
+    stamps, poses = np.array([r.stamp_ns for r in results]), np.stack([r.T_world_lidar for r in results])
+    offset = clock_of(fixes, stamps, poses, arm, level)
+    again = (
+        fixes if offset is None else _usable(on_clock_of_scans(stream, offset), results, arm, config.gnss, config.graph)
+    )
+    if offset is None or isinstance(again, str):
+        return fixes, Faults()
+    facts = {"seconds": round(-offset.seconds, 3), "sigma_s": round(offset.sigma, 3)}
+    return again, Faults().and_another(clock_said(offset), fixes_late=facts)
 
 
 def _usable(
@@ -188,6 +202,7 @@ def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[G
     origin = geodesy.from_local(first[None], fixes.origin)[0]
     shift = geodesy.frame_change(fixes.origin, origin)
     residuals = found.residuals[found.inliers]
+    heights = found.residuals[found.inliers & fixes.has_height, 2]
     return Georeference(
         origin=origin,
         T_enu_world=shift @ found.T_enu_world,
@@ -196,7 +211,7 @@ def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[G
         fixes=fixes.given,
         used=int(found.inliers.sum()),
         rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
-        rmse_vertical=float(np.sqrt((residuals[:, 2] ** 2).mean())),
+        rmse_vertical=float(np.sqrt((heights**2).mean())) if len(heights) else float("nan"),
         height_epsg=config.height_crs,
         geoid=config.geoid,
     ), shift

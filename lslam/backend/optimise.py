@@ -86,7 +86,7 @@ def run_back_end(
         problems += contradicting(left, probability)
     for problem in problems:
         log.warning("%s", problem)
-    return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts)
+    return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts | given.facts)
 
 
 def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str, ...] = ("graph",)) -> Placement:
@@ -103,9 +103,10 @@ def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str
 
 
 def _said(placement: Placement, given: Given) -> Placement:
-    """The placement; its problem is one of the run."""
-    if placement.problem and placement.problem not in given.problems:
-        given.problems.append(placement.problem)
+    """The placement; its problems are those of the run."""
+    said = (*placement.faults.problems, placement.problem)
+    given.problems.extend(problem for problem in said if problem and problem not in given.problems)
+    given.facts.update(placement.faults.facts or {})
     return placement
 
 

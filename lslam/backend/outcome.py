@@ -14,6 +14,7 @@ from lslam.errors import GraphError
 from lslam.geometry import se3
 from lslam.graph.drift import tilt_factor
 from lslam.graph.factors import well_conditioned
+from lslam.graph.fix_errors import NO_HEIGHT
 from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.graph.loop_drift import without_loop_drift
 from lslam.graph.odometry_constraints import corrected
@@ -47,7 +48,7 @@ class Given:
     results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with the verdicts of verification
     clocks : time the work on each keyframe; the last one takes that of the whole graph
     points : control points
-    problems : what failed so far, one sentence each; appended to
+    problems : what failed so far, one sentence each; appended to. facts : for the manifest, likewise
     """
 
     results: list[ScanResult]
@@ -56,6 +57,7 @@ class Given:
     candidates: list[LoopCandidate]
     clocks: KeyframeClocks = field(default_factory=KeyframeClocks)
     problems: list[str] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
     points: tuple[ControlPoint, ...] = ()
 
 
@@ -199,10 +201,11 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
             return georeference
         return replace(georeference, used=0, rmse_horizontal=float("nan"), rmse_vertical=float("nan"))
     off = np.stack([f.position - f.seen(solution.poses) for f in used])
+    heights = off[[f.sigma[2] < NO_HEIGHT for f in used], 2]
     return replace(
         georeference,
         rmse_horizontal=float(np.sqrt((off[:, :2] ** 2).sum(1).mean())),
-        rmse_vertical=float(np.sqrt((off[:, 2] ** 2).mean())),
+        rmse_vertical=float(np.sqrt((heights**2).mean())) if len(heights) else float("nan"),
         used=len(used),
     )
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.graph.chi_square import quantile
+from lslam.graph.fix_errors import NO_HEIGHT
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +86,7 @@ def fit_gauss_markov(
     white = max(white, LEAST_WHITE)
     drift = replace(drift, keyframes=drift.keyframes[good])
     memory, factor = _likeliest(seconds, scaled, sigmas, antenna, white, drift)
-    sigma = np.sqrt(1.0 - white) * np.median(sigmas, axis=0)
+    sigma = np.sqrt(1.0 - white) * np.nanmedian(np.where(sigmas < NO_HEIGHT, sigmas, np.nan), axis=0)
     return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], sigma, memory), factor
 
 

@@ -1,0 +1,162 @@
+"""What is wrong with the fixes of a run beside single outliers: their clock, their sigmas, the datum of their heights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.geometry.interpolate import poses_at
+from lslam.graph.fix_errors import (
+    NO_HEIGHT,
+    ClockOffset,
+    actual_sigmas,
+    agreeing_heights,
+    clock_offset,
+    rough_residuals,
+)
+from lslam.graph.gnss_alignment import GnssAlignment, align
+from lslam.types.gnss import GnssStream
+
+Floats = NDArray[np.float64]
+
+# Fixes that heights alone reject, at least, as a share of all.
+LEAST_SHARE = 0.05
+# Share of the heights from which those left out are as plausible.
+AMBIGUOUS = 0.4
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """The usable fixes of a run, m, and odometry's positions of the antenna.
+
+    stamps_ns : (F,); positions : (F, 3) east, north, up from `origin` (3,) lat, lon, height; sigmas : (F, 3)
+    antenna : (F, 3) in the world of odometry; slack : (F,) one sigma of odometry's drift
+    is_stated : whether the sigmas are those of the recording
+    """
+
+    stamps_ns: NDArray[np.int64]
+    positions: Floats
+    sigmas: Floats
+    antenna: Floats
+    slack: Floats
+    origin: Floats
+    given: int
+    is_stated: bool
+
+    @property
+    def has_height(self) -> NDArray[np.bool_]:
+        """(F,) whether the height counts."""
+        return np.asarray(self.sigmas[:, 2] < NO_HEIGHT)
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Sentences about what is wrong, and the same for the manifest."""
+
+    problems: tuple[str, ...] = ()
+    facts: dict[str, Any] | None = None
+
+    def and_another(self, problem: str, **facts: Any) -> Faults:
+        """With one more."""
+        return Faults((*self.problems, problem), {**(self.facts or {}), **facts})
+
+
+def clock_of(
+    fixes: Fixes, stamps_ns: NDArray[np.int64], poses: Floats, arm: Floats, level: Floats
+) -> ClockOffset | None:
+    """The offset of the fixes' stamps against those of the scans, `stamps_ns` (N,), of `poses` (N, 4, 4); None where unclear.
+
+    arm : (3,) of the antenna; level : (3, 3) of the poses' world
+    """
+    start = int(stamps_ns[0])
+
+    def antenna_at(seconds: Floats) -> Floats:
+        at = start + np.round(1e9 * seconds).astype(np.int64)
+        inside = (at >= stamps_ns[0]) & (at <= stamps_ns[-1])
+        poses_there = poses_at(stamps_ns, poses, np.clip(at, stamps_ns[0], stamps_ns[-1]))
+        places = (np.einsum("nij,j->ni", poses_there[:, :3, :3], arm) + poses_there[:, :3, 3]) @ level.T
+        return np.where(inside[:, None], places, np.nan)
+
+    seconds = np.asarray(1e-9 * (fixes.stamps_ns - start), np.float64)
+    found = clock_offset(seconds, fixes.positions, antenna_at)
+    return found if found is not None and found.is_clear else None
+
+
+def on_clock_of_scans(stream: GnssStream, offset: ClockOffset) -> GnssStream:
+    """The fixes with the stamps that the scans would have given them."""
+    return replace(stream, stamps_ns=stream.stamps_ns + round(1e9 * offset.seconds))
+
+
+def clock_said(offset: ClockOffset) -> str:
+    """A sentence about a wrong clock."""
+    late = offset.seconds < 0
+    return (
+        f"GNSS: fixes are stamped {abs(offset.seconds):.2f} s {'late' if late else 'early'} (one sigma {offset.sigma:.2g} s): "
+        f"there they move as odometry does, and are taken {abs(offset.seconds):.2f} s {'earlier' if late else 'later'}"
+    )
+
+
+def with_actual_sigmas(
+    fixes: Fixes, level: Floats, largest: float, probability: float, faults: Faults
+) -> tuple[Fixes, Faults]:
+    """The fixes with the sigmas of their scatter where they state less, up to the `largest`, m: beyond they are no fixes."""
+    seconds = 1e-9 * (fixes.stamps_ns - fixes.stamps_ns[0])
+    rough = rough_residuals(seconds, fixes.antenna @ level.T, fixes.positions)
+    factors = actual_sigmas(seconds, rough, fixes.sigmas, probability)
+    sigmas = fixes.sigmas if factors is None else fixes.sigmas * factors
+    if factors is None or float(np.median(sigmas[:, :2], axis=0).max()) > largest:
+        return fixes, faults
+    stated, actual = np.median(fixes.sigmas, axis=0), np.median(sigmas, axis=0)
+    said = (
+        f"GNSS: fixes state {_axes(stated)} m (east, north, up) and scatter by {_axes(actual)} m where odometry is smooth: they "
+        "are weighted by their scatter"
+    )
+    facts = {"stated": np.round(stated, 3).tolist(), "scatter": np.round(actual, 3).tolist()}
+    return replace(fixes, sigmas=sigmas), faults.and_another(said, fix_sigma_m=facts)
+
+
+def aligned(
+    fixes: Fixes, up: Floats, up_sigma: float, min_fixes: int, faults: Faults
+) -> tuple[GnssAlignment | None, Fixes, Faults]:
+    """The alignment, and the fixes without the heights that are of another datum than most: east and north stay."""
+
+    def fit(of: Fixes) -> GnssAlignment | None:
+        return align(of.antenna, of.positions, of.sigmas, of.slack, up, up_sigma, min_fixes)
+
+    found = fit(fixes)
+    if found is not None and found.inliers.all():
+        return found, fixes, faults
+    flat = replace(fixes, sigmas=np.column_stack([fixes.sigmas[:, :2], np.full(len(fixes.sigmas), NO_HEIGHT)]))
+    level = fit(flat)
+    gained = 0 if level is None else int(level.inliers.sum()) - (0 if found is None else int(found.inliers.sum()))
+    if level is None or gained < max(3, LEAST_SHARE * len(fixes.stamps_ns)):
+        return found, fixes, faults
+    off, judged = level.residuals[:, 2], np.hypot(fixes.sigmas[:, 2], fixes.slack)
+    way = np.linalg.norm(fixes.antenna - np.median(fixes.antenna, axis=0), axis=1)
+    judged = np.hypot(judged, min(up_sigma, float(np.deg2rad(2.0))) * way)
+    agrees = agreeing_heights(off, judged)
+    without = replace(flat, sigmas=np.where(agrees[:, None], fixes.sigmas, flat.sigmas))
+    again = fit(without)
+    if again is None or (found is not None and again.inliers.sum() <= found.inliers.sum()):
+        return found, fixes, faults
+    wrong = np.flatnonzero(~agrees)
+    off = again.residuals[:, 2]
+    step = float(np.median(off[wrong]) - np.median(off[agrees]))
+    at = wrong[0] if wrong[0] > 0 else wrong[-1]
+    since = f"{'from' if wrong[0] > 0 else 'until'} {(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"
+    said = (
+        f"GNSS: the heights of {len(wrong)} of {len(off)} fixes are {abs(step):.1f} m {'above' if step > 0 else 'below'} the "
+        f"others, {since}, "
+        "where odometry does not climb: they are left out, east and north count"
+    )
+    if len(wrong) >= AMBIGUOUS * len(off):
+        said += "; they may as well be the right ones"
+    return again, without, faults.and_another(said, heights_left_out=len(wrong))
+
+
+def _axes(sigmas: Floats) -> str:
+    east, north, up = sigmas.tolist()
+    return f"{east:.2f}, {north:.2f} and {up:.2f}"

@@ -1,0 +1,106 @@
+"""Faults of a whole receiver are set right and said: the run is no worse than odometry."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stub_sequences import Stub
+
+from lslam.backend.georeferencing import Placement, place
+from lslam.config import Config
+from lslam.geometry import geodesy, se3, so3
+from lslam.graph.fix_errors import NO_HEIGHT
+from lslam.graph.odometry_constraints import odometry_constraints
+from lslam.graph.problem import PoseGraph
+from lslam.types.gnss import GnssStream
+from lslam.types.keyframe import Keyframe
+from lslam.types.scan_result import ScanResult
+from lslam.types.sequence import Calibration
+
+ORIGIN = np.array([49.0, 8.4, 115.0])
+COUNT = 400
+SECONDS = 0.1 * np.arange(COUNT)
+STAMPS = np.arange(COUNT, dtype=np.int64) * 100_000_000
+
+
+def at(seconds: np.ndarray) -> np.ndarray:
+    """(N, 4, 4) of a drive that slows down, hurries and turns."""
+    x, y = 40 * np.sin(seconds / 9) + 10 * np.sin(seconds / 3), 25 * np.sin(seconds / 5)
+    heading = np.arctan2(5 * np.cos(seconds / 5), 40 / 9 * np.cos(seconds / 9) + 10 / 3 * np.cos(seconds / 3))
+    R = so3.from_euler_rpy(np.column_stack([0 * heading, 0 * heading, heading]))
+    return se3.make(R, np.column_stack([x, y, 0 * x]))
+
+
+POSES = at(SECONDS)
+RESULTS = [ScanResult(i, int(STAMPS[i]), T) for i, T in enumerate(se3.inverse(POSES[0]) @ POSES)]
+KEYFRAMES = [Keyframe(n, i, int(STAMPS[i]), RESULTS[i].T_world_lidar) for n, i in enumerate(range(0, COUNT, 10))]
+
+
+def placed(late: float = 0.0, noise: float = 0.5, stated: float = 0.5, climb: float = 0.0, seed: int = 0) -> Placement:
+    """By 5 fixes a second, of which those of the last 15 s are higher by `climb`, m."""
+    taken = SECONDS[2:-2:2]
+    error = noise * np.random.default_rng(seed).normal(size=(len(taken), 3)) * [1, 1, 1.8]
+    error[taken > 25, 2] += climb
+    fixes = geodesy.from_local(at(taken)[:, :3, 3] + error, ORIGIN)
+    stream = GnssStream(np.round(1e9 * (taken + late)).astype(np.int64), fixes, np.full(len(taken), stated))
+    config = Config.model_validate({"gnss": {"mode": "graph"}})
+    graph = PoseGraph(
+        np.stack([k.T_world_lidar for k in KEYFRAMES]), odometry_constraints(KEYFRAMES, RESULTS, config.graph)
+    )
+    sequence = Stub(["none"] * COUNT, calibration=Calibration(T_lidar_gnss=np.eye(4)), gnss=stream)
+    return place(sequence, RESULTS, KEYFRAMES, None, graph, config)
+
+
+def apart(found: Placement) -> np.ndarray:
+    """(N, 3) m, of the trajectory from where it is on the Earth."""
+    assert found.georeference is not None
+    world = se3.apply(found.georeference.T_enu_world, np.stack([r.T_world_lidar[:3, 3] for r in RESULTS]))
+    return geodesy.to_local(geodesy.from_local(world, found.georeference.origin), ORIGIN) - POSES[:, :3, 3]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sound_fixes_have_no_faults(seed: int) -> None:
+    for noise in (0.02, 0.5, 2.0):
+        found = placed(noise=noise, stated=noise, seed=seed)
+        assert (found.faults.problems, found.problem) == ((), "")
+        assert len(found.fixes) == 198
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sigmas_that_are_far_too_small_are_those_of_the_scatter(seed: int) -> None:
+    found = placed(stated=0.02, seed=seed)
+    assert len(found.faults.problems) == 1
+    assert found.faults.problems[0].startswith(
+        "GNSS: fixes state 0.02, 0.02 and 0.04 m (east, north, up) and scatter by 0."
+    )
+    sigmas = np.median([fix.sigma for fix in found.fixes], axis=0)
+    np.testing.assert_allclose(sigmas, [0.5, 0.5, 0.9], rtol=0.35)
+    assert found.walk == 0.0
+    assert len(found.fixes) == 198
+    assert np.abs(apart(found)[:, :2]).max() < 0.3
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("late", [2.0, -1.0])
+def test_stamps_that_are_late_are_set_right(late: float, seed: int) -> None:
+    found = placed(late=late, seed=seed)
+    assert len(found.faults.problems) == 1
+    assert f"{'late' if late > 0 else 'early'} (one sigma" in found.faults.problems[0]
+    assert found.faults.facts is not None
+    assert found.faults.facts["fixes_late"]["seconds"] == pytest.approx(late, abs=0.2)
+    assert np.abs(apart(found)[:, :2]).max() < 0.5
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_heights_of_another_datum_do_not_cost_east_and_north(seed: int) -> None:
+    found = placed(climb=-48.0, seed=seed)
+    assert len(found.faults.problems) == 1
+    said = found.faults.problems[0]
+    assert "below the others, from 25.0 s after the first" in said or "below the others, from 24.8" in said
+    assert found.faults.facts == {"heights_left_out": 73}
+    assert len(found.fixes) == 198
+    heights = np.array([fix.sigma[2] < NO_HEIGHT for fix in found.fixes])
+    assert heights.sum() == 125
+    assert np.abs(apart(found)[:, :2]).max() < 0.3
+    # Half of the heights leave the tilt less sure.
+    assert np.abs(apart(found)[:, 2]).max() < 3.0
