@@ -168,8 +168,13 @@ class Tracker:
     ) -> tuple[ScanResult, MotionPrior]:
         """Register the scan, fuse the pose with the IMU and update the map; also the motion that it was deskewed with."""
         expected = prior
-        found, prior = self._align(odometry, scan, prepared, prior, self.motion, clock)
         is_first_open = self._first is not None or not self.motion.is_known
+        # While the motion is unknown the clouds of several LiDARs do not fit each other: one of them tells it.
+        alone = scan.of_leading() if is_first_open else None
+        found, prior = self._align(
+            odometry, scan if alone is None else alone, prepared if alone is None else odometry.prepare(alone), prior,
+            self.motion, clock,
+        )  # fmt: skip
         if found.result.status == "ok" and scan.span.seconds > 0 and is_first_open:
             if self._first is None:
                 self._first = (scan, prepared, found.result.T_world_lidar)

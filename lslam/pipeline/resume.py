@@ -32,6 +32,9 @@ def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
     Raises InputError when the folder cannot be listed.
     """
     digest = _listing(sequence.path, len(sequence))
+    for other in getattr(sequence, "further_lidars", ()):  # further LiDARs, whose folders may lie elsewhere
+        if other.scans.path != sequence.path:
+            digest.update(_listing(other.scans.path, len(other.scans)).digest())
     truth = sequence.ground_truth if truth is None else truth
     if truth is not None:
         digest.update(truth.stamps_ns.tobytes())

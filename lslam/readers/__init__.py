@@ -109,11 +109,12 @@ def open_sequence(
     if given and sequence.kind != "bag":
         raise UsageError(f"{', '.join(given)} is for bags: {folder} is {sequence.kind}")
     sequence = with_streams(sequence, imu, gnss, data_root)
-    if sequence.kind == "bag":
+    if sequence.kind == "bag" or sequence.kind not in READERS:
         return sequence
     from lslam.readers.merged_lidars import with_folders
 
-    return with_folders(sequence, overrides, lambda path: _open(path, SequenceInfo()))
+    of_all = SequenceInfo(motion_compensated=motion_compensated)
+    return with_folders(sequence, overrides, lambda path: _open(path, of_all))
 
 
 def _unreadable(name_or_path: str | Path, error: OSError) -> InputError:

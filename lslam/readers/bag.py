@@ -20,7 +20,7 @@ from lslam.geometry import se3
 from lslam.printable import printable
 from lslam.readers.bag_clocks import points_off, stamps_by_points
 from lslam.readers.bag_halves import Halves, read_whole
-from lslam.readers.bag_lidars import UNNAMED, ScanIndex
+from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
 from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
@@ -208,7 +208,8 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
     if is_decoded(topic):
         opened, frame = open_packets(bag, topic, voice)
         stamps = opened.revolutions.stamps_ns
-        index = ScanIndex(topic, frame or UNNAMED, frame, np.arange(len(stamps)), stamps, Halves())
+        ((name, _),) = choose_lidars(topic, [frame or UNNAMED], info.lidar_frame, voice)
+        index = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, Halves())
         found: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
     else:
         found = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]

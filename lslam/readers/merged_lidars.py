@@ -68,7 +68,7 @@ class MergedLidars(SequenceView):
     def __init__(self, whole: Sequence, others: list[FurtherLidar]) -> None:
         self.notes, self.problems = list(whole.notes), list(whole.problems)
         super().__init__(whole, rows=None, cols=None, rings=None)
-        self.others = others
+        self.further_lidars = others
         stamps, sweep = whole.stamps_ns, _sweep_of(whole)
         self._period_ns = _period_ns(whole)
         begin_ns = 0 if sweep is None else round(sweep.begin_s * 1e9)
@@ -88,18 +88,19 @@ class MergedLidars(SequenceView):
     def scan(self, index: int) -> Scan:
         """Read scan `index` of the leading LiDAR and the points of the others that belong to it. Raises InputError as it does."""
         scan = self.whole.scan(index)
-        parts = [scan if scan.times is not None or not self._is_timed else replace(scan, times=_zeros(scan))]
+        times = _zeros(scan) if scan.times is None and self._is_timed else scan.times
+        parts = [replace(scan, times=times, lidars=np.zeros(len(scan), np.uint8))]
         for number, source in enumerate(self._sources, 1):
-            parts += self._parts(source, index, scan.stamp_ns, number * RINGS_APART)
+            parts += self._parts(source, index, scan.stamp_ns, number)
         return _joined(scan, parts, self._is_timed)
 
     def ringed(self, wanted: str) -> Sequence:
         """The same with the rings of each LiDAR found by itself."""
-        others = [replace(other, scans=with_rings(other.scans, wanted)) for other in self.others]
+        others = [replace(other, scans=with_rings(other.scans, wanted)) for other in self.further_lidars]
         return MergedLidars(with_rings(self.whole, wanted), others)
 
-    def _parts(self, source: _Reading, index: int, stamp_ns: int, first_ring: int) -> Iterator[Scan]:
-        """The points of one further LiDAR during sweep `index`, a part of each of its scans that overlaps."""
+    def _parts(self, source: _Reading, index: int, stamp_ns: int, number: int) -> Iterator[Scan]:
+        """The points of the `number`-th further LiDAR during sweep `index`, a part of each of its scans that overlaps."""
         begin, end = int(self._edges[index]), int(self._edges[index + 1])
         end = min(end, begin + round(_LONGEST_SWEEP * self._period_ns))
         first, last = int(np.searchsorted(source.ends, begin)), int(np.searchsorted(source.begins, end))
@@ -113,7 +114,7 @@ class MergedLidars(SequenceView):
             kept = np.ones(len(scan), np.bool_) if source.sweep is None else (at_ns >= begin) & (at_ns < end)
             kept &= _is_far(scan.points)
             if kept.any():
-                yield _moved(scan, kept, at_ns, stamp_ns, source.lidar.T_lidar_other, first_ring)
+                yield _moved(scan, kept, at_ns, stamp_ns, source.lidar.T_lidar_other, number)
 
     def _describe(self, source: _Reading) -> None:
         """Say how a further LiDAR is used; raise InputError when none of its scans falls into a sweep."""
@@ -209,9 +210,9 @@ def _is_far(points: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _moved(
-    scan: Scan, kept: NDArray[np.bool_], at_ns: NDArray[np.int64], stamp_ns: int, T: Matrix, first_ring: int
+    scan: Scan, kept: NDArray[np.bool_], at_ns: NDArray[np.int64], stamp_ns: int, T: Matrix, number: int
 ) -> Scan:
-    """The points `kept`, in the frame of the leading LiDAR, with times from `stamp_ns` and rings from `first_ring`."""
+    """The points `kept`, of the `number`-th further LiDAR, in the frame of the leading one, with times from `stamp_ns`."""
     from lslam.kernels.transform import transform
 
     part = scan.select(kept)
@@ -222,8 +223,10 @@ def _moved(
     if rings is not None:
         known = rings != NO_RING
         has_rings = int(rings[known].max(initial=0)) < RINGS_APART
-        rings = np.where(known, rings + np.uint16(first_ring), NO_RING).astype(np.uint16) if has_rings else None
-    return replace(part, points=points, times=times, rings=rings)
+        rings = (
+            np.where(known, rings + np.uint16(number * RINGS_APART), NO_RING).astype(np.uint16) if has_rings else None
+        )
+    return replace(part, points=points, times=times, rings=rings, lidars=np.full(len(part), number, np.uint8))
 
 
 def _joined(scan: Scan, parts: list[Scan], is_timed: bool) -> Scan:
@@ -238,7 +241,8 @@ def _joined(scan: Scan, parts: list[Scan], is_timed: bool) -> Scan:
 
     return replace(
         scan, points=np.concatenate([part.points for part in full]), intensity=column("intensity"), rings=column("rings"),
-        times=column("times") if is_timed else None, fault="; ".join(filter(None, dict.fromkeys(part.fault for part in full))),
+        times=column("times") if is_timed else None, lidars=column("lidars"),
+        fault="; ".join(filter(None, dict.fromkeys(part.fault for part in full))),
     )  # fmt: skip
 
 

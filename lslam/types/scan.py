@@ -54,6 +54,7 @@ class Scan:
     times : (N,) float32 seconds from the stamp, negative before it, or None; None means compensated or unknown
     rings : (N,) uint16, `NO_RING` where a point has none, or None
     fault : what is wrong with the scan though it is of use, a sentence without its number; empty: nothing
+    lidars : (N,) uint8, which LiDAR of several measured each point, 0 for the leading one; None where there is but one
     """
 
     points: NDArray[np.float32]
@@ -63,6 +64,7 @@ class Scan:
     times: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     fault: str = ""
+    lidars: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -82,4 +84,11 @@ class Scan:
             intensity=None if self.intensity is None else self.intensity[mask],
             times=None if self.times is None else self.times[mask],
             rings=None if self.rings is None else self.rings[mask],
+            lidars=None if self.lidars is None else self.lidars[mask],
         )
+
+    def of_leading(self) -> Scan | None:
+        """The points of the leading LiDAR alone; None where there are no others, or none of its own."""
+        if self.lidars is None or not self.lidars.any() or self.lidars.all():
+            return None
+        return replace(self.select(self.lidars == 0), lidars=None)

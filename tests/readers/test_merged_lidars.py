@@ -288,7 +288,7 @@ def test_invalid_points_of_the_other_lidar_do_not_become_a_place() -> None:
 def test_each_scan_is_read_once_in_a_pass_and_any_order_gives_the_same() -> None:
     front, rear = sweeps(30, start_ns=0), sweeps(30, 41_000_000, seed=50, start_ns=0)
     sequence = merged_of([*front], [*rear])
-    other: Any = sequence.others[0].scans
+    other: Any = sequence.further_lidars[0].scans
     other.scans = [replace(one, stamp_ns=one.stamp_ns) for one in rear]
     other.reads.clear()
     forwards = [sequence.scan(k) for k in range(30)]
