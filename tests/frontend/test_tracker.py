@@ -249,3 +249,31 @@ def test_a_scan_lost_by_the_imu_gives_no_comparison() -> None:
     _, results = braked(missed=frozenset({(19, 2)}))
     assert results[19].status == "bridged"
     assert [r.index for r in results if r.saved_s is not None] == [39]
+
+
+class Weighing(Oracle):
+    """Remembers how many points each registration was of, by scan."""
+
+    def __init__(self, poses: NDArray[np.float64]) -> None:
+        super().__init__(poses)
+        self.points: list[tuple[int, int]] = []
+
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
+        assert len(scan) == len(prepared)
+        self.points.append((scan.index, len(scan)))
+        return super().register(scan, prepared, prior)
+
+
+def test_the_first_motion_is_told_by_one_of_several_lidars() -> None:
+    """Before it is known their clouds do not fit each other; then the first scan is taken in anew, with all points."""
+    x = np.arange(5.0)
+    oracle = Weighing(np.asarray(se3.make(np.eye(3), np.column_stack([x, 0 * x, 0 * x]))))
+    tracker = Tracker(oracle)
+    times, lidars = np.linspace(0, SPAN_S, 7, dtype=np.float32), np.array([0, 0, 0, 0, 1, 1, 1], np.uint8)
+    for k in range(5):
+        scan = Scan(np.ones((7, 3), np.float32), k * 100_000_000, k, times=times, lidars=lidars)
+        tracker.track(Loaded(k, scan.stamp_ns, scan, scan))
+    alone, whole = [points for points in oracle.points if points[1] == 4], oracle.points
+    assert [index for index, _ in alone] == [0, 1]
+    assert whole[2:4] == [(0, 7), (1, 7)], "both again, with all points"
+    assert {count for index, count in whole if index > 1} == {7}

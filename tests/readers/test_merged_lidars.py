@@ -21,6 +21,7 @@ from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.kitti_layout import write_scan, write_times
 from lslam.geometry import se3
+from lslam.pipeline.resume import input_digest
 from lslam.readers import open_sequence
 from lslam.readers.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
 from lslam.readers.selection import select, with_rings
@@ -259,6 +260,10 @@ def test_folders_are_merged_as_sequence_toml_says(tmp_path: Path) -> None:
     assert len(got) == COUNT * 400 - 120, "the last 30 ms lie beyond the last sweep"
     np.testing.assert_allclose(got[:, 1:], truth[: len(got), 1:], atol=2e-5)
     np.testing.assert_allclose(got[:, 0], truth[: len(got), 0], atol=2e-8)
+    before = input_digest(sequence, None)
+    assert input_digest(open_sequence(front), None) == before
+    (tmp_path / "rear" / "velodyne" / "000001.bin").touch()
+    assert input_digest(open_sequence(front), None) != before, "another input: a run does not go on with it"
     (tmp_path / "front" / "sequence.toml").write_text(f'[lidars]\n"../left" = {T}\n')
     with pytest.raises(InputError, match=r"left, named by lidars of .*sequence.toml, does not exist"):
         open_sequence(front)
@@ -300,6 +305,16 @@ def test_each_scan_is_read_once_in_a_pass_and_any_order_gives_the_same() -> None
         np.testing.assert_array_equal(again.times, forwards[k].times)
     chosen = select(sequence, 4, 3, 2)
     np.testing.assert_array_equal(chosen.scan(1).points, forwards[6].points)
+
+
+def test_scans_say_which_lidar_measured_each_point() -> None:
+    merged = merged_of([*sweeps(COUNT, start_ns=0)], [*sweeps(COUNT, 50_000_000, seed=50, start_ns=0)]).scan(1)
+    assert merged.lidars is not None
+    assert np.bincount(merged.lidars).tolist() == [400, 400]
+    alone = merged.of_leading()
+    assert alone is not None
+    np.testing.assert_array_equal(alone.points, sweeps(2, start_ns=0)[1].points)
+    assert (alone.lidars, alone.of_leading(), sweeps(1)[0].of_leading()) == (None, None, None)
 
 
 def test_rings_are_found_sensor_by_sensor_and_stay_distinct() -> None:
