@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats.bag_chunks import Topic, unpack, zstd
-from lslam.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, suffix_of
+from lslam.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, shown, suffix_of
 from lslam.formats.bag_parts import apart
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.bag_unpacking import unpacked
@@ -209,7 +209,7 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
     losses += [f"a part of the recording is not read: {failure}" for failure in failures]
     if packed:
         what = "is compressed as a whole" if len(packed) == 1 else "are compressed as a whole"
-        notes.append(f"{', '.join(packed)} {what}: unpacked in the user's cache for as long as the recording is read")
+        notes.append(f"{shown(packed)} {what}: unpacked in the user's cache for as long as the recording is read")
     return recordings
 
 

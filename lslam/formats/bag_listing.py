@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ PACKED = {".zstd": "zstd", ".zst": "zstd", ".lz4": "lz4", ".gz": "gz", ".bz2": "
 # Captures of the packets of a sensor.
 CAPTURES = (".pcap", ".pcapng")
 METADATA = "metadata.yaml"
+_SHOWN = 8  # names in a sentence
 # Recorders of ROS 1 put the time at which a part begins before its number.
 _TIME = re.compile(r"\d{4}([-_]\d\d){5}")
 _NUMBER = re.compile(r"(?:(.*?)[_-])?(\d{1,4})$")
@@ -62,8 +64,9 @@ def missing_parts(path: Path, files: list[Path]) -> list[str]:
         missing = sorted(set(range(have[0], have[-1])) - set(have))
         # More numbers missing than there are: they count something else, days or minutes.
         if 0 < len(missing) <= 10 * len(have):
+            which = f"part {missing[0]} is" if len(missing) == 1 else f"parts {shown(missing)} are"
             said.append(
-                f"{_parts(missing)} missing: the parts in {path} are numbered from {have[0]} ({numbers[have[0]].name}) to "
+                f"{which} missing: the parts in {path} are numbered from {have[0]} ({numbers[have[0]].name}) to "
                 f"{have[-1]} ({numbers[have[-1]].name})"
             )
         # ROS 2 counts from 0 and calls the parts as their folder.
@@ -98,6 +101,16 @@ def stem_of(path: Path) -> str:
     return _unpacked(path.name)[: -len(suffix_of(path)) or None]
 
 
+def shown(names: Sequence[object]) -> str:
+    """The first of many, with commas between them.
+
+    >>> shown([1, 2]), shown(range(20))
+    ('1, 2', '0, 1, 2, 3, 4, 5, 6, 7 and 12 more')
+    """
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(map(str, names[:_SHOWN])) + more
+
+
 def _unpacked(name: str) -> str:
     ending = next((e for e in PACKED if name.lower().endswith(e)), "")
     return name[: len(name) - len(ending)]
@@ -120,7 +133,7 @@ def _unlisted(path: Path, files: list[Path]) -> list[str]:
     if not absent:
         return []
     verb = "is" if len(absent) == 1 else "are"
-    return [f"{path / METADATA} lists {len(listed)} files, of which {', '.join(absent)} {verb} not there"]
+    return [f"{path / METADATA} lists {len(listed)} files, of which {shown(absent)} {verb} not there"]
 
 
 def _listed(path: Path) -> list[str] | None:
@@ -136,16 +149,6 @@ def _listed(path: Path) -> list[str] | None:
         return [str(name).rpartition("/")[2] for name in names]
     except (YAMLError, LookupError, TypeError, ValueError, RecursionError, OSError):
         return None
-
-
-def _parts(numbers: list[int]) -> str:
-    """As part of a sentence.
-
-    >>> _parts([3]), _parts([3, 4])
-    ('part 3 is', 'parts 3, 4 are')
-    """
-    shown = ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")
-    return f"part {shown} is" if len(numbers) == 1 else f"parts {shown} are"
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.formats.bag_chunks import Topic
 
@@ -45,7 +46,12 @@ def _count(file: _File) -> int:
 def _is_within(file: _File, other: _File) -> bool:
     """Whether `other` has every message of `file`, by topic and time; one without messages is a part of its own."""
     return _count(file) > 0 and all(
-        any(t.name == topic.name and np.isin(topic.stamps_ns, t.stamps_ns).all() for t in other.topics)
+        any(t.name == topic.name and _has_all(t.stamps_ns, topic.stamps_ns) for t in other.topics)
         for topic in file.topics
         if len(topic)
     )
+
+
+def _has_all(stamps: NDArray[np.int64], of: NDArray[np.int64]) -> bool:
+    """Whether `of` are among `stamps`, both in order; where one begins or ends outside, no more is compared."""
+    return len(stamps) > 0 and stamps[0] <= of[0] and of[-1] <= stamps[-1] and bool(np.isin(of, stamps).all())

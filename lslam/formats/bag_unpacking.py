@@ -48,7 +48,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, str]]:
     folder = cache_folder(CACHE)
     if folder is None:
         raise OutputError(f"{path} needs a folder to be unpacked in: name a folder of your own in XDG_CACHE_HOME")
-    with tempfile.NamedTemporaryFile(dir=folder, suffix=path.name) as target:
+    with tempfile.NamedTemporaryFile(dir=folder, suffix=".unpacked") as target:
         loss = _unpack(path, kind, target)
         target.flush()
         yield Path(target.name), loss

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag
-from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
+from lslam.formats.bag_listing import list_bag_files, parts_beside, shown, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
@@ -152,10 +152,9 @@ def _others(path: Path) -> str:
     names = [p.name for p in parts_beside(path)]
     if not names:
         return ""
-    shown = ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
     is_one = len(names) == 1
     are = "is another part" if is_one else "are other parts"
-    return f"; by {'its name' if is_one else 'their names'} {shown} {are} of it: a folder of its parts is read as one"
+    return f"; by {'its name' if is_one else 'their names'} {shown(names)} {are} of it: a folder of its parts is read as one"
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:

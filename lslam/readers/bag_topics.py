@@ -30,6 +30,7 @@ _LATE_NS = 10**9  # stamps that go back further are no jitter, nor by more than 
 _LATE_STEPS = 10
 _CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
 _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
+_FEW = 4  # messages that may come late at the seam of two parts
 _SAID = 3  # damaged messages that are named one by one
 
 Stamps = NDArray[np.int64]
@@ -75,17 +76,18 @@ def check_parts(bag: Bag, topic: BagTopic) -> None:
 
     They are when the next one begins where one has ended, or soon after, and neither tells of the time of the other.
     """
-    spans: dict[Path, tuple[int, int]] = {}
+    spans: dict[Path, tuple[int, int, int]] = {}
     for recording, part in topic.parts:
         if len(part):
-            begin, end = spans.get(recording.path, (int(part.stamps_ns[0]), 0))
-            spans[recording.path] = min(begin, int(part.stamps_ns[0])), max(end, int(part.stamps_ns[-1]))
-    parts = sorted((begin, end, path) for path, (begin, end) in spans.items())
-    for (begin, end, path), (start, stop, following) in pairwise(parts):
+            begin, end, count = spans.get(recording.path, (int(part.stamps_ns[0]), 0, 0))
+            span = min(begin, int(part.stamps_ns[0])), max(end, int(part.stamps_ns[-1]))
+            spans[recording.path] = (*span, count + len(part))
+    parts = sorted((*span, path) for path, span in spans.items())
+    for (begin, end, count, path), (start, stop, following_count, following) in pairwise(parts):
         wrong = ""
         if start - end > _APART_NS:
             wrong = f"{following.name} begins {(start - end) * 1e-9:.0f} s after {path.name} has ended"
-        elif end - start > 0.5 * min(stop - start, end - begin) > 0:
+        elif end - start > 0.5 * min(stop - start, end - begin) and min(count, following_count) >= _FEW:
             wrong = f"{following.name} and {path.name} hold {topic.name} of the same {(min(end, stop) - start) * 1e-9:.1f} s"
         if wrong:
             gaps = "".join(f"; {sentence}" for sentence in missing_parts(bag.path, bag.files))

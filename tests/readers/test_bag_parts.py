@@ -296,3 +296,11 @@ def test_connections_of_one_topic_are_merged_by_the_times_of_recording(tmp_path:
     np.testing.assert_allclose(sequence.gnss.lat_lon_alt[:, 1], 8 + 1e-6 * seconds)
     assert sequence.ground_truth is not None
     np.testing.assert_allclose(sequence.ground_truth.positions[:, 0], seconds, atol=1e-9)
+
+
+def test_some_messages_may_come_late_at_the_seam_of_two_parts(tmp_path: Path) -> None:
+    part(tmp_path / "rec", "rec_0.mcap", (0, 1, 2, 3, 6))
+    part(tmp_path / "rec", "rec_1.mcap", (4, 5, 7))
+    sequence = open_sequence(tmp_path / "rec")
+    assert_scans(sequence, range(8))
+    assert not sequence.problems
