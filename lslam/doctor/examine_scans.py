@@ -64,7 +64,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
         findings.append(Finding("scan-empty", what, "a run skips them and bridges the motion"))
     faulty = [s for s in scans if s["fault"]]
     if faulty:
-        what = f"{len(faulty)} of the {len(indices)} scans looked at are not wholly right, the first is scan {faulty[0]['index']}"
+        what = f"in {len(faulty)} of the {len(indices)} scans looked at not all is right; scan {faulty[0]['index']}"
         findings.append(Finding("scan-faults", f"{what}: {faulty[0]['fault']}", "a run uses the rest of these scans"))
     full = [s for s in scans if s["count"]]
     far = [s for s in full if s["far"]]

@@ -29,6 +29,9 @@ from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
+# Scans with points that say when sweeps begin and end.
+_LOOKED_AT = 3
+
 
 def estimate(
     sequence: Sequence,
@@ -89,17 +92,20 @@ def _failures_at_end(results: list[ScanResult]) -> int:
 
 
 def sweep_of(sequence: Sequence) -> Span | None:
-    """When sweeps begin and end, None when points have no times: the first scan with a sweep that is half a period or longer
-    speaks for all, or the longest of the first ten."""
-    longest: Span | None = None
+    """When sweeps begin and end, None when points have no times: the longest of the first scans with points speaks for all.
+
+    One that lasts half a period is long enough; a scan that lacks times, or has the end of a sweep alone, does not decide.
+    """
+    spans: list[Span | None] = []
     for i in range(min(len(sequence), 10)):
         with suppress(InputError):
             scan = sequence.scan(i)
-            if len(scan) and scan.times is not None and (longest is None or scan.span.seconds > longest.seconds):
-                longest = scan.span
-        if longest is not None and longest.seconds * sequence.rate_hz >= 0.5:
+            if len(scan):
+                spans.append(None if scan.times is None else scan.span)
+        last = spans[-1] if spans else None
+        if len(spans) == _LOOKED_AT or (last is not None and last.seconds * sequence.rate_hz >= 0.5):
             break
-    return longest
+    return max((span for span in spans if span is not None), key=lambda span: span.seconds, default=None)
 
 
 def is_diverged(results: list[ScanResult], max_failures: int) -> bool:

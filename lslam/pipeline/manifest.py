@@ -104,12 +104,6 @@ class Manifest:
                 f"{len(bad)} of {len(results)} scans were not registered and follow the motion prior, "
                 f"the first is scan {bad[0].index}: {bad[0].reason}"
             )
-        faulty = [r for r in results if r.fault]
-        if faulty:
-            self.problems.append(
-                f"{len(faulty)} of {len(results)} scans were used though not all in them was right, the first is scan "
-                f"{faulty[0].index}: {faulty[0].fault}"
-            )
         if diverged:
             self._ended = "diverged"
         elif len(results) < expected:

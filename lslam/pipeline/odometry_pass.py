@@ -44,6 +44,8 @@ from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
+
+_FAULTS_NAMED = 10  # scans
 # Sentences of one run; the scans beyond are marked all the same.
 MOST_SAID = 6
 # Sections that choose no kernel; of buildings it is enough whether there are any.
@@ -95,6 +97,7 @@ def estimate_poses(
     if config.imu.use:
         manifest.imu = close_inertial(inertial, results)
         manifest.problems += inertial.problems
+    _report_faults(results, manifest)
     manifest.judge(results, len(sequence), is_diverged(results, limit))
     if monitor is not None:
         results = mark_lost(results, monitor, manifest)
@@ -238,3 +241,16 @@ def _sentence(results: list[ScanResult], alert: Alert) -> str:
     first, last = results[alert.first].index, results[alert.last].index
     scans = f"scan {first}" if first == last else f"scans {first} to {last}"
     return f"{scans} may be lost: {alert.why}"
+
+
+def _report_faults(results: list[ScanResult], manifest: Manifest) -> None:
+    """Name the scans of which a part was wrong and the rest was used."""
+    faulty = [r for r in results if r.fault]
+    if not faulty:
+        return
+    numbers = ", ".join(str(r.index) for r in faulty[:_FAULTS_NAMED]) + (", ..." if len(faulty) > _FAULTS_NAMED else "")
+    manifest.problems.append(
+        f"in {len(faulty)} of {len(results)} scans not all was right and the rest was used ({numbers}); scan {faulty[0].index}: "
+        f"{faulty[0].fault}"
+    )
+    log.warning("%s", manifest.problems[-1])

@@ -172,9 +172,7 @@ def _sweep_of(sequence: Sequence) -> Span | None:
     for index in range(min(len(sequence), _LOOKED_AT)):
         with suppress(InputError):
             scan = sequence.scan(index)
-            if len(scan):
-                if scan.times is None:
-                    return None
+            if len(scan) and scan.times is not None:
                 spans.append(scan.span)
     if not spans:
         return None

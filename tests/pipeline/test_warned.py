@@ -16,6 +16,7 @@ from stub_sequences import sample
 
 import lslam
 from lslam.config import Config, load_config
+from lslam.doctor.inspect import inspect
 from lslam.errors import InterruptedRunError
 from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import deliver
@@ -214,3 +215,19 @@ def test_every_thread_of_a_run_shares_its_context() -> None:
         starts = text.count(".submit(") + text.count("threading.Thread(")
         assert text.count("copy_context().run") == starts, path
     assert any("copy_context().run" in path.read_text() for path in sources)
+
+
+def test_scans_of_which_a_part_was_wrong_are_named_and_the_run_is_degraded(tmp_path: Path) -> None:
+    faults = {2: "5 points have times outside the sweep and are left out", 4: "the scan has no field 't'"}
+    scans = [
+        replace(scan, fault=faults.get(k, "")) for k, scan in enumerate(sample(6).scans) if not isinstance(scan, str)
+    ]
+    sequence = replace(sample(6), scans=scans)
+    lslam.run(sequence, config_of("map.write=false"), out=tmp_path / "out")
+    facts = manifest(tmp_path / "out")
+    assert facts["status"] == "degraded"
+    (sentence,) = facts["problems"]
+    assert sentence == f"in 2 of 6 scans not all was right and the rest was used (2, 4); scan 2: {faults[2]}"
+    assert f"WARNING {sentence}" in (tmp_path / "out" / "log.txt").read_text()
+    (finding,) = [f for f in inspect(sequence, is_quick=True)["findings"] if f["code"] == "scan-faults"]
+    assert faults[2] in finding["what"]

@@ -14,14 +14,14 @@ from lslam.errors import InputError
 from lslam.pipeline.job import choose_scans
 from lslam.readers.selection import with_rings
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.scan import Scan
+from lslam.types.scan import NO_RING, Scan
 
 
 class Bare:
-    """A simulated drive without ring field; what `change` makes of each scan."""
+    """A simulated drive without ring field, unless `with_fields`; what `change` makes of each scan."""
 
-    def __init__(self, drive: SimulatedDrive, change: Any = lambda scan: scan) -> None:
-        self._drive, self._change = drive, change
+    def __init__(self, drive: SimulatedDrive, change: Any = lambda scan: scan, with_fields: bool = False) -> None:
+        self._drive, self._change, self._with_fields = drive, change, with_fields
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._drive, name)
@@ -30,12 +30,13 @@ class Bare:
         return len(self._drive)
 
     def scan(self, index: int) -> Scan:
-        changed: Scan = self._change(replace(self._drive.scan(index), rings=None))
+        scan = self._drive.scan(index)
+        changed: Scan = self._change(scan if self._with_fields else replace(scan, rings=None))
         return changed
 
 
-def bare(change: Any = lambda scan: scan) -> Any:
-    return Bare(simulate("block", seed=0, count=12), change)
+def bare(change: Any = lambda scan: scan, with_fields: bool = False) -> Any:
+    return Bare(simulate("block", seed=0, count=12), change, with_fields)
 
 
 def test_every_scan_gets_its_rings_and_the_notes_say_how() -> None:
@@ -85,3 +86,34 @@ def test_a_recording_without_rings_is_refused_by_name_and_a_scan_that_differs_is
     later = with_rings(bare(lambda scan: turned(scan) if scan.index == 7 else scan))
     with pytest.raises(InputError, match="scan 7 is not in ring order"):
         later.scan(7)
+
+
+def test_points_without_a_ring_leave_the_scans_of_methods_that_need_rings() -> None:
+    def some(scan: Scan) -> Scan:
+        assert scan.rings is not None
+        return replace(scan, rings=np.where(np.arange(len(scan)) % 50, scan.rings, NO_RING).astype(np.uint16))
+
+    whole = bare(some, with_fields=True)
+    ringed = with_rings(whole)
+    assert ringed.notes[-1] == "rings: 16, the ring field of the points"
+    kept = np.arange(len(whole.scan(3))) % 50 > 0
+    np.testing.assert_array_equal(ringed.scan(3).points, whole.scan(3).points[kept])
+    np.testing.assert_array_equal(ringed.scan(3).rings, whole.scan(3).rings[kept])
+
+
+@pytest.mark.parametrize("odd", [0, 6])
+def test_a_scan_without_the_ring_field_has_its_rings_found_by_itself(odd: int) -> None:
+    """The first one too, and a sliver does not decide how rings are found."""
+    whole = bare(lambda scan: replace(scan, rings=None) if scan.index == odd else scan, with_fields=True)
+    ringed = with_rings(whole)
+    assert ringed.notes[-1] == "rings: 16, the ring field of the points"
+    assert ringed.scan(3).fault == ""
+    scan = ringed.scan(odd)
+    assert f"scan {odd} has no ring field" in scan.fault
+    assert scan.rings is not None
+    assert len(np.unique(scan.rings)) == 16
+
+
+def test_a_sliver_at_the_beginning_does_not_decide_the_order() -> None:
+    whole = bare(lambda scan: scan.select(np.arange(len(scan)) > 0.98 * len(scan)) if scan.index == 0 else scan)
+    assert with_rings(whole).scan(2).rings is not None
