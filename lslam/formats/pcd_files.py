@@ -149,50 +149,60 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
     lines = bytes(body).split(b"\n")
     while lines and not lines[-1].strip():
         lines.pop()
-    raw: set[int] = set()
+    unread: set[int] = set()
     try:
         if len(lines) < header.points:
             raise ValueError(f"header says {header.points} points, the file holds {len(lines)} lines of them")
         table = np.loadtxt([line.decode("ascii") for line in lines[: header.points]], np.float64, ndmin=2)
     except ValueError as error:
-        raw, rows = _raw_columns(header), None
-        if raw and 2 * width * header.points <= len(body) + 1:
-            rows = _rows_with_raw_bytes(header, bytes(body), raw)
-        if rows is None:
+        found = _rows_with_raw_bytes(header, bytes(body))
+        if found is None:
             raise InputError(f"{path}: PCD ascii data (counted from the first point) cannot be read: {error}") from None
-        table = rows
+        table, unread = found
     if table.shape != (header.points, width):
         raise InputError(f"{path}: PCD ascii lines hold {table.shape[1]} numbers where FIELDS and COUNT say {width}")
     columns, k = {}, 0
     for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
         values = table[:, k] if count == 1 else table[:, k : k + count]
-        if k not in raw:
-            # Text holds the digits that it holds, whatever type its header names.
-            as_read = name.lower() in AXES or dtype.kind != "f"
-            columns[name] = values if as_read else values.astype(dtype)
+        # Text holds the digits that it holds, whatever type its header names.
+        as_read = name.lower() in AXES or dtype.kind != "f"
+        label = f"{name} (bytes in place of digits)" if k in unread else name
+        columns[label] = values if as_read else values.astype(dtype)
         k += count
     return columns
 
 
-def _raw_columns(header: _Header) -> set[int]:
-    """Columns that a writer may have put as bytes, not as digits: those of one byte, as C++ streams write a char."""
+def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[NDArray[np.float64], set[int]] | None:
+    """Numbers of lines in which columns hold bytes in place of digits, a blank or the end of a line among them; what is left NaN.
+
+    C++ streams a char so: all columns of one byte are read as that. Any other one column of a few bytes is left NaN.
+    """
     sizes = np.repeat([dtype.itemsize for dtype in header.dtypes], header.counts)
-    return set(np.flatnonzero(sizes == 1).tolist())
+    names = np.repeat(header.names, header.counts)
+    if 2 * len(sizes) * header.points > len(body) + 1:
+        return None
+    single = set(np.flatnonzero(sizes == 1).tolist())
+    others = [{k} for k in range(len(sizes)) if sizes[k] > 1 and str(names[k]).lower() not in AXES]
+    for raw in [single, *others] if single else others:
+        table = _match_rows(header.points, body, len(sizes), raw, raw == single)
+        if table is not None:
+            return table, set() if raw == single else raw
+    return None
 
 
-def _rows_with_raw_bytes(header: _Header, body: bytes, raw: set[int]) -> NDArray[np.float64] | None:
-    """Numbers of lines of which the columns `raw` hold a byte, any byte, a blank or the end of a line too; these as NaN."""
+def _match_rows(points: int, body: bytes, width: int, raw: set[int], is_char: bool) -> NDArray[np.float64] | None:
     number = rb"([-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf))"
-    words = [rb"(?:[-+]?\d+|[\s\S])" if k in raw else number for k in range(sum(header.counts))]
+    other = rb"([\s\S])" if is_char else rb"([\s\S]{0,8}?)"
+    words = [other if k in raw else number for k in range(width)]
     line = re.compile(b" ".join(words) + rb" ?\r?(?:\n|\Z)", re.IGNORECASE)
-    table = np.full((header.points, len(words)), np.nan)
-    kept = [k for k in range(len(words)) if k not in raw]
-    position = 0
+    table, position = np.empty((points, width)), 0
     for row in table:
         match = line.match(body, position)
         if match is None:
             return None
-        row[kept] = [float(word) for word in match.groups()]
+        row[:] = [
+            float(word) if k not in raw else word[0] if is_char else np.nan for k, word in enumerate(match.groups())
+        ]
         position = match.end()
     return table
 

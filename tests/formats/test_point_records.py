@@ -244,6 +244,13 @@ def test_raw_bytes_in_a_column_of_text_leave_the_others(tmp_path: Path) -> None:
     assert (read.points[:, 1] == -12.5).all()
     assert np.isnan(read.points[:, 2]).all()
     np.testing.assert_array_equal(read.intensity, 2 * np.arange(256))
+    # As a ring the bytes are numbers, and one of another type is left out.
+    path.write_bytes(head.replace("flag", "ring").encode() + rows)
+    np.testing.assert_array_equal(read_points(path).rings, np.arange(256))
+    rgb = b"".join(b"%d.5 -1.25e+01 %s nan %d\n" % (k, bytes([k, 255 - k, 10, 32]), 2 * k) for k in range(256))
+    path.write_bytes(head.replace("flag", "rgb").replace("SIZE 4 4 1", "SIZE 4 4 4").encode() + rgb)
+    np.testing.assert_array_equal(read_points(path).points[:, 0], np.arange(256) + 0.5)
+    np.testing.assert_array_equal(read_points(path).intensity, 2 * np.arange(256))
     path.write_bytes(head.encode() + rows.replace(b"-1.25e+01", b"-1.2x", 1))
     with pytest.raises(InputError, match=r"a\.pcd: PCD ascii data"):
         read_points(path)

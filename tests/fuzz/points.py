@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+from formats.test_point_records import packed, revolution
 from fuzz.cases import Files, Parser
 
 from lslam.formats.pcd_files import write_pcd
@@ -45,7 +46,10 @@ def _pcd(folder: Path) -> list[bytes]:
     bare = (
         head.split(b"COUNT")[0] + b"COUNT 1 1 1 1000000000 1 1\nWIDTH 4\nHEIGHT 1\nPOINTS 4\nDATA binary\n" + bytes(104)
     )
-    return [*made, ascii_, huge, huge.replace(b"ascii", b"binary_compressed"), bare, b"", head]
+    raw = ascii_.replace(b"SIZE 4 4 4 4", b"SIZE 4 4 4 1").replace(b"TYPE F F F F", b"TYPE F F F U")
+    raw = raw.replace(b" 0.5 ", b" \n ").replace(b"WIDTH 4", b"WIDTH 0")
+    double = raw.replace(b"SIZE 4 4 4 1", b"SIZE 8 8 8 4").replace(b"ascii", b"binary") + bytes(400)
+    return [*made, ascii_, raw, double, huge, huge.replace(b"ascii", b"binary_compressed"), bare, b"", head]
 
 
 def _ply(folder: Path) -> list[bytes]:
@@ -62,7 +66,20 @@ def _npy(folder: Path) -> list[bytes]:
     made = []
     table = np.column_stack(_points())
     fields = np.zeros(4, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<f8")])
-    for array in (table, table.reshape(2, -1, 4), fields, np.zeros((0, 4)), np.zeros((3, 4), "<c8"), np.array("text")):
+    xyz = np.zeros(4, [("xyz", "<f8", 3), ("ring", "u1"), ("t", "<f8", 2), ("name", "S4")])
+    columns = revolution(turns=20, rings=4)
+    wide = np.column_stack([columns[name] for name in ("x", "y", "z", "intensity", "time", "ring", "noise")])
+    for array in (
+        xyz,
+        wide,
+        wide.T,
+        table,
+        table.reshape(2, -1, 4),
+        fields,
+        np.zeros((0, 4)),
+        np.zeros((3, 4), "<c8"),
+        np.array("text"),
+    ):
         stream = io.BytesIO()
         np.save(stream, array)
         made.append(stream.getvalue())
@@ -82,9 +99,17 @@ def _text(folder: Path) -> list[bytes]:
     return [b"1 2 3 0.5\n4 5 6 0.25\n", b"", b"1 2 3\n", b"nan nan nan nan\n"]
 
 
+_RECORDS = (
+    "x y z intensity ring", "x y z intensity ring time", "x:f8 y:f8 z:f8 intensity:f8", "x y z intensity ring:u2 stamp:f8",
+    "x y z intensity time_ns:u4 pad:u2 ring:u2 pad:u2", "x y z noise noise noise", "x y z",
+)  # fmt: skip
+
+
 def _bin(folder: Path) -> list[bytes]:
     data = np.column_stack(_points()).astype("<f4").tobytes()
-    return [data, data[:-3], b"", np.full((4, 4), np.nan, "<f4").tobytes(), b"\xff" * 64]
+    columns = revolution(turns=20, rings=4)
+    others = [packed(columns, words) for words in _RECORDS]
+    return [data, *others, data[:-3], b"", np.full((4, 4), np.nan, "<f4").tobytes(), b"\xff" * 64]
 
 
 def _las(suffix: str) -> Callable[[Path], list[bytes]]:

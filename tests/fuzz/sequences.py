@@ -6,8 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from formats.test_point_records import packed, revolution
 from fuzz.cases import Files, Parser, files_in
 from readers.bag_builders import bag, clouds, imu, together, transforms
+from readers.pcap_builders import velodyne, write_pcap
 from readers.sequence_builders import T_CAM0_LIDAR, kitti_root, raw_drive, scans
 
 from lslam.errors import InputError
@@ -79,6 +81,23 @@ def _packed_bag(compression: str) -> Callable[[Path], list[Files]]:
 
 def _bag_parser(name: str, file: str, make: Callable[[Path], list[Files]]) -> Parser:
     return Parser(name, lambda folder: read_sequence(folder / file), make)
+
+
+def _capture(folder: Path) -> list[Files]:
+    """Revolutions of a Velodyne sensor, one after the other, with missing ones, and less than one."""
+    frames, _ = velodyne("VLP-16", 2.3, rate_hz=60.0)
+    per = len(frames) // 2
+    kept = [frames, frames[: per // 2], frames[: per // 2] + frames[per:], frames[:3]]
+    made = [{"a.pcap": write_pcap(folder / f"{k}.pcap", some).read_bytes()} for k, some in enumerate(kept)]
+    return [*made, {"a.pcap": b""}, {"a.pcap": made[0]["a.pcap"][:24]}]
+
+
+def _records(folder: Path) -> list[Files]:
+    """Scans whose points are six float32, by their values and as stated."""
+    scans_ = {f"{k}.bin": packed(revolution(k, turns=20, rings=4), "x y z intensity ring time") for k in range(_SCANS)}
+    stated = b'bin_record = "x:f4 y z intensity ring time:>f4"\npoint_unit = "cm"\n'
+    far = {name: (100 * np.frombuffer(data, "<f4")).astype("<f4").tobytes() for name, data in scans_.items()}
+    return [scans_ | {"sequence.toml": stated}, scans_, far, scans_ | {"1.bin": scans_["1.bin"][:-9]}]
 
 
 def _kitti(folder: Path) -> list[Files]:
@@ -159,6 +178,8 @@ PARSERS = [
     _bag_parser("MCAP, zstd", "a.mcap", _bag(".mcap", "mcap", True)),
     _bag_parser("SQLite bag", "a.db3", _bag(".db3", "sqlite", False)),
     _bag_parser("SQLite bag, zstd", "a.db3", _bag(".db3", "sqlite", True)),
+    _bag_parser("capture", "a.pcap", _capture),
+    Parser("folder of records", read_sequence, _records, trees=("sequence.toml",)),
     Parser("KITTI odometry", lambda f: read_sequence(f / "sequences" / "07"), _kitti,
            tables=("sequences/07/times.txt", "sequences/07/calib.txt", "poses/07.txt")),
     Parser("KITTI raw", lambda f: read_sequence(f / "2011_09_26" / "2011_09_26_drive_0005_sync"), _raw,
