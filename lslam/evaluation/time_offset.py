@@ -20,8 +20,8 @@ Stamps = NDArray[np.int64]
 WINDOW_S, FARTHEST_S, ROUNDS = 0.3, 0.5, 20
 # Least correlation of how the motions of both change: where both merely rattle, each does so by itself.
 MIN_COHERENCE = 0.5
-# Blocks whose errors count as independent, s, and how many there must be.
-BLOCK_S, MIN_BLOCKS = 1.5, 8
+# Blocks whose errors count as independent: so long, s, or a part of a shorter drive, but two windows; and how many at least.
+BLOCK_S, PARTS, MIN_BLOCKS = 1.5, 12, 8
 # An offset is clear from so many sigmas on, and from so many seconds on.
 CLEAR_SIGMAS, CLEAR_S = 5.0, 0.005
 # Noise of a way, m, and of a turn, rad, that is always allowed for.
@@ -54,9 +54,9 @@ def fit_offset(estimate: Trajectory, truth: Trajectory, start_ns: int = 0) -> Of
     own = _motions(estimate.poses, count, turns)
     durations = estimate.stamps_ns[count:] - estimate.stamps_ns[:-count]
     is_whole = durations < 1.5 * count * step
-    blocks = (
-        (estimate.stamps_ns[:-count] - estimate.stamps_ns[0]) // int(max(BLOCK_S * 1e9, 2 * count * step))
-    ).astype(int)
+    since = estimate.stamps_ns[:-count] - estimate.stamps_ns[0]
+    block = max(min(BLOCK_S * 1e9, float(since[-1]) / PARTS), 2 * count * step)
+    blocks = (since // int(block)).astype(int)
     reach = int(max(float(np.median(np.diff(truth.stamps_ns))), step))
     offset, last, gain = float(start_ns), 0.0, 1.0
     for _ in range(ROUNDS):
@@ -88,7 +88,8 @@ def _linearised(
     """Change of the offset, ns, its sigma, and the coherence, by the truth's motions at `stamps`, before and after."""
     inside = _known(truth.stamps_ns, stamps - reach) & _known(truth.stamps_ns, stamps + reach)
     use = inside[count:] & inside[:-count] & is_whole
-    if len(np.unique(blocks[use])) < MIN_BLOCKS:
+    many = len(np.unique(blocks[use]))
+    if many < MIN_BLOCKS:
         return None
     before, at, after = (
         _motions(interpolate.poses_at(truth.stamps_ns, truth.poses, stamps + shift), count, turns)[use]
@@ -105,7 +106,7 @@ def _linearised(
     change = float(pulls.sum()) / information
     parts = np.bincount(blocks[use], weights=np.sum(w * J * J, axis=1))
     # What is left of each block once the offset is taken off, and no less than noise of the floors would leave.
-    sigma = float(np.sqrt(np.sum((pulls - change * parts) ** 2))) / information
+    sigma = float(np.sqrt(np.sum((pulls - change * parts) ** 2) * many / (many - 1))) / information
     own_change = np.zeros_like(own)
     own_change[1:-1] = own[2:] - own[:-2]
     mine = own_change[use]

@@ -82,6 +82,18 @@ def test_nothing_is_clear_where_there_is_none_or_motion_does_not_tell(
         assert fit is None or not fit.is_clearly_off()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_short_walk_is_enough(seed: int) -> None:
+    estimate, truth = pair("walk", 0.1, 10, seed)
+    fit = fit_offset(estimate.select(slice(60)), truth.select(slice(60)))
+    assert fit is not None
+    assert fit.is_clearly_off()
+    assert fit.offset_ns / 1e9 == pytest.approx(0.1, abs=0.02)
+    right, truth = pair("walk", 0.0, 10, seed)
+    fit = fit_offset(right.select(slice(60)), truth.select(slice(60)))
+    assert fit is None or not fit.is_clearly_off()
+
+
 def test_positions_alone_tell_by_their_speed() -> None:
     fits = [fit_offset(*pair("car", 0.1, 100, seed, has_rotations=False)) for seed in range(5)]
     assert [fit is not None and abs(fit.offset_ns / 1e9 - 0.1) < 6 * fit.sigma_ns / 1e9 for fit in fits] == [True] * 5
