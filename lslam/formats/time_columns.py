@@ -25,7 +25,7 @@ UNITS_NS = {
 }  # fmt: skip
 SECOND_NS = 1_000_000_000
 _STAMPS = ("stamp", "timestamp", "stamps", "timestamps")
-_TIMES = ("t", "time", "times", "datetime", "epoch", "ts")
+_TIMES = ("t", "time", "times", "datetime", "epoch", "ts", "utc")
 _COMPACT = re.compile(r"(?:time|stamp|timestamp)(ns|us|ms|s)")
 # Poses, samples and scans are less than a minute apart.
 _LONGEST_STEP_S = 60.0
@@ -102,7 +102,8 @@ def _by_name(table: TextTable, taken: Collection[int]) -> list[tuple[int, ...]]:
     free = [k for k in range(min(len(words), width)) if k not in taken]
     ranked: list[tuple[int, int, tuple[int, ...]]] = []
     for k in free:
-        rank = _rank(words[k]) if words[k] or k else _ENDING
+        # pandas writes its index without a name.
+        rank = _rank(words[k]) if words[k] else (_ENDING if k == 0 else None)
         if rank is None:
             continue
         rest = _fraction_of(table, words, k, free)
@@ -115,8 +116,6 @@ def _by_name(table: TextTable, taken: Collection[int]) -> list[tuple[int, ...]]:
 
 def _rank(words: list[str]) -> int | None:
     """How likely a column of this name is the time of the row, 0 first; None when it is no time."""
-    if not words:
-        return _ENDING
     core = words[:-1] if len(words) > 1 and words[-1] in UNITS_NS else words
     if "header" in core or core[-1] in _STAMPS:
         return _STAMPED if "header" not in core or core[-1] in ("stamp", *UNITS_NS) else None
@@ -144,7 +143,7 @@ def _fraction_of(table: TextTable, words: list[list[str]], k: int, free: list[in
             both = known & np.isfinite(rest)
             if is_fraction(whole[both], rest[both], True, UNITS_NS[words[j][-1]]):
                 return j
-    if k + 1 in free and _rank(words[k + 1]) is None:
+    if k + 1 in free and words[k + 1] and _rank(words[k + 1]) is None:
         rest = table.numbers(k + 1)
         both = known & np.isfinite(rest)
         if is_fraction(whole[both], rest[both], False):

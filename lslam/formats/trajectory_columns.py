@@ -20,7 +20,7 @@ _BODIES = frozenset((
     "field", "pose", "poses", "gt", "est", "ref", "true", "truth", "ground", "groundtruth", "reference", "utm", "enu", "world",
     "map", "odom", "lidar", "base", "imu", "body", "cam", "camera", "local", "global", "prism", "leica", "rtk", "gps", "gnss",
 ))  # fmt: skip
-_EARTH = {"east": "x", "easting": "x", "north": "y", "northing": "y", "up": "z"}
+_EARTH = {"east": "x", "easting": "x", "e": "x", "north": "y", "northing": "y", "n": "y", "up": "z", "u": "z"}
 _ANGLES = ("roll", "pitch", "yaw", "heading")
 _WAY_OUT = "name the columns t, x, y, z, qx, qy, qz, qw"
 # Share of a table's quaternions that must have length 1, and how far from it they may be.
@@ -117,7 +117,8 @@ def _kind(words: list[str]) -> tuple[bool, tuple[str, ...], str] | None:
         if last != "w" and before and before[-1] in _POSITIONS:
             return False, tuple(before[:-1]), last
         return (False, tuple(before), last) if last != "w" and _BODIES.issuperset(before) else None
-    return (False, tuple(words[:-1]), _EARTH[words[-1]]) if words[-1] in _EARTH else None
+    # A body of its own: beside x, y, z a column `n` is a count.
+    return (False, (*words[:-1], "on Earth"), _EARTH[words[-1]]) if words[-1] in _EARTH else None
 
 
 def placed_columns(path: Path, table: TextTable, values: Floats, is_time: list[bool], scalar: str) -> PoseColumns:

@@ -162,6 +162,8 @@ ALONE = {
     "a prism": lines(lambda i: [str(NS[i]), *pose(i)[:3]], ",", "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]"),
     "a point of ROS": lines(lambda i: [str(NS[i]), *pose(i)[:3]], ",", "%time,field.point.x,field.point.y,field.point.z"),
     "RTK": lines(lambda i: [*parts(i), *pose(i)[:3]], ",", "sec,nsec,easting,northing,up"),
+    "ENU": lines(lambda i: [f"{np.datetime64(int(NS[i]), 'ns')}Z", *pose(i)[:3]], ",", "utc,E,N,U"),
+    "a count beside": lines(lambda i: [str(7 - i % 3), seconds(i), *pose(i)[:3], ""], ",", "n,t,x,y,z,"),
     "blanks": lines(lambda i: [seconds(i), *pose(i)[:3]]),
     "blanks and two columns of time": lines(lambda i: [*parts(i), *pose(i)[:3]]),
     "commas": lines(lambda i: [seconds(i), *pose(i)[:3]], ","),
@@ -180,6 +182,7 @@ def test_positions_alone(kind: str, tmp_path: Path) -> None:
     assert not trajectory.has_rotations
     assert trajectory.stamps_ns.tolist() == NS.tolist()
     np.testing.assert_allclose(trajectory.positions, P, atol=1e-8)
+    assert bool(trajectory.notes) == (kind in ("angles", "zero quaternions") or "identity" in kind)
     if kind == "angles":
         assert "left out: roll, pitch, yaw" in trajectory.notes[0]
 
