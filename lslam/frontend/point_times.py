@@ -34,6 +34,11 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
     recording decides, whatever part of it is used. Raises InputError when what is stated does not fit the scans.
     """
     stated = getattr(sequence, "stated_times", StatedTimes())
+    if getattr(sequence, "further_lidars", ()):
+        # The order and the azimuths of points of several LiDARs tell nothing; their reader said which have no times.
+        if stated.kind not in (None, "field"):
+            raise InputError(f"{sequence.path}: point_times = {stated.kind!r} is of one LiDAR, and several are merged")
+        return sequence
     if stated.kind is None and (sequence.motion_compensated or is_stated_only):
         return sequence
     if stated.kind == "none":

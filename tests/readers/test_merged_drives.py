@@ -92,6 +92,9 @@ def test_a_drive_that_begins_in_a_turn_is_followed_from_its_first_scan(tmp_path:
     error = outcome.evaluation.scores["ate"]["se3"].translation
     assert error is not None
     assert error.rmse < 0.05
+    alone = lslam.run(sequence, load_config(None, [*settings, "input.threads=1"], {}))
+    for a, b in zip(outcome.record.results, alone.record.results, strict=True):
+        np.testing.assert_array_equal(a.T_world_lidar, b.T_world_lidar)
 
 
 def in_the_city(two: TwoLidars, scan: Scan) -> np.ndarray:

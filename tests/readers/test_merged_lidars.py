@@ -16,17 +16,19 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from stub_sequences import Stub
 from test_bag_clouds import CUSTOM, POINT
 
+from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError, UsageError
 from lslam.formats import bag_messages
 from lslam.formats.bag_files import BagWriter
 from lslam.formats.kitti_layout import write_scan, write_times
+from lslam.frontend.point_times import with_point_times
 from lslam.geometry import se3
 from lslam.pipeline.resume import input_digest
 from lslam.readers import open_sequence
 from lslam.readers.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
 from lslam.readers.selection import select, with_rings
 from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, StatedTimes
 
 T_FRONT_REAR = se3.exp(np.array([-1.6, 0.4, -0.2, 0.0, 0.05, 2.9]))
 TREE = {("base", "front"): se3.exp(np.array([1.0, 0, 2, 0, 0.1, 0])),
@@ -171,6 +173,16 @@ def test_compensated_clouds_of_one_instant_stay_without_times(tmp_path: Path) ->
     assert merged.times is None
     assert len(merged) == 800
     assert not sequence.problems
+
+
+def test_no_clock_is_sought_in_the_order_of_points_of_several_lidars() -> None:
+    front, rear = ([replace(one, times=None) for one in sweeps(COUNT, seed=seed, start_ns=0)] for seed in (0, 50))
+    sequence = merged_of([*front], [*rear])
+    assert with_point_times(sequence, PreprocessConfig()) is sequence
+    assert any("rear: no per-point times" in problem for problem in sequence.problems)
+    sequence.stated_times = StatedTimes("order")
+    with pytest.raises(InputError, match="point_times = 'order' is of one LiDAR, and several are merged"):
+        with_point_times(sequence, PreprocessConfig())
 
 
 def test_without_extrinsics_lidars_are_not_merged(tmp_path: Path) -> None:
