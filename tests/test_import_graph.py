@@ -42,7 +42,7 @@ HOMES = {
     "small_gicp": ["odometry/small_gicp.py"],
     "rerun": ["reports/"],
     "kiss_icp": ["odometry/kiss.py"],
-    "embreex": ["simulation/lidar.py"],
+    "embreex": ["simulation/ray_scene.py"],
     "open3d": ["maps/", "odometry/open3d.py"],
     "requests": ["osm/overpass.py"],
     "urllib3": ["osm/overpass.py"],

@@ -6,7 +6,7 @@ import pytest
 from shared_towns import HELD, Towns
 
 from lslam.simulation import built_scenario, scenarios
-from lslam.simulation.lidar import RayScene
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenarios import simulate
 
 

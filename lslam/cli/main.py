@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 import click
 
 from lslam.errors import LslamError, cause, nearest, sentence
+from lslam.machine import pin_blas
 from lslam.stopping import heeded, is_interrupt, is_too_late
 from lslam.version import __version__
 
@@ -125,6 +126,7 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Entry point: results on stdout, one sentence per error on stderr, documented exit codes."""
+    pin_blas()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours

@@ -213,9 +213,9 @@ def _draw_map(
 ) -> Written:
     """Draw the whole extract, with the street of the drive when there is one."""
     from lslam.simulation.built_scenario import whole_map
-    from lslam.simulation.lidar import RayScene
     from lslam.simulation.osm_place import read_extract
     from lslam.simulation.plan import plan_of
+    from lslam.simulation.ray_scene import RayScene
     from lslam.simulation.scenario_files import scenario_named
     from lslam.simulation.scenarios import checked_origin
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.point_files import write_points
 from lslam.formats.pose_rows import seconds_text
-from lslam.geometry import se3
+from lslam.geometry import portable, se3
 from lslam.types.trajectory import Trajectory
 
 POINTS, PER_POINT = "velodyne", "per_point"
@@ -50,5 +50,5 @@ def write_calib(folder: Path, T_cam0_lidar: NDArray[np.float64]) -> None:
 
 def in_camera(truth: Trajectory, T_cam0_lidar: NDArray[np.float64]) -> Trajectory:
     """LiDAR poses as KITTI has them: camera 0 in camera 0 at the start."""
-    poses = T_cam0_lidar @ truth.poses @ se3.inverse(T_cam0_lidar)
+    poses = portable.product(portable.product(T_cam0_lidar, truth.poses), se3.inverse(T_cam0_lidar))
     return Trajectory(truth.stamps_ns, poses, "cam0", truth.has_stamps, source=truth.source)

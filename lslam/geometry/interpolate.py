@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +24,6 @@ def poses_at(stamps_ns: NDArray[np.int64], poses: Floats, query_ns: NDArray[Any]
     share = (query - stamps[left]).astype(np.float64) / span
     a, b = poses[left], poses[left + 1]
     R_a = a[:, :3, :3]
-    turn = so3.log(np.swapaxes(R_a, -1, -2) @ b[:, :3, :3])
+    turn = so3.log(portable.product(np.swapaxes(R_a, -1, -2), b[:, :3, :3]))
     t = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
-    return se3.make(R_a @ so3.exp(share[:, None] * turn), t)
+    return se3.make(portable.product(R_a, so3.exp(share[:, None] * turn)), t)

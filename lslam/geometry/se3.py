@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
+from lslam.geometry import portable, so3
 
 Floats = NDArray[np.float64]
 
@@ -28,14 +28,14 @@ def exp(xi: NDArray[Any]) -> Floats:
     """(..., 6) twists to (..., 4, 4) transforms."""
     xi = np.asarray(xi, np.float64)
     rho, phi = xi[..., :3], xi[..., 3:]
-    return make(so3.exp(phi), np.einsum("...ij,...j->...i", _left_jacobian(phi), rho))
+    return make(so3.exp(phi), portable.rotate(_left_jacobian(phi), rho))
 
 
 def log(T: NDArray[Any]) -> Floats:
     """(..., 4, 4) transforms to (..., 6) twists."""
     T = np.asarray(T, np.float64)
     phi = so3.log(T[..., :3, :3])
-    rho = np.linalg.solve(_left_jacobian(phi), T[..., :3, 3, None])[..., 0]
+    rho = portable.rotate(_inverse_left_jacobian(phi), T[..., :3, 3])
     return np.concatenate([rho, phi], axis=-1)
 
 
@@ -43,18 +43,18 @@ def inverse(T: NDArray[Any]) -> Floats:
     """Inverse of rigid transforms, by the transpose."""
     T = np.asarray(T, np.float64)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
-    return make(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
+    return make(Rt, -portable.rotate(Rt, T[..., :3, 3]))
 
 
 def relative(T_a: NDArray[Any], T_b: NDArray[Any]) -> Floats:
     """inv(T_a) @ T_b: pose b seen from pose a."""
-    return np.asarray(inverse(T_a) @ np.asarray(T_b, np.float64))
+    return portable.product(inverse(T_a), np.asarray(T_b, np.float64))
 
 
 def apply(T: NDArray[Any], points: NDArray[Any]) -> Floats:
     """One transform (4, 4) applied to points (N, 3), m; float64 out."""
     T = np.asarray(T, np.float64)
-    return np.asarray(np.asarray(points, np.float64) @ T[:3, :3].T + T[:3, 3])
+    return np.asarray(portable.product(np.asarray(points, np.float64), T[:3, :3].T) + T[:3, 3])
 
 
 def normalise(T: NDArray[Any]) -> Floats:
@@ -69,7 +69,7 @@ def adjoint(T: NDArray[Any]) -> Floats:
     R, t = T[..., :3, :3], T[..., :3, 3]
     A = np.zeros((*T.shape[:-2], 6, 6))
     A[..., :3, :3] = A[..., 3:, 3:] = R
-    A[..., :3, 3:] = so3.hat(t) @ R
+    A[..., :3, 3:] = portable.product(so3.hat(t), R)
     return A
 
 
@@ -78,7 +78,18 @@ def _left_jacobian(phi: Floats) -> Floats:
     theta = np.sqrt(theta2)
     small = theta2 < 1e-8
     safe = np.where(small, 1.0, theta)
-    b = np.where(small, 0.5 - theta2 / 24, (1 - np.cos(safe)) / safe**2)
-    c = np.where(small, 1 / 6 - theta2 / 120, (safe - np.sin(safe)) / safe**3)
-    k = so3.hat(phi)
-    return np.asarray(np.eye(3) + b * k + c * (k @ k))
+    sine, cosine = portable.sine_cosine(safe)
+    b = np.where(small, 0.5 - theta2 / 24, (1 - cosine) / safe**2)
+    c = np.where(small, 1 / 6 - theta2 / 120, (safe - sine) / (safe * safe * safe))
+    return np.asarray(np.eye(3) + b * so3.hat(phi) + c * so3.square(phi))
+
+
+def _inverse_left_jacobian(phi: Floats) -> Floats:
+    """Of rotation vectors (..., 3) of angles up to pi (Barfoot 2017, equation 7.37b)."""
+    theta2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    small = theta2 < 1e-4
+    half = np.sqrt(np.where(small, 1.0, theta2)) / 2
+    sine, cosine = portable.sine_cosine(half)
+    series = 1 / 12 + theta2 / 720 + theta2 * theta2 / 30240
+    c = np.where(small, series, (1 - half * cosine / sine) / (4 * half * half))
+    return np.asarray(np.eye(3) - 0.5 * so3.hat(phi) + c * so3.square(phi))

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
+
 Floats = NDArray[np.float64]
 
 
@@ -26,10 +28,15 @@ def exp(phi: NDArray[Any]) -> Floats:
     theta = np.sqrt(theta2)
     small = theta2 < 1e-10
     safe = np.where(small, 1.0, theta)
-    a = np.where(small, 1 - theta2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - theta2 / 24, (1 - np.cos(safe)) / safe**2)
-    k = hat(phi)
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+    sine, cosine = portable.sine_cosine(safe)
+    a = np.where(small, 1 - theta2 / 6, sine / safe)
+    b = np.where(small, 0.5 - theta2 / 24, (1 - cosine) / safe**2)
+    return np.asarray(np.eye(3) + a * hat(phi) + b * square(phi))
+
+
+def square(phi: Floats) -> Floats:
+    """hat(phi) @ hat(phi) of vectors (..., 3)."""
+    return np.asarray(phi[..., :, None] * phi[..., None, :] - np.eye(3) * portable.dot(phi, phi)[..., None, None])
 
 
 def log(R: NDArray[Any]) -> Floats:
@@ -38,7 +45,7 @@ def log(R: NDArray[Any]) -> Floats:
     v, w = q[..., :3], q[..., 3]
     n = np.linalg.norm(v, axis=-1)
     small = n < 1e-9
-    scale = np.where(small, 2.0, 2 * np.arctan2(n, w) / np.where(small, 1.0, n))
+    scale = np.where(small, 2.0, 2 * portable.arctan2(n, w) / np.where(small, 1.0, n))
     return np.asarray(v * scale[..., None])
 
 
@@ -49,15 +56,15 @@ def angle(R: NDArray[Any]) -> Floats:
 
 def least_rotation(a: Floats, b: Floats) -> Floats:
     """(3, 3) smallest rotation that takes the unit vector `a` (3,) to `b` (3,), half a turn square to them where opposite."""
-    axis, cosine = np.cross(a, b), float(a @ b)
-    sine = float(np.linalg.norm(axis))
+    axis, cosine = np.cross(a, b), float(portable.dot(a, b))
+    sine = float(portable.norm(axis))
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
         least = int(np.argmin(np.abs(a)))
         axis = np.eye(3)[least] - a[least] * a
-        return exp(np.pi * axis / np.linalg.norm(axis))
-    return exp(axis / sine * np.arctan2(sine, cosine))
+        return exp(np.pi * axis / portable.norm(axis))
+    return exp(axis / sine * portable.arctan2(sine, cosine))
 
 
 def to_quaternion(R: NDArray[Any]) -> Floats:
@@ -114,8 +121,22 @@ def is_rotation(R: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
 
 
 def normalise(R: NDArray[Any]) -> Floats:
-    """Nearest rotation (SVD) to (..., 3, 3) matrices that rounding moved off SO(3)."""
-    u, _, vt = np.linalg.svd(np.asarray(R, np.float64))
+    """Nearest rotation to (..., 3, 3) matrices that rounding moved off SO(3)."""
+    R = np.asarray(R, np.float64)
+    for _ in range(6):
+        # Newton and Schulz's iteration for the polar factor squares the distance; far off the singular vectors tell.
+        off = portable.product(np.swapaxes(R, -1, -2), R) - np.eye(3)
+        largest = np.abs(off).max(initial=0.0)
+        if not largest < 0.1:
+            return _nearest(R)
+        R = R - 0.5 * portable.product(R, off)
+        if largest < 1e-9:
+            break
+    return R if bool(np.all(np.linalg.det(R) > 0)) else _nearest(R)
+
+
+def _nearest(R: Floats) -> Floats:
+    u, _, vt = np.linalg.svd(R)
     d = np.sign(np.linalg.det(u @ vt))
     u[..., :, 2] *= d[..., None]
     return np.asarray(u @ vt)
@@ -124,9 +145,9 @@ def normalise(R: NDArray[Any]) -> Floats:
 def euler_rpy(R: NDArray[Any]) -> Floats:
     """(..., 3) roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll)."""
     R = np.asarray(R, np.float64)
-    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
-    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
-    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    roll = portable.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = portable.arctan2(-R[..., 2, 0], portable.hypot(R[..., 0, 0], R[..., 1, 0]))
+    yaw = portable.arctan2(R[..., 1, 0], R[..., 0, 0])
     return np.stack([roll, pitch, yaw], axis=-1)
 
 
@@ -134,4 +155,5 @@ def from_euler_rpy(rpy: NDArray[Any]) -> Floats:
     """(..., 3) roll, pitch, yaw in rad to Rz(yaw) Ry(pitch) Rx(roll)."""
     rpy = np.asarray(rpy, np.float64)
     axes = np.eye(3)
-    return np.asarray(exp(rpy[..., 2:3] * axes[2]) @ exp(rpy[..., 1:2] * axes[1]) @ exp(rpy[..., 0:1] * axes[0]))
+    level = portable.product(exp(rpy[..., 2:3] * axes[2]), exp(rpy[..., 1:2] * axes[1]))
+    return portable.product(level, exp(rpy[..., 0:1] * axes[0]))

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import UsageError
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
 from lslam.simulation.flight import GRAVITY, Swing
+from lslam.simulation.splines import interpolating_spline
 
 Floats = NDArray[np.float64]
 
@@ -46,7 +47,7 @@ class EightFlight:
         half = up + UPWARDS / GRAVITY
         tilt = np.column_stack([-half[:, 1], half[:, 0], np.zeros(len(up)), half[:, 2]])
         look = so3.exp(np.column_stack([np.zeros((len(up), 2)), self.heading(times)]))
-        R = so3.from_quaternion(tilt / np.linalg.norm(tilt, axis=1, keepdims=True)) @ look
+        R = portable.product(so3.from_quaternion(tilt / np.linalg.norm(tilt, axis=1, keepdims=True)), look)
         shake = self.swing.at(times)[:, :3]
         return se3.make(R, np.asarray(self.position(times)) + shake)
 
@@ -58,20 +59,18 @@ def eight_flight(
 
     Raises UsageError where that needs more than `limit` m/s2 of thrust.
     """
-    from scipy.interpolate import make_interp_spline
-
     duration = HOVER + GROWING + VIOLENT
     t = np.arange(0.0, duration + 6 * STEP, STEP)
     half = HALF * rng.uniform(0.97, 1.03, 2)
     side, phase = (1.0 if rng.random() < 0.5 else -1.0), rng.uniform(0, 2 * np.pi)
-    pulse = speed / float(np.hypot(half[0], 2 * half[1]))
+    pulse = speed / float(portable.hypot(half[0], 2 * half[1]))
     angle = pulse * (t - HOVER)
     u = np.clip((t - HOVER) / GROWING, 0, 1)
-    grown = u**4 * (35 - 84 * u + 70 * u**2 - 20 * u**3)
-    x, y = half[0] * np.sin(angle), side * half[1] * np.sin(2 * angle)
-    path = middle + grown[:, None] * np.stack([x, y, -DIP * np.cos(2 * angle)], axis=1)
-    look = grown * LOOK * (np.sin(0.9 * t + phase) - np.sin(phase))
-    flight = EightFlight(make_interp_spline(t, path, k=5), make_interp_spline(t, look, k=5), duration, swing)
+    grown = (u * u) ** 2 * (35 - 84 * u + 70 * u**2 - 20 * u * u * u)
+    x, y = half[0] * portable.sin(angle), side * half[1] * portable.sin(2 * angle)
+    path = middle + grown[:, None] * np.stack([x, y, -DIP * portable.cos(2 * angle)], axis=1)
+    look = grown * LOOK * (portable.sin(0.9 * t + phase) - portable.sin(phase))
+    flight = EightFlight(interpolating_spline(t, path), interpolating_spline(t, look), duration, swing)
     needed = float(np.linalg.norm(flight.position(t, nu=2) + UPWARDS, axis=1).max())
     if needed > limit:
         raise UsageError(

@@ -19,10 +19,10 @@ from lslam.simulation.curve import RouteCurve, stretched
 from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
 from lslam.simulation.hall import build_hall
 from lslam.simulation.kinematics import PosePath
-from lslam.simulation.lidar import RayScene
 from lslam.simulation.moving import Mover, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.routes import (
     FIRST_VISIT,
     SPARE,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from lslam.config.section import Section
+from lslam.geometry import portable
 from lslam.simulation import furniture
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
@@ -121,7 +122,7 @@ class Lots:
         if self.corridor.intersects(polygon):
             return False
         x, y, reach = _circle(corners)
-        near = np.hypot(self._circles[:, 0] - x, self._circles[:, 1] - y) <= self._circles[:, 2] + reach
+        near = portable.hypot(self._circles[:, 0] - x, self._circles[:, 1] - y) <= self._circles[:, 2] + reach
         return not any(self.taken[i].intersects(polygon) for i in np.flatnonzero(near))
 
     def take(self, corners: Floats, height: float) -> None:
@@ -215,7 +216,7 @@ def add_row(
         bend = float(street.curvature(np.array([min(s, street.length)]))[0])
         along = 1 / np.clip(1 - side * offset * bend, 0.6, 3.0)
         position, tangent = _front(street, s + along * width / 2, side, offset)
-        yaw = float(np.arctan2(tangent[1], tangent[0]))
+        yaw = float(portable.arctan2(tangent[1], tangent[0]))
         placed = False
         # Most places are taken, and where the shallowest house has no room none has.
         for share in (1.0, 0.8, 0.65) if lots.is_free(_lot(position, tangent, width, 0.65 * depth)) else ():
@@ -263,7 +264,7 @@ def _add_front_garden(
         return
     length, across = width * rng.uniform(0.5, 0.95), -(setback - 0.2)
     shift = rng.uniform(-0.5, 0.5) * (width - length)
-    c, s = np.cos(yaw), np.sin(yaw)
+    c, s = portable.cos(yaw), portable.sin(yaw)
     place = np.asarray(position) + np.array([c * shift - s * across, s * shift + c * across, 0])
     part = furniture.hedge(rng, length, layout.volumes) if kind < 0.4 else furniture.garden_wall(rng, length)
     builder.add_mesh(part, place, yaw)
@@ -283,7 +284,7 @@ def add_street_furniture(
     def put(part: SceneMesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
         at = np.array([s])
         xy, tangent = street.beside(at, side * offset)[0], street.tangent(at)[0] * side
-        yaw = float(np.arctan2(tangent[1], tangent[0])) + turn
+        yaw = float(portable.arctan2(tangent[1], tangent[0])) + turn
         if allowed is not None and not allowed(xy, offset, yaw):
             return
         builder.add_mesh(part, [*xy, float(terrain.height(xy)) + lift], yaw)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout, add_ground
 from lslam.simulation.curve import RouteCurve
@@ -123,7 +124,7 @@ def add_house(
     front, tangent = street.beside(at, offset)[0], side * street.tangent(at)[0]
     inward, half = np.array([-tangent[1], tangent[0]]), width / 2 * tangent
     building = house(rng, width, depth, layout.storeys)
-    builder.add_mesh(building, [*front, float(terrain.height(front))], float(np.arctan2(tangent[1], tangent[0])))
+    builder.add_mesh(building, [*front, float(terrain.height(front))], float(portable.arctan2(tangent[1], tangent[0])))
     outline = np.array([front - half, front + half, front + half + depth * inward, front - half + depth * inward])
     return outline, float(building.vertices[:, 2].max())
 
@@ -181,7 +182,7 @@ def _put(
     part.add_box(low, high, surface)
     at = np.array([s])
     xy, tangent = street.beside(at, offset)[0], street.tangent(at)[0]
-    yaw = float(np.arctan2(tangent[1], tangent[0]))
+    yaw = float(portable.arctan2(tangent[1], tangent[0]))
     builder.add_mesh(part.build(), [*xy, float(terrain.height(xy))], yaw)
 
 
@@ -258,9 +259,9 @@ def _add_trees(
             part = furniture.tree(rng, layout.volumes)
             if rng.random() >= layout.trees or float(tree.query(xy)[0]) < layout.band + NEAREST:
                 continue
-            if len(taken) and np.hypot(*(taken[-64:] - xy).T).min() < APART:
+            if len(taken) and portable.hypot(*(taken[-64:] - xy).T).min() < APART:
                 continue
-            if len(houses) and (np.hypot(*(houses[:, :2] - xy).T) < houses[:, 2] + 1.5).any():
+            if len(houses) and (portable.hypot(*(houses[:, :2] - xy).T) < houses[:, 2] + 1.5).any():
                 continue
             taken = np.concatenate([taken, xy[None]])
             builder.add_mesh(part, [*xy, float(terrain.height(xy)) + VERGE], rng.uniform(0, 2 * np.pi))
@@ -276,7 +277,7 @@ def _add_hedges(
                 continue
             at, length = np.array([s + rng.uniform(-2, 2)]), rng.uniform(0.4, 0.8) * HEDGE
             xy, tangent = street.beside(at, side * (layout.band + 0.8))[0], street.tangent(at)[0]
-            yaw = float(np.arctan2(tangent[1], tangent[0]))
+            yaw = float(portable.arctan2(tangent[1], tangent[0]))
             part = furniture.hedge(rng, length, layout.volumes)
             builder.add_mesh(part, [*xy, float(terrain.height(xy)) + VERGE], yaw)
 
@@ -306,7 +307,7 @@ def _add_lodges(
         if rng.random() >= layout.openings:
             continue
         middle = street.beside(along, offset + np.sign(offset) * depth / 2)[0]
-        if np.hypot(*(way - middle).T).min() < 0.5 * np.hypot(width, depth) + layout.band:
+        if portable.hypot(*(way - middle).T).min() < 0.5 * portable.hypot(width, depth) + layout.band:
             continue
         outline, height = add_house(builder, street, terrain, layout, float(along[0]), offset, width, depth, rng)
         footprints.append(outline)

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
+from lslam.simulation.splines import interpolating_spline, smoothed
+
 Floats = NDArray[np.float64]
 
 SPACING = 0.5  # m between the spline's knots
@@ -37,7 +40,7 @@ class RouteCurve:
         """(M,) signed curvature, 1/m, positive to the left."""
         at = self._wrap(s)
         d, dd = np.asarray(self.spline(at, nu=1)), np.asarray(self.spline(at, nu=2))
-        return np.asarray((d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3)
+        return np.asarray((d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / portable.dot(d, d) / portable.norm(d))
 
     def beside(self, s: NDArray[Any], offset: Any) -> Floats:
         """(M, 2) positions `offset` m to the left of the curve at distances `s` (M,)."""
@@ -60,23 +63,20 @@ def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> 
 
     A closed curve must not repeat its first point at the end.
     """
-    from scipy.interpolate import make_interp_spline
-    from scipy.ndimage import gaussian_filter1d
-
     points = np.asarray(points, np.float64)
     if closed:
         points = np.concatenate([points, points[:1]])
     even, step = _resample(points)
     if closed:
-        even = gaussian_filter1d(even[:-1], smoothing / step, axis=0, mode="wrap")
+        even = smoothed(even[:-1], smoothing / step, "wrap")
         even = np.concatenate([even, even[:1]])
     else:
         # Mirroring the differences, not the positions, keeps the ends where they are and straight.
         reach = int(np.ceil(4 * smoothing / step))
         ahead, behind = 2 * even[0] - even[reach:0:-1], 2 * even[-1] - even[-2 : -reach - 2 : -1]
-        even = gaussian_filter1d(np.concatenate([ahead, even, behind]), smoothing / step, axis=0)[reach:-reach]
+        even = smoothed(np.concatenate([ahead, even, behind]), smoothing / step)[reach:-reach]
     knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(even, axis=0), axis=1))])
-    spline = make_interp_spline(knots, even, k=5, bc_type="periodic" if closed else None)
+    spline = interpolating_spline(knots, even, closed)
     return RouteCurve(spline, float(knots[-1]), closed)
 
 
@@ -105,7 +105,7 @@ def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
     for k, (sx, sy) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
         angle = np.linspace(-np.pi / 2, 0, 48) + k * np.pi / 2
         centre = np.array([sx * (width / 2 - radius), sy * (depth / 2 - radius)])
-        corners.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        corners.append(centre + radius * np.stack([portable.cos(angle), portable.sin(angle)], axis=1))
     return np.concatenate([[[0.0, -depth / 2]], *corners])
 
 
@@ -114,6 +114,6 @@ def winding_line(rng: np.random.Generator, length: float, bend: float = 0.22) ->
     s = np.arange(0, length + 1.0)
     heading = np.zeros_like(s)
     for wavelength, share in ((rng.uniform(200, 260), 1.0), (rng.uniform(150, 190), 0.5)):
-        heading += bend * share * np.sin(2 * np.pi * s / wavelength + rng.uniform(0, 2 * np.pi))
-    steps = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        heading += bend * share * portable.sin(2 * np.pi * s / wavelength + rng.uniform(0, 2 * np.pi))
+    steps = np.stack([portable.cos(heading), portable.sin(heading)], axis=1)
     return np.asarray(np.cumsum(steps, axis=0))

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.path import SpeedProfile, drive, suspension
+from lslam.simulation.splines import interpolating_spline, smoothed
 from lslam.simulation.terrain import Terrain, flat
 
 Floats = NDArray[np.float64]
@@ -32,7 +33,7 @@ class Swing:
     def at(self, times: NDArray[Any]) -> Floats:
         """(M, 6) displacements at `times` (M,), s."""
         angle = 2 * np.pi * np.asarray(times)[:, None, None] * self.frequencies + self.phases
-        return np.asarray(np.sum(self.amplitudes * np.sin(angle), axis=1))
+        return np.asarray(np.sum(self.amplitudes * portable.sin(angle), axis=1))
 
 
 def gait(rng: np.random.Generator, strength: float = 1.0) -> Swing:
@@ -103,25 +104,22 @@ class FreePath:
             z = z + self.terrain.height(xy)
         shake = self.swing.at(times)
         T = se3.make(R, np.column_stack([xy, z]))
-        return np.asarray(T @ se3.make(so3.exp(shake[:, 3:]), shake[:, :3]))
+        return portable.product(T, se3.make(so3.exp(shake[:, 3:]), shake[:, :3]))
 
 
 def climb_spline(curve: RouteCurve, s: NDArray[Any], heights: NDArray[Any], smoothing: float) -> Any:
     """Height over distance along `curve` through `heights` (N,), m, at distances `s` (N,), smoothed by `smoothing` m."""
-    from scipy.interpolate import make_interp_spline
-    from scipy.ndimage import gaussian_filter1d
-
     along = np.linspace(0, curve.length, max(int(curve.length / 0.5), 64) + 1)
     z, sigma = np.interp(along, s, heights), smoothing / along[1]
     if curve.closed:
-        z = gaussian_filter1d(z[:-1], sigma, mode="wrap")
+        z = smoothed(z[:-1], sigma, "wrap")
         z = np.append(z, z[0])
     else:
         # Mirroring the differences keeps the ends and a constant slope.
         reach = min(int(np.ceil(4 * sigma)), len(z) - 1)
         z = np.concatenate([2 * z[0] - z[reach:0:-1], z, 2 * z[-1] - z[-2 : -reach - 2 : -1]])
-        z = gaussian_filter1d(z, sigma)[reach:-reach]
-    return make_interp_spline(along, z, k=5, bc_type="periodic" if curve.closed else None)
+        z = smoothed(z, sigma)[reach:-reach]
+    return interpolating_spline(along, z, curve.closed)
 
 
 def fly(
@@ -135,7 +133,7 @@ def fly(
 ) -> FreePath:
     """Carry a LiDAR along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
     rise = float(climb(curve.length) - climb(0.0))
-    level = curve.length / float(np.hypot(curve.length, rise))
+    level = curve.length / float(portable.hypot(curve.length, rise))
     pace = replace(speed, cruise=speed.cruise * level, start=speed.start * level)
     still = suspension(np.random.default_rng(0), 0.0, 0.0)
     timed = drive(curve, flat(), pace, distance, 0.0, still)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, tube
 
 BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
@@ -51,9 +52,10 @@ def _add_crown(builder: MeshBuilder, rng: np.random.Generator, size: NDArray[np.
     bumps = 1 + rng.normal(0, 0.12, (rows, columns + 1))
     # Its poles and its seam are one place each.
     bumps[0], bumps[-1], bumps[:, -1] = bumps[0, 0], bumps[-1, 0], bumps[:, 0]
-    flat = np.sin(polar)[:, None] * np.ones(columns + 1)
+    flat = portable.sin(polar)[:, None] * np.ones(columns + 1)
     at = np.stack(
-        [flat * np.cos(round_), flat * np.sin(round_), np.cos(polar)[:, None] * np.ones(columns + 1)], axis=-1
+        [flat * portable.cos(round_), flat * portable.sin(round_), portable.cos(polar)[:, None] * np.ones(columns + 1)],
+        axis=-1,
     )
     vertices = at * bumps[..., None] * size + [0, 0, height]
     builder.add(vertices.reshape(-1, 3), grid_faces(rows, columns + 1), Surface.CROWN)

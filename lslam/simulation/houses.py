@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 
 Floats = NDArray[np.float64]
@@ -67,7 +68,7 @@ def _facade(
     builder: MeshBuilder, rng: np.random.Generator, style: _HouseStyle, start: Floats, end: Floats, street: bool
 ) -> None:
     """One wall from `start` to `end` (2,), outside to its right, windows in a grid."""
-    length = float(np.linalg.norm(end - start))
+    length = float(portable.norm(end - start))
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
 

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from lslam.config.section import Section
 from lslam.errors import UsageError, nearest
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
 from lslam.simulation.kinematics import Kinematics, Motion
 from lslam.types.imu import ImuStream
 
@@ -165,7 +165,7 @@ def simulate_imu(
 def specific_force(truth: Kinematics) -> Floats:
     """(M, 3) what an exact accelerometer reads in the body frame, m/s2: +g upwards at rest (REP 145)."""
     felt = truth.acceleration + np.array([0.0, 0.0, GRAVITY])
-    return np.asarray(np.einsum("nji,nj->ni", truth.poses[:, :3, :3], felt))
+    return portable.rotate(np.swapaxes(truth.poses[:, :3, :3], -1, -2), felt)
 
 
 def measure(triad: Triad, exact: Floats, noise: Floats, rate_hz: float) -> tuple[Floats, Floats]:
@@ -178,7 +178,7 @@ def measure(triad: Triad, exact: Floats, noise: Floats, rate_hz: float) -> tuple
     np.fill_diagonal(cross, 1.0)
     walk = np.cumsum(noise[:, 1], axis=0) - noise[:1, 1]
     bias = triad.bias + triad.bias_walk / np.sqrt(rate_hz) * walk
-    reading = exact @ cross.T + bias + triad.noise_density * np.sqrt(rate_hz) * noise[:, 0]
+    reading = portable.product(exact, cross.T) + bias + triad.noise_density * np.sqrt(rate_hz) * noise[:, 0]
     if triad.step > 0:
         reading = np.round(reading / triad.step) * triad.step
     return np.clip(reading, -triad.limit, triad.limit), np.asarray(bias)

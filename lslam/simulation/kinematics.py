@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from lslam.config.section import Section
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
+from lslam.simulation.splines import interpolating_spline
 
 Floats = NDArray[np.float64]
 
@@ -58,11 +59,11 @@ class Kinematics:
         swing = np.cross(self.rate, arm)
         pull = np.cross(self.rate_change, arm) + np.cross(self.rate, swing)
         return Kinematics(
-            poses=self.poses @ np.asarray(T_body_sensor, np.float64),
-            velocity=self.velocity + _rotate(R, swing),
-            acceleration=self.acceleration + _rotate(R, pull),
-            rate=self.rate @ R_body_sensor,
-            rate_change=self.rate_change @ R_body_sensor,
+            poses=portable.product(self.poses, np.asarray(T_body_sensor, np.float64)),
+            velocity=self.velocity + portable.rotate(R, swing),
+            acceleration=self.acceleration + portable.rotate(R, pull),
+            rate=portable.product(self.rate, R_body_sensor),
+            rate_change=portable.product(self.rate_change, R_body_sensor),
         )
 
 
@@ -128,14 +129,12 @@ class StandingStart:
         since = np.asarray(times, np.float64) - self.seconds
         u = np.clip(since / self.ramp, 0, 1)
         # The integral of 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7, whose first three derivatives vanish at both ends.
-        grown = u**5 * (7 - 14 * u + 10 * u**2 - 2.5 * u**3)
+        grown = (u * u) ** 2 * u * (7 - 14 * u + 10 * u**2 - 2.5 * u * u * u)
         return np.asarray(self.ramp * grown + np.maximum(since - self.ramp, 0))
 
 
 def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
     """Make `path` differentiable: the motion meets it every `spacing` s and is smooth between."""
-    from scipy.interpolate import make_interp_spline
-
     knots = np.arange(max(int(path.duration / spacing), 8) + 1) * spacing
     # A last step that is shorter than half of the others would make the spline swing.
     knots = np.append(knots[knots < path.duration - spacing / 2], path.duration)
@@ -143,22 +142,16 @@ def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
     q = so3.to_quaternion(poses[:, :3, :3])
     flips = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0, -1.0, 1.0)
     q[1:] *= np.cumprod(flips)[:, None]
-    return Motion(
-        make_interp_spline(knots, poses[:, :3, 3], k=5), make_interp_spline(knots, q, k=5), float(path.duration)
-    )
+    return Motion(interpolating_spline(knots, poses[:, :3, 3]), interpolating_spline(knots, q), float(path.duration))
 
 
 def standing_start(path: PosePath, seconds: float) -> StandingStart:
     """Let `path` begin with `seconds` s of standing still; the faster it starts, the longer it takes to move off."""
     step = 1e-3
     first = path.poses(np.array([0.0, step]))[:, :3, 3]
-    speed = float(np.linalg.norm(first[1] - first[0])) / step
+    speed = float(portable.norm(first[1] - first[0])) / step
     # The pace of the smooth step grows by at most 35/16 per ramp.
     return StandingStart(path, seconds, max(2.0, 35 / 16 * speed / STANDING_ACCELERATION))
-
-
-def _rotate(R: Floats, v: Floats) -> Floats:
-    return np.asarray(np.einsum("nij,nj->ni", R, v))
 
 
 def _conjugate_times(q: Floats, p: Floats) -> Floats:
@@ -196,13 +189,13 @@ class Shaking:
     def at(self, times: NDArray[Any]) -> Floats:
         """(M, 4) roll, pitch, yaw, rad, and lift, m, at `times` (M,), s."""
         angle = 2 * np.pi * np.asarray(times)[:, None, None] * self.frequencies + self.phases
-        return np.asarray(np.sin(angle).sum(axis=2) * self.amplitudes)
+        return np.asarray(portable.sin(angle).sum(axis=2) * self.amplitudes)
 
     def shaken(self, poses: NDArray[Any], times: NDArray[Any]) -> Floats:
         """Poses (M, 4, 4), or one (4, 4), of a LiDAR at rest on its mount as they are at `times` (M,), s: (M, 4, 4)."""
         off = self.at(times)
         lift = np.column_stack([np.zeros((len(off), 2)), off[:, 3]])
-        return np.asarray(np.asarray(poses, np.float64) @ se3.make(so3.exp(off[:, :3]), lift))
+        return portable.product(np.asarray(poses, np.float64), se3.make(so3.exp(off[:, :3]), lift))
 
 
 def shaking(vibration: Vibration, rng: np.random.Generator) -> Shaking | None:

@@ -1,4 +1,4 @@
-"""Rays against a mesh (Embree), and what a LiDAR makes of them: noise, resolution, losses, intensity."""
+"""What a LiDAR makes of rays that meet a scene: noise, resolution, losses, intensity."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
 from lslam.simulation.lidar_models import LidarModel
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
-from lslam.simulation.scene_mesh import SceneMesh, Surface
+from lslam.simulation.scene_mesh import Surface
 from lslam.types.scan import Scan
 
 # Share of the light of a 905 nm laser that comes back from each surface met squarely.
@@ -60,26 +62,6 @@ class Roof:
         x, y = fall * directions[:, 0], fall * directions[:, 1]
         blocked = (x > -self.behind) & (x < self.ahead) & (np.abs(y) < self.aside)
         return np.where(blocked, fall, np.float32(np.inf)).astype(np.float32)
-
-
-class RayScene:
-    """A mesh prepared for ray casting."""
-
-    def __init__(self, mesh: SceneMesh) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
-
-        self.mesh = mesh
-        self._scene = EmbreeScene()
-        self._geometry = TriangleMesh(self._scene, mesh.vertices, mesh.faces)
-
-    def cast(
-        self, origins: NDArray[np.float32], directions: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """First hits of rays (N, 3) with unit directions: distances (N,), m, inf where nothing is hit, and faces (N,) or -1."""
-        hit = self._scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=1)
-        faces = np.asarray(hit["primID"], np.int32)
-        return np.where(faces >= 0, hit["tfar"], np.float32(np.inf)), faces
 
 
 @dataclass(frozen=True)
@@ -201,17 +183,17 @@ def _by_column(
 ) -> Iterator[NDArray[np.intp]]:
     """For each body, within `swept` (B,), m, of its centre (B, 3), the rays of a scan that may meet it."""
     # Bearings of whole columns first: a body is met by few of them, and then by few of their rings.
-    bearing = np.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
+    bearing = portable.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
     middle = bearing[:, rings // 2]
     spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
     climb = rays.directions[:, 2].reshape(-1, rings)
     apart = sum(float(np.ptp(axis)) for axis in rays.origins.T)
     to = centres - rays.origins[len(rays.fired) // 2]
-    reach, level, away = swept + apart, np.hypot(to[:, 0], to[:, 1]), np.linalg.norm(to, axis=1)
-    aside = np.arcsin(reach / np.maximum(level, reach))
-    rise, tilt = np.arctan2(to[:, 2], level), np.arcsin(reach / np.maximum(away, reach)) + 1e-3
-    lowest, highest = (np.sin(np.clip(rise + k * tilt, -np.pi / 2, np.pi / 2)) for k in (-1, 1))
-    for i, towards in enumerate(np.arctan2(to[:, 1], to[:, 0]).astype(np.float32)):
+    reach, level, away = swept + apart, portable.hypot(to[:, 0], to[:, 1]), portable.norm(to)
+    aside = portable.arcsin(reach / np.maximum(level, reach))
+    rise, tilt = portable.arctan2(to[:, 2], level), portable.arcsin(reach / np.maximum(away, reach)) + 1e-3
+    lowest, highest = (portable.sin(np.clip(rise + k * tilt, -np.pi / 2, np.pi / 2)) for k in (-1, 1))
+    for i, towards in enumerate(portable.arctan2(to[:, 1], to[:, 0]).astype(np.float32)):
         if level[i] <= reach[i]:
             yield np.arange(len(rays.fired))
             continue
@@ -250,8 +232,9 @@ def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits
     T = body.poses(stamp + BODY_STEP * np.arange(first, int(at.max()) + 2))
     T = T[at - first] + (share - at)[:, None, None] * (T[at - first + 1] - T[at - first])
     R, centre = T[:, :3, :3].astype(np.float32), T[:, :3, 3]
-    local = np.einsum("nji,nj->ni", R, rays.directions)
-    start = np.einsum("nji,nj->ni", R, (rays.origins - centre).astype(np.float32))
+    R = np.swapaxes(R, -1, -2)
+    local = portable.rotate(R, rays.directions)
+    start = portable.rotate(R, (rays.origins - centre).astype(np.float32))
     far, face = body.scene.cast(start, local)
     nearer = far < hits.distance[which]
     met, face = which[nearer], face[nearer]
@@ -320,8 +303,8 @@ def _directions(
 
 
 def _unit(azimuth: NDArray[np.float32], elevation: NDArray[np.float32]) -> NDArray[np.float32]:
-    flat = np.cos(elevation)
-    both = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    (sine, cosine), (rise, flat) = portable.sine_cosine(azimuth), portable.sine_cosine(elevation)
+    both = np.stack([flat * cosine, flat * sine, rise], axis=-1)
     return np.asarray(both.reshape(-1, 3))
 
 
@@ -336,14 +319,14 @@ def _into_city(
     by_column = directions.reshape(model.columns, model.rings, 3)
     lift = np.outer(model.heights, [0, 0, 1]).astype(np.float32)
     R, t = poses[..., :3, :3].astype(np.float32), poses[..., :3, 3].astype(np.float32)
-    origins = t[..., None, :] + lift @ np.swapaxes(R, -1, -2)
-    towards = by_column @ np.swapaxes(R, -1, -2)
+    origins = t[..., None, :] + portable.product(lift, np.swapaxes(R, -1, -2))
+    towards = portable.product(by_column, np.swapaxes(R, -1, -2))
     if poses.ndim == 3 and model.firing_us:
         # Between two columns it moves on evenly: what is left out of a turn of w in 50 us is (w 50 us)^2 / 2.
         share = (model.firing * model.columns / period).astype(np.float32)[:, None]
         step_R, step_t = _on(np.diff(poses[:, :3, :3], axis=0)), _on(np.diff(poses[:, :3, 3], axis=0))
         origins = origins + share * step_t[:, None]
-        towards = towards + share * (by_column @ np.swapaxes(step_R, -1, -2))
+        towards = towards + share * portable.product(by_column, np.swapaxes(step_R, -1, -2))
     spread = np.broadcast_to(origins, by_column.shape)
     return Rays(spread.reshape(-1, 3), towards.reshape(-1, 3), fired)
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import UsageError, nearest
+from lslam.geometry import portable
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +30,8 @@ class Rosette:
         scans = index + np.arange(columns) / columns
         a, b = (2 * np.pi * np.mod(scans * turns, 1.0) for turns in self.turns)
         half = np.radians(self.half_view_deg) / 2
-        azimuth = half * (np.cos(a) + np.cos(b))
-        elevation = half * (np.sin(a) + np.sin(b))
+        azimuth = half * (portable.cos(a) + portable.cos(b))
+        elevation = half * (portable.sin(a) + portable.sin(b))
         return np.broadcast_to(azimuth[:, None], (columns, len(lines))), elevation[:, None] + lines
 
 

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
+from lslam.geometry import portable, se3
 from lslam.simulation import furniture
 from lslam.simulation.city import KERB
 from lslam.simulation.curve import RouteCurve
-from lslam.simulation.lidar import MovingMesh, RayScene
+from lslam.simulation.lidar import MovingMesh
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, tube
 from lslam.simulation.terrain import Terrain
 
@@ -166,7 +167,7 @@ def _body(
 
 def _keeps_clear(body: Mover, times: Floats, ego: Floats) -> bool:
     at = body.poses(times)[:, :3, 3]
-    apart = np.hypot(*(at - ego[:, :3, 3])[:, :2].T)
+    apart = portable.hypot(*(at - ego[:, :3, 3])[:, :2].T)
     # What flies high above is in nobody's way.
     beside = np.abs(at[:, 2] - ego[:, 2, 3]) < 3.5
     return not bool(np.any(beside & (apart < NEAREST)))

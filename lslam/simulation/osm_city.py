@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.geometry import portable
 from lslam.simulation.city import KERB, MARGIN, City, Layout, Lots, add_garden_trees, add_street_furniture
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
@@ -157,7 +158,7 @@ class _Gaps:
         from shapely import points
 
         is_car = offset < self._road
-        half = 0.5 * CAR_LENGTH * is_car * np.array([np.cos(yaw), np.sin(yaw)])
+        half = 0.5 * CAR_LENGTH * is_car * np.array([portable.cos(yaw), portable.sin(yaw)])
         ends = points(np.stack([xy - half, xy, xy + half]))
         near = self._walls.query(ends, predicate="dwithin", distance=AIR[is_car])
         return near.size == 0 and self._places(xy, offset, yaw)
@@ -223,7 +224,7 @@ def _facade(
 ) -> None:
     """One wall from `start` to `end` (2,), outside to its right, from bottom over the ground floor to the top (`levels`)."""
     bottom, floor, top = levels
-    length = float(np.linalg.norm(end - start))
+    length = float(portable.norm(end - start))
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
 
@@ -295,11 +296,11 @@ def _gabled_roof(builder: MeshBuilder, gable: _Gable, eaves: float) -> None:
     top = eaves + gable.rise
     gables = [[*a, eaves], [*b, eaves], [*ridge[0], top], [*c, eaves], [*d, eaves], [*ridge[1], top]]
     builder.add(np.array(gables), np.arange(6).reshape(2, 3), Surface.WALL)
-    axis = (ridge[1] - ridge[0]) / np.linalg.norm(ridge[1] - ridge[0])
+    axis = (ridge[1] - ridge[0]) / portable.norm(ridge[1] - ridge[0])
     ends = ridge + OVERHANG * np.array([-axis, axis])
     for first, second in ((a, d), (b, c)):
         out = [corner - middle for corner, middle in zip((first, second), ridge, strict=True)]
-        share = [OVERHANG / float(np.linalg.norm(o)) for o in out]
+        share = [OVERHANG / float(portable.norm(o)) for o in out]
         eave = [end + (1 + k) * o for end, o, k in zip(ends, out, share, strict=True)]
         drops = [eaves - k * gable.rise for k in share]
         slope = [[*eave[0], drops[0]], [*eave[1], drops[1]], [*ends[1], top], [*ends[0], top]]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
+from lslam.geometry import portable
 from lslam.types.building import Building, Footprint, footprint_polygon, footprints_of
 from lslam.untrusted import MISFIT, parse_json
 
@@ -69,12 +70,12 @@ def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[B
         building = join_outlines(known[change.id], change, known)
         if change.simplify_m > 0:
             building = simplify_outlines(building, change.simplify_m)
-        c, s = np.cos(change.turn_rad), np.sin(change.turn_rad)
+        c, s = portable.cos(change.turn_rad), portable.sin(change.turn_rad)
         R, middle = np.array([[c, -s], [s, c]]), building.middle
         if change.turn_rad == 0:
             # Nothing but the shift, to the last bit.
             R, middle = np.eye(2), np.zeros(2)
-        found.append(building.moved(R, middle - R @ middle + np.array(change.shift_m) + common))
+        found.append(building.moved(R, middle - portable.rotate(R, middle) + np.array(change.shift_m) + common))
     return found + [building.moved(np.eye(2), common) for building in perturbation.not_yet_built]
 
 
@@ -191,7 +192,7 @@ def draw_perturbation(
     keep_clear : shapely geometry, m, where nobody would build (the streets)
     """
     heading = rng.uniform(0, 2 * np.pi)
-    common = (float(faults.offset * np.cos(heading)), float(faults.offset * np.sin(heading)))
+    common = (float(faults.offset * portable.cos(heading)), float(faults.offset * portable.sin(heading)))
     changes = [Change(b.osm_id) for b in buildings]
     missing = _some(rng, len(buildings), faults.missing)
     for k in missing:
@@ -212,7 +213,7 @@ def draw_perturbation(
         changes[k] = replace(changes[k], turn_rad=turn)
     for k in _pick(rng, present, len(_some(rng, len(buildings), faults.shifted))):
         size, way = rng.uniform(0.3, 1.0) * faults.shift, rng.uniform(0, 2 * np.pi)
-        changes[k] = replace(changes[k], shift_m=(float(size * np.cos(way)), float(size * np.sin(way))))
+        changes[k] = replace(changes[k], shift_m=(float(size * portable.cos(way)), float(size * portable.sin(way))))
     count = len(_some(rng, len(buildings), faults.new))
     return Perturbation(common, tuple(changes), _draw_new(buildings, count, rng, keep_clear))
 
@@ -280,9 +281,9 @@ def _draw_new(
             break
         near = buildings[int(rng.integers(len(buildings)))].middle
         half, turn = rng.uniform(3.5, 8.0, 2), rng.uniform(0, 2 * np.pi)
-        centre = near + rng.uniform(8, 30) * np.array([np.cos(turn), np.sin(turn)])
-        R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        outline = centre + (half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ R.T
+        centre = near + rng.uniform(8, 30) * np.array([portable.cos(turn), portable.sin(turn)])
+        R = np.array([[portable.cos(turn), -portable.sin(turn)], [portable.sin(turn), portable.cos(turn)]])
+        outline = centre + portable.product(half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), R.T)
         shape = footprint_polygon(Footprint(outline))
         if not taken.intersects(shape):
             taken = taken.union(shape.buffer(1.0))

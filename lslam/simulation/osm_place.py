@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError
 from lslam.formats.osm_buildings import BuildingExtract, buildings_near, read_buildings
 from lslam.formats.osm_files import OsmData
+from lslam.geometry import portable
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.moving import Mover
 from lslam.simulation.osm_city import OsmCity, build_osm_city
@@ -142,21 +143,22 @@ def fit_shape(shape: WayPoints, buildings: Sequence[Building], margin: float, so
     low, distance = _distances(buildings)
     best, most = None, -1
     for angle in 2 * np.pi * np.arange(HEADINGS) / HEADINGS:
-        c, s = np.cos(angle), np.sin(angle)
+        c, s = portable.cos(angle), portable.sin(angle)
         R = np.array([[c, -s], [s, c]])
-        shifts, seen = _free_shifts((points - middle) @ R.T, low, distance, margin)
+        shifts, seen = _free_shifts(portable.product(points - middle, R.T), low, distance, margin)
         if len(seen) and seen.max() > most:
             most = int(seen.max())
-            best = R, shifts[int(np.argmax(seen))] - R @ middle
+            best = R, shifts[int(np.argmax(seen))] - portable.rotate(R, middle)
     if best is None:
         raise UsageError(
             f"the shape of --path fits nowhere between the buildings of {source} with {margin:.1f} m of room: give way-points "
             "of the place itself; --plan without --path draws it"
         )
     R, shift = best
-    turn = np.degrees(np.arctan2(R[1, 0], R[0, 0]))
-    log.info("the shape of --path begins at x = %.0f, y = %.0f m, turned by %.0f deg", *(R @ points[0] + shift), turn)
-    return replace(shape, points=shape.points[:, :2] @ R.T + shift, is_placed=True)
+    turn = np.degrees(portable.arctan2(R[1, 0], R[0, 0]))
+    x, y = portable.rotate(R, points[0]) + shift
+    log.info("the shape of --path begins at x = %.0f, y = %.0f m, turned by %.0f deg", x, y, turn)
+    return replace(shape, points=portable.product(shape.points[:, :2], R.T) + shift, is_placed=True)
 
 
 def _dense(shape: WayPoints) -> Floats:

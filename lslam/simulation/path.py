@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
 from lslam.simulation.curve import RouteCurve
+from lslam.simulation.splines import interpolating_spline
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
@@ -49,7 +50,7 @@ class Suspension:
     def at(self, times: NDArray[Any]) -> Floats:
         """(M, 3) roll, pitch (rad) and heave (m) at `times` (M,), s."""
         angle = 2 * np.pi * times[:, None, None] * self.frequencies[:, None] + self.phases
-        return np.asarray(np.sum(self.amplitudes * np.sin(angle), axis=1))
+        return np.asarray(np.sum(self.amplitudes * portable.sin(angle), axis=1))
 
 
 def suspension(rng: np.random.Generator, angle_deg: float = 0.15, heave: float = 0.004) -> Suspension:
@@ -86,21 +87,20 @@ class VehiclePath:
         roll, pitch, heave = self.shaking.at(times).T
         ground = np.column_stack([xy, self.terrain.height(xy)])
         position = ground + (self.height + heave)[:, None] * z_axis
-        return se3.make(R @ so3.exp(np.column_stack([roll, pitch, np.zeros_like(roll)])), position)
+        shaken = portable.product(R, so3.exp(np.column_stack([roll, pitch, np.zeros_like(roll)])))
+        return se3.make(shaken, position)
 
 
 def drive(
     curve: RouteCurve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Suspension
 ) -> VehiclePath:
     """Drive `distance` m along `curve`, lap after lap on a closed one."""
-    from scipy.interpolate import make_interp_spline
-
     s = np.linspace(0, distance, int(np.ceil(distance / 0.25)) + 1)
     v = _speeds(curve, s, speed)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
     times, travelled = _eased(t, s, v, speed.easing if speed.start > 0 else -speed.easing)
     duration = float(np.interp(distance, travelled, times))
-    return VehiclePath(curve, terrain, make_interp_spline(times, travelled, k=5), duration, height, shaking)
+    return VehiclePath(curve, terrain, interpolating_spline(times, travelled), duration, height, shaking)
 
 
 def _speeds(curve: RouteCurve, s: Floats, speed: SpeedProfile) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.simulation.city import City
-from lslam.simulation.lidar import RayScene
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import Surface
 
 Image = NDArray[np.uint8]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from lslam.config.section import Section
+from lslam.geometry import portable
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.scene_mesh import SceneMesh, Surface
 
@@ -216,7 +217,7 @@ def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.
 
 def range_walk(returns: Returns, brightness: Array) -> Array:
     """(N,) m by which surfaces of some `brightness` (N,), the share of light they return, are measured too long."""
-    dimmer = np.log2(np.float32(REFERENCE) / np.clip(brightness, np.float32(0.02), np.float32(1)))
+    dimmer = portable.log(np.float32(REFERENCE) / np.clip(brightness, np.float32(0.02), np.float32(1))) / np.log(2)
     return np.asarray(np.float32(returns.walk) * dimmer, np.float32)
 
 
@@ -261,7 +262,7 @@ def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rn
 def mirrored(returns: Returns, hits: Hits, normals: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     """Which rays a pane of the static scene mirrors; `normals` (F, 3) of its faces."""
     panes = np.flatnonzero((hits.surface == Surface.GLASS) & np.isfinite(hits.distance) & (hits.face >= 0))
-    share = returns.mirror + (1 - returns.mirror) * (1 - hits.cosine[panes]) ** 5
+    share = returns.mirror + (1 - returns.mirror) * portable.power(1 - hits.cosine[panes], 5)
     lucky = rng.random(len(panes), np.float32) < share
     met = np.linalg.norm(normals[hits.face[panes]], axis=1) > 0
     return np.asarray(panes[lucky & met])
@@ -275,8 +276,8 @@ def reflect(rays: Rays, distance: Array, normals: Array) -> Rays:
 
 
 def _gain(returns: Returns, hits: Hits, distance: Array) -> Array:
-    gain = np.exp(np.float32(-2 * returns.attenuation) * distance)
+    gain = portable.exp(np.float32(-2 * returns.attenuation) * distance)
     if returns.paint > 0:
         shiny = np.flatnonzero((hits.surface == Surface.CAR) | (hits.surface == Surface.GLASS))
-        gain[shiny] *= hits.cosine[shiny] ** np.float32(returns.paint)
+        gain[shiny] *= portable.power(hits.cosine[shiny], returns.paint)
     return np.asarray(gain, np.float32)

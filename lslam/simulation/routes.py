@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import UsageError
+from lslam.geometry import portable
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
@@ -142,7 +143,7 @@ def _street(rng: np.random.Generator) -> Route:
     """Along a winding street, changing sides of the lane now and then."""
     street = smooth_curve(winding_line(rng, 320 + 2 * SPARE), closed=False)
     s = np.arange(SPARE, street.length - SPARE, 1.0)
-    sway = -0.4 + 0.5 * np.sin(2 * np.pi * s / rng.uniform(80, 120) + rng.uniform(0, 2 * np.pi))
+    sway = -0.4 + 0.5 * portable.sin(2 * np.pi * s / rng.uniform(80, 120) + rng.uniform(0, 2 * np.pi))
     return Route(street, smooth_curve(street.beside(s, sway), closed=False))
 
 

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.config.section import Section
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
+from lslam.geometry import portable
 from lslam.printable import toml_text
 from lslam.simulation.city import Layout
 from lslam.simulation.imu import ImuFaults
@@ -57,10 +58,10 @@ def rounded(corners: Sequence[tuple[float, float]], radius: float, closed: bool)
     for k in range(len(points)) if closed else range(1, len(points) - 1):
         here, before, after = points[k], points[k - 1], points[(k + 1) % len(points)]
         a, b = before - here, after - here
-        la, lb = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+        la, lb = float(portable.norm(a)), float(portable.norm(b))
         a, b = a / la, b / lb
-        half = 0.5 * float(np.arccos(np.clip(a @ b, -1, 1)))
-        reach = min(radius / np.tan(half), 0.45 * min(la, lb))
+        half = 0.5 * float(portable.arccos(np.clip(portable.dot(a, b), -1, 1)))
+        reach = min(radius / portable.tan(half), 0.45 * min(la, lb))
         out.append(_arc(here, a, b, half, reach))
     if not closed:
         out.append(points[-1:])
@@ -69,14 +70,14 @@ def rounded(corners: Sequence[tuple[float, float]], radius: float, closed: bool)
 
 def _arc(corner: Floats, a: Floats, b: Floats, half: float, reach: float) -> Floats:
     """The arc that touches two lines from `corner` along unit vectors `a` and `b`, `reach` m from it."""
-    radius = reach * np.tan(half)
-    middle = (a + b) / max(float(np.linalg.norm(a + b)), 1e-9)
-    centre = corner + middle * radius / np.sin(half)
+    radius = reach * portable.tan(half)
+    middle = (a + b) / max(float(portable.norm(a + b)), 1e-9)
+    centre = corner + middle * radius / portable.sin(half)
     start, end = corner + reach * a - centre, corner + reach * b - centre
-    turn = np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end)
+    turn = portable.arctan2(start[0] * end[1] - start[1] * end[0], portable.dot(start, end))
     count = max(int(abs(turn) * radius / STEP), 3)
-    angle = np.arctan2(start[1], start[0]) + np.linspace(0, turn, count + 1)
-    return np.asarray(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    angle = portable.arctan2(start[1], start[0]) + np.linspace(0, turn, count + 1)
+    return np.asarray(centre + radius * np.stack([portable.cos(angle), portable.sin(angle)], axis=1))
 
 
 def eight(width: float, depth: float, radius: float) -> Floats:
@@ -102,7 +103,7 @@ def spiral(approach: float, radius: float, turns: float) -> Floats:
     angle = np.linspace(0, 2 * np.pi * turns, int(2 * np.pi * turns * radius / STEP))
     # The radius shrinks a little, so that it is nearly but not quite a helix.
     r = radius * (1 - 0.06 * angle / angle[-1])
-    circle = np.stack([r * np.sin(angle), radius - r * np.cos(angle)], axis=1)
+    circle = np.stack([r * portable.sin(angle), radius - r * portable.cos(angle)], axis=1)
     straight = np.column_stack([np.arange(-approach, -0.5 * STEP, STEP), np.zeros(int(np.ceil(approach / STEP)))])
     return np.concatenate([straight, circle])
 
@@ -111,7 +112,7 @@ def out_and_back(length: float, radius: float) -> Floats:
     """(N, 2): along +x, round a U-turn to the left of `radius` m, and back beside; `length` m in all, 10 m of it straight."""
     straight = max(0.5 * (length - np.pi * radius), 5.0)
     angle = np.linspace(-np.pi / 2, np.pi / 2, max(int(np.pi * radius / STEP), 8) + 1)
-    turn = np.array([straight, radius]) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    turn = np.array([straight, radius]) + radius * np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
     return np.concatenate([[[0.0, 0.0]], turn, [[0.0, 2 * radius]]])
 
 

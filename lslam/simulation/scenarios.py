@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import UsageError
-from lslam.geometry import se3, so3
+from lslam.geometry import portable, se3, so3
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
 from lslam.simulation.imu import ImuModel, imu_named
 from lslam.simulation.kinematics import PosePath, shaking, smooth_motion, standing_start
-from lslam.simulation.lidar import RayScene, Roof, trace
+from lslam.simulation.lidar import Roof, trace
 from lslam.simulation.lidar_models import LidarModel, lidar_named
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
@@ -226,7 +227,9 @@ def checked_origin(origin: Iterable[float]) -> NDArray[np.float64]:
 def kitti_like_cam0() -> NDArray[np.float64]:
     """(4, 4) T_cam0_lidar: camera 0 looks ahead (x right, y down, z forward), turned by under a degree, as on KITTI's car."""
     axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    return se3.make(so3.from_euler_rpy(np.radians([0.45, -0.4, 0.02])) @ axes, np.array([-0.012, -0.06, -0.28]))
+    return se3.make(
+        portable.product(so3.from_euler_rpy(np.radians([0.45, -0.4, 0.02])), axes), np.array([-0.012, -0.06, -0.28])
+    )
 
 
 def _check(seed: int, count: int | None, speed: float, start_speed: float) -> None:

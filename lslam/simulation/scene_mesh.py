@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
+
 Floats = NDArray[np.float64]
 
 
@@ -81,8 +83,8 @@ class MeshBuilder:
 
     def add_mesh(self, mesh: SceneMesh, position: Any = (0, 0, 0), yaw: float = 0.0) -> None:
         """Add a mesh turned by `yaw` (rad, about z) and moved to `position` (3,)."""
-        c, s = np.cos(yaw), np.sin(yaw)
-        turned = mesh.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        c, s = portable.cos(yaw), portable.sin(yaw)
+        turned = portable.product(mesh.vertices, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
         self.add(turned + np.asarray(position, np.float64), mesh.faces, mesh.surfaces)
 
     def build(self) -> SceneMesh:
@@ -109,7 +111,7 @@ def tube(
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Vertices and faces of an open vertical tube round the z axis, possibly conical."""
     angle = 2 * np.pi * np.arange(sides) / sides
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    ring = np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
     low = np.column_stack([radius_low * ring, np.full(sides, bottom)])
     high = np.column_stack([radius_high * ring, np.full(sides, top)])
     here, there = np.arange(sides), (np.arange(sides) + 1) % sides

@@ -12,7 +12,7 @@ from lslam.errors import UsageError
 from lslam.formats.atomic import write_text
 from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv
 from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import geodesy, se3
+from lslam.geometry import geodesy, portable, se3
 from lslam.printable import toml_text
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
 from lslam.simulation.kinematics import Motion
@@ -54,7 +54,7 @@ class GnssModel:
     @property
     def sigma(self) -> float:
         """The one-sigma error a fix states, of east and of north, m."""
-        return float(np.hypot(self.white, self.slow))
+        return float(portable.hypot(self.white, self.slow))
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def simulate_gnss(
     count = int(np.floor(end * model.rate_hz + 1e-6)) + 1
     stamps = np.round(np.arange(count) * (1e9 / model.rate_hz)).astype(np.int64)
     times = stamps / 1e9
-    antenna = (motion.poses(times) @ T_lidar_gnss)[:, :3, 3]
+    antenna = portable.product(motion.poses(times), T_lidar_gnss)[:, :3, 3]
     error = _errors(model, count, rng)
     seen = np.ones(count, bool)
     for begin, finish in model.outages:
@@ -117,7 +117,7 @@ def _errors(model: GnssModel, count: int, rng: np.random.Generator) -> Floats:
     from scipy.signal import lfilter
 
     draws = rng.standard_normal((count, 2, 3))
-    keep = float(np.exp(-1 / (model.rate_hz * model.memory)))
+    keep = float(portable.exp(-1 / (model.rate_hz * model.memory)))
     driven = draws[:, 1] * np.sqrt(1 - keep**2)
     driven[:1] = draws[:1, 1]
     slow = np.asarray(lfilter([1.0], [1.0, -keep], driven, axis=0))
@@ -203,7 +203,7 @@ def write_truth(
         poses = se3.relative(T_city_world, motion.poses(stamps / 1e9))
         write_tum(folder / name, Trajectory(stamps, poses, "lidar"), note)
     exact = motion.at(fine_ns / 1e9)
-    velocity = exact.velocity @ T_city_world[:3, :3]
+    velocity = portable.product(exact.velocity, T_city_world[:3, :3])
     names = [f"{what}_{axis}" for what in ("velocity", "rate") for axis in "xyz"]
     write_stamped_csv(folder / "motion.csv", names, fine_ns, np.hstack([velocity, exact.rate]))
     if readings.imu is not None:
@@ -219,6 +219,6 @@ def _write_world(path: Path, T_enu_world: Floats, origin: Floats) -> None:
     tree = {
         "origin_lat_lon_alt": origin.tolist(),
         "T_enu_world": T_enu_world.tolist(),
-        "gravity_world": (down @ T_enu_world[:3, :3]).tolist(),
+        "gravity_world": portable.rotate(T_enu_world[:3, :3].T, down).tolist(),
     }
     write_text(path, toml_text(tree))

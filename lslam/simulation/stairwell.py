@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
 from lslam.simulation.city import City
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
@@ -39,14 +40,16 @@ def stairs_line(above: float) -> tuple[RouteCurve, tuple[Floats, Floats]]:
     for storey in range(STOREYS):
         low = 2 * storey * STEPS * RISE
         half, full = low + STEPS * RISE, low + 2 * STEPS * RISE
-        turn = np.column_stack([FLIGHT + TURNING * np.cos(bend), TURNING * np.sin(bend), np.full(13, half)])
+        turn = np.column_stack([FLIGHT + TURNING * portable.cos(bend), TURNING * portable.sin(bend), np.full(13, half)])
         parts += [turn, np.array([[0.0, TURNING, full]])]
         if storey + 1 < STOREYS:
-            parts.append(np.column_stack([-TURNING * np.cos(bend), -TURNING * np.sin(bend), np.full(13, full)]))
+            parts.append(
+                np.column_stack([-TURNING * portable.cos(bend), -TURNING * portable.sin(bend), np.full(13, full)])
+            )
     # Out of the landing ahead, then to the right along the corridor.
     x = -LANDING - CORRIDOR / 2
     out = np.linspace(0, np.pi / 2, 7)
-    parts.append(np.column_stack([x + 1.0 - np.sin(out), TURNING + 1.0 - np.cos(out), np.full(7, TOP)]))
+    parts.append(np.column_stack([x + 1.0 - portable.sin(out), TURNING + 1.0 - portable.cos(out), np.full(7, TOP)]))
     parts.append(np.array([[x, TURNING + WALKED, TOP]]))
     points = np.concatenate(parts)
     points = points[np.append(True, np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1) > 1e-6)]

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
+
 Floats = NDArray[np.float64]
 
 
@@ -26,13 +28,18 @@ class Terrain:
 
     def height(self, xy: NDArray[Any]) -> Floats:
         """Height at (..., 2) positions, m, shape (...)."""
-        return np.asarray(np.sin(xy @ self.waves.T + self.phases) @ self.amplitudes + xy @ np.array(self.tilt))
+        heights = portable.sin(self._phases_at(xy))
+        return portable.dot(heights, self.amplitudes) + portable.dot(np.asarray(xy, np.float64), np.array(self.tilt))
 
     def slope(self, xy: NDArray[Any]) -> Floats:
         """Gradient of the height at (..., 2) positions, m/m, shape (..., 2)."""
-        return np.asarray(
-            (np.cos(xy @ self.waves.T + self.phases) * self.amplitudes) @ self.waves + np.array(self.tilt)
-        )
+        steepness = portable.cos(self._phases_at(xy)) * self.amplitudes
+        return np.stack([portable.dot(steepness, self.waves[:, k]) + self.tilt[k] for k in (0, 1)], axis=-1)
+
+    def _phases_at(self, xy: NDArray[Any]) -> Floats:
+        """(..., K) of the waves, rad."""
+        xy = np.asarray(xy, np.float64)
+        return np.asarray(xy[..., :1] * self.waves[:, 0] + xy[..., 1:] * self.waves[:, 1] + self.phases)
 
 
 def rolling(
@@ -49,10 +56,12 @@ def rolling(
     lengths = np.concatenate([rng.uniform(0.6, 1.4, 4) * swell, rng.uniform(7, 20, 5)])
     amplitudes = np.concatenate([rng.uniform(0.4, 1.0, 4) * relief, rng.uniform(0.4, 1.0, 5) * unevenness])
     heading = rng.uniform(0, 2 * np.pi, len(lengths))
-    waves = (2 * np.pi / lengths)[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    waves = (2 * np.pi / lengths)[:, None] * np.stack([portable.cos(heading), portable.sin(heading)], axis=1)
     phases = rng.uniform(0, 2 * np.pi, len(lengths))
     fall, towards = rng.uniform(*slope), rng.uniform(0, 2 * np.pi)
-    return Terrain(waves, amplitudes, phases, (float(fall * np.cos(towards)), float(fall * np.sin(towards))))
+    return Terrain(
+        waves, amplitudes, phases, (float(fall * portable.cos(towards)), float(fall * portable.sin(towards)))
+    )
 
 
 def flat() -> Terrain:

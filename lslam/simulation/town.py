@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import portable
 from lslam.simulation.city import (
     KERB,
     City,
@@ -97,11 +98,11 @@ class Places:
         if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
             return False
         # Nor may a car's ends reach into another road.
-        half = 0.5 * CAR_LENGTH * np.array([np.cos(yaw), np.sin(yaw)])
+        half = 0.5 * CAR_LENGTH * np.array([portable.cos(yaw), portable.sin(yaw)])
         if is_car and self._network.distance(np.stack([xy - half, xy + half])).min() < offset - 0.7:
             return False
         apart = CAR_LENGTH if is_car else 0.9
-        if len(self._taken) and np.hypot(*(self._taken - xy).T).min() < apart:
+        if len(self._taken) and portable.hypot(*(self._taken - xy).T).min() < apart:
             return False
         self._taken = np.concatenate([self._taken, xy[None]])
         return True
@@ -133,8 +134,8 @@ def _side_streets(
                 if abs(float(street.curvature(at)[0])) > 0.02:
                     continue
                 tangent = street.tangent(at)[0] * side
-                heading = np.arctan2(tangent[1], tangent[0]) + np.pi / 2 + turn
-                ray = np.array([np.cos(heading), np.sin(heading)])
+                heading = portable.arctan2(tangent[1], tangent[0]) + np.pi / 2 + turn
+                ray = np.array([portable.cos(heading), portable.sin(heading)])
                 line = _until_met(street.position(at)[0], ray, length, cKDTree(taken), layout)
                 if line is not None:
                     out.append(line)

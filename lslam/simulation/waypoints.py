@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause, nearest
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.geometry import portable
 from lslam.geometry.geodesy import to_local
 from lslam.untrusted import MISFIT, parse_json, parse_toml
 
@@ -132,7 +133,7 @@ def _from_geojson(path: Path, origin: NDArray[Any] | None) -> WayPoints:
     at = fixes[0] if origin is None else np.asarray(origin, np.float64)
     local = to_local(fixes, at)[:, :2]
     points = np.column_stack([local, degrees[:, 2]]) if degrees.shape[1] == 3 else local
-    closed = len(points) > 3 and bool(np.linalg.norm(local[0] - local[-1]) < 0.1)
+    closed = len(points) > 3 and bool(portable.norm(local[0] - local[-1]) < 0.1)
     return WayPoints(points[:-1] if closed else points, closed, at)
 
 
@@ -155,12 +156,12 @@ def _from_trajectory(path: Path) -> WayPoints:
     xy = np.column_stack([p[:, 2], -p[:, 0]]) if trajectory.frame == "cam0" else p[:, :2]
     kept = [0]
     for i in range(len(xy)):
-        if np.linalg.norm(xy[i] - xy[kept[-1]]) >= APART:
+        if portable.norm(xy[i] - xy[kept[-1]]) >= APART:
             kept.append(i)
     xy = xy[kept] - xy[0]
     if len(xy) > 1:
-        c, s = xy[1] / np.linalg.norm(xy[1])
-        xy = xy @ np.array([[c, -s], [s, c]])
+        c, s = xy[1] / portable.norm(xy[1])
+        xy = portable.product(xy, np.array([[c, -s], [s, c]]))
     return WayPoints(xy, is_placed=False)
 
 

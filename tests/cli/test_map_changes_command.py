@@ -16,7 +16,7 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.geometry.umeyama import align
 from lslam.maps.georeference import Projection, to_wgs84
-from lslam.simulation.lidar import RayScene
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.record import record
 from lslam.simulation.routes import Visit
 from lslam.simulation.scenarios import SimulatedDrive, simulate

@@ -14,8 +14,9 @@ from lslam.errors import InputError
 from lslam.kernels import petals
 from lslam.preprocessing.features import extract_features
 from lslam.preprocessing.petals import petal_features, walk_lines
-from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LIDARS
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.types.scan import Scan
 

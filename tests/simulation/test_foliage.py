@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lslam.simulation import furniture
-from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.returns import Returns
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, box
 from lslam.types.scan import Scan

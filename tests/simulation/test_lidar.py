@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
-from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel, lidar_named
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 
 # A LiDAR without faults, so that answers are exact.

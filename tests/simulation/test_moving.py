@@ -12,9 +12,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.simulation.curve import smooth_curve
-from lslam.simulation.lidar import MovingMesh, RayScene, Roof, trace
+from lslam.simulation.lidar import MovingMesh, Roof, trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel
 from lslam.simulation.moving import NEAREST, Mover, add_traffic, moving_meshes, pedestrian
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
 from lslam.simulation.terrain import flat, rolling

@@ -15,9 +15,9 @@ from shapely import MultiPolygon, contains_xy, points
 
 from lslam.errors import InputError
 from lslam.simulation.curve import smooth_curve
-from lslam.simulation.lidar import RayScene
 from lslam.simulation.osm_city import OsmCity, build_osm_city, extrude
 from lslam.simulation.osm_place import read_extract
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.simulation.terrain import flat, rolling
 from lslam.types.building import Building, Footprint, footprint_polygon

@@ -9,8 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.returns import Hits, Rays, Returns, errors, mixed, range_walk, texture
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import simulate

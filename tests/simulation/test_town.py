@@ -11,7 +11,7 @@ import pytest
 from lslam.errors import UsageError
 from lslam.simulation.built_scenario import check_bends, check_path
 from lslam.simulation.city import KERB, City
-from lslam.simulation.lidar import RayScene
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import MeshBuilder, Surface

@@ -8,8 +8,9 @@ import pytest
 from lslam.errors import ConfigError
 from lslam.geometry import se3
 from lslam.simulation.kinematics import Vibration, shaking
-from lslam.simulation.lidar import RayScene, trace
+from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
+from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, Surface

@@ -1,0 +1,110 @@
+"""A simulated drive and its run have the same bytes, whatever kernels BLAS, NumPy and numba choose for the processor."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.skipif(
+    platform.machine() not in ("x86_64", "AMD64"), reason="the settings are those of x86-64"
+)
+
+# Of NumPy since 2.4, and before; it takes no notice of the names that it does not know.
+NO_VECTORS = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX2 FMA3"
+SETTINGS = {
+    **{name: {"OPENBLAS_CORETYPE": name} for name in ("Haswell", "SkylakeX", "Zen", "Nehalem")},
+    "numpy without vector units": {"NPY_DISABLE_CPU_FEATURES": NO_VECTORS},
+    "numba generic": {"NUMBA_CPU_NAME": "generic"},
+    "numba x86-64-v3": {"NUMBA_CPU_NAME": "x86-64-v3"},
+}
+OUTPUTS = (
+    "trajectory.tum",
+    "trajectory_kitti.txt",
+    "covariances.npz",
+    "evaluation.json",
+    "map.ply",
+    "scans.csv",
+)
+IN_PROCESS = """
+import sys, hashlib
+import numpy as np
+from lslam.simulation.scenarios import simulate
+drive = simulate(sys.argv[1], count=3, imu="icm20948", motion_compensated=False)
+digest = hashlib.sha256()
+for k in range(3):
+    digest.update(drive.scan(k).points.tobytes())
+digest.update(drive.imu.accel.tobytes() + drive.imu.gyro.tobytes() + drive.ground_truth.poses.tobytes())
+print(digest.hexdigest())
+"""
+
+
+def lslam(setting: dict[str, str], *args: str | Path) -> None:
+    env = {**{k: v for k, v in os.environ.items() if k not in ("OPENBLAS_CORETYPE", "NUMBA_CPU_NAME")}, **setting}
+    command = [sys.executable, "-m", "lslam", *map(str, args), "-q"]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def digests(folder: Path, names: list[Path]) -> dict[str, str]:
+    return {str(name): hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
+
+
+def simulated(folder: Path, setting: dict[str, str]) -> dict[str, str]:
+    lslam(setting, "simulate", "block", "--lidar", "vlp16", "--distorted", "--count", "5", "--out", folder)
+    # The manifest holds the command and the place.
+    names = [p.relative_to(folder) for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "manifest.json"]
+    assert len(names) > 15
+    return digests(folder, names)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+    folder = tmp_path_factory.mktemp("drive") / "drive"
+    return folder, simulated(folder, {})
+
+
+@pytest.fixture(scope="module")
+def outputs(drive: tuple[Path, dict[str, str]], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    return ran(drive[0], tmp_path_factory.mktemp("run") / "run", {})
+
+
+def ran(drive: Path, out: Path, setting: dict[str, str]) -> dict[str, str]:
+    lslam(setting, "run", drive, "--method", "icp", "--imu", "--no-loops", "--out", out, "--set", "report.html=false")
+    return digests(out, [Path(name) for name in OUTPUTS])
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_drive_and_run(name: str, drive: tuple[Path, dict[str, str]], outputs: dict[str, str], tmp_path: Path) -> None:
+    assert simulated(tmp_path / "drive", SETTINGS[name]) == drive[1]
+    assert ran(drive[0], tmp_path / "run", SETTINGS[name]) == outputs
+
+
+@pytest.mark.parametrize("scenario", ["quadrotor", "walk"])
+def test_drives_of_a_process_that_chose_its_own_kernels(scenario: str) -> None:
+    """In Python nothing is pinned: the simulator itself calls no BLAS."""
+    seen = set()
+    for setting in SETTINGS.values():
+        env = {**os.environ, **setting}
+        seen.add(
+            subprocess.run(
+                [sys.executable, "-c", IN_PROCESS, scenario], env=env, capture_output=True, check=True
+            ).stdout
+        )
+    assert len(seen) == 1
+
+
+def test_digests_tell_a_last_bit(drive: tuple[Path, dict[str, str]], tmp_path: Path) -> None:
+    """The sentinel: one bit of one coordinate."""
+    name = Path("sequences/00/velodyne/000003.bin")
+    points = np.fromfile(drive[0] / name, np.float32)
+    points[7] = np.nextafter(points[7], np.float32(np.inf))
+    (tmp_path / name).parent.mkdir(parents=True)
+    points.tofile(tmp_path / name)
+    assert digests(tmp_path, [name])[str(name)] != drive[1][str(name)]
