@@ -2,7 +2,7 @@
 
 BLAS and LAPACK choose their kernels by the processor, and NumPy its vector functions: the last bits of `A @ B`, `np.linalg.solve`
 and `np.sin` differ from machine to machine. IEEE 754 fixes `+ - * /` and square roots, so what consists of these alone does not.
-Elementary functions are those of fdlibm (Sun Microsystems 1993), within one unit in the last place.
+Elementary functions are those of fdlibm (Ng 1993), within one unit in the last place.
 """
 
 from __future__ import annotations
