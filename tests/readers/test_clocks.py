@@ -292,3 +292,14 @@ def test_the_clock_that_counts_is_said(tmp_path: Path) -> None:
     assert (
         "/points: scans have the stamps of their headers; they were recorded 0.015 s after (median)" in sequence.notes
     )
+
+
+def test_messages_lost_while_the_recorder_was_late_are_no_step_of_the_headers() -> None:
+    """A disk that hangs for 1.5 s in 20: half a second of scans is lost, the others are written late and at once."""
+    true = START_NS + np.arange(200) * STEP_NS
+    hung = (true > true[99]) & (true < true[99] + 15 * 10**8)
+    recorded = np.where(hung, true[99] + 15 * 10**8, true) + delays(200, 0.006)
+    kept = np.setdiff1d(np.arange(200), [102, 103, 104, 105, 106, 108, 109, 110])
+    _, stamps, voice = ordered(true[kept], np.maximum.accumulate(recorded)[kept])
+    np.testing.assert_array_equal(stamps, true[kept])
+    assert not voice.problems
