@@ -24,7 +24,6 @@ _LOOKED_AT = 40  # stamps; of more of them so many are looked at before the reco
 _BINS = 90  # of azimuth
 _FULL = 5 / 6  # of all directions, by 12 deg: the sensor turns, and what it sees again is another revolution
 _SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
-_SAME = 0.1  # of the points: a repeat, or another return of the same beams
 _CELL_RAD = 1e-3  # of directions: those of another return are the same, those between two columns are not
 _BURST = 0.25  # of the time between scans: what is recorded together was measured together
 
@@ -160,8 +159,6 @@ def _adds(a: PointCloud, b: PointCloud, is_burst: bool) -> bool:
     """Whether b sees what a does not; of both only what was measured."""
     if not len(a) or not len(b):
         return len(b) > 0
-    if np.isin(_keys(b), _keys(a)).mean() > _SAME:
-        return False
     return _is_complement(a, b) or (is_burst and _sees_between(a, b))
 
 
@@ -187,13 +184,6 @@ def _sees_between(a: PointCloud, b: PointCloud) -> bool:
         for x, y, z in (cloud.points.T.astype(np.float64) for cloud in (a, b))
     )
     return bool(np.isin(of_b, of_a).mean() <= _SHARED)
-
-
-def _keys(cloud: PointCloud) -> NDArray[np.uint64]:
-    """A number of each point, the same where its place is."""
-    bits = np.ascontiguousarray(cloud.points).view(np.uint32).astype(np.uint64)
-    keys: NDArray[np.uint64] = bits @ np.array([1, 0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F], np.uint64)
-    return keys
 
 
 def _azimuths(cloud: PointCloud) -> NDArray[np.int64]:
