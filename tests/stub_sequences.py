@@ -16,7 +16,7 @@ from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Calibration, Sequence
+from lslam.types.sequence import Calibration, Sequence, StatedTimes
 from lslam.types.trajectory import Trajectory
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
@@ -34,6 +34,7 @@ class Stub:
     kind: str = "stub"
     rate_hz: float = 10.0
     motion_compensated: bool | None = True
+    stated_times: StatedTimes = field(default_factory=StatedTimes)
     imu: ImuStream | None = None
     gnss: GnssStream | None = None
     notes: list[str] = field(default_factory=lambda: ["a note of the reader"])

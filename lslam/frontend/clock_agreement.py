@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -30,12 +30,12 @@ Floats = NDArray[np.float64]
 # Scans of a window. The speed is not known before the second scan: those before are not judged.
 SCANS, SKIPPED, FEWEST_SCANS = 13, 3, 8
 # Points of a scan that odometry has, that the surfaces are made of, and that are kept out to be laid on them.
-_REGISTERED, _SURFACE, _KEPT_OUT = 6000, 4000, 800
+_REGISTERED, _SURFACE, _KEPT_OUT = 9000, 4000, 800
 _SHARE_KEPT_OUT = 0.15
 _SOURCE = 2000, 3500
-# A motion over the window that differs by more than this share of it, m, and the largest rotation in a sweep on a lever of so
-# many m, from that without a clock is another one.
-_ASTRAY, _ASTRAY_M, _LEVER_M = 0.08, 0.3, 5.0
+# A step that differs by more than this share of it, m, and the largest rotation in a sweep on a lever of so many m, from that
+# without a clock is another one.
+_ASTRAY, _ASTRAY_M, _LEVER_M = 0.15, 0.2, 2.0
 # With the speed of the start known, nothing is searched far from where it leads: rings on flat ground lure to a standstill.
 _NO_SEARCH = RecoveryConfig(start_search=False, coarse_to_fine=False)
 # Neighbours that make a surface, within m, and the fewest of other scans among them.
@@ -63,6 +63,26 @@ class ClockComparison(NamedTuple):
         return self.t >= _T and self.same_sign >= _SAME_SIGN and self.relative >= _RELATIVE
 
 
+class _KnownSteps(ConstantVelocity):
+    """Predicts each scan by the motion from the scan before that was found without a clock."""
+
+    def __init__(self, stamps_ns: list[int], steps: list[Floats]) -> None:
+        super().__init__()
+        self._steps = [(se3.log(step), 1e-9 * (b - a)) for step, (a, b) in zip(steps, pairwise(stamps_ns), strict=True)]
+        self._next = 0
+        # As if the scan before the first had moved as the first did.
+        self._twist, self._step_s = self._steps[0]
+        self._instant_ns, self._pose = 2 * stamps_ns[0] - stamps_ns[1], se3.inverse(steps[0])
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """As constant velocity, with the next step in place of the last."""
+        super().correct(stamp_ns, pose, prior, is_registered)
+        self._twist, self._step_s = self._steps[min(self._next, len(self._steps) - 1)]
+        self._next += 1
+
+
 @dataclass(frozen=True)
 class _Placed:
     """A scan where odometry has it, deskewed: its pose, points for surfaces (N, 3) and points that were kept out (M, 3), m."""
@@ -75,13 +95,14 @@ class _Placed:
 class ClockWindow:
     """Consecutive scans, over which clocks are tried; the same clock is tried once.
 
-    Where the sensor goes is found once, without a clock. Under each clock, and without one, odometry then begins with the speed
-    of its first step and searches nothing.
+    Where the sensor goes is found once, without a clock. Under each clock, and without one, odometry then predicts each scan by
+    that and searches nothing.
     """
 
     def __init__(self, scans: list[Scan], preprocess: PreprocessConfig) -> None:
         gate = preprocess.model_dump(include={"range_min", "range_max", "range_shape", "ego_box"})
         few = {"source_points_min": _SOURCE[0], "source_points_max": _SOURCE[1]}
+        self._whole = Config.model_validate({"preprocess": gate})
         self._config = Config.model_validate({"preprocess": gate | few})
         self.scans = [scan for scan in scans if len(scan) > 0]
         self._masks = [self._split(scan) for scan in self.scans]
@@ -90,7 +111,7 @@ class ClockWindow:
     @cached_property
     def _steps(self) -> list[Floats]:
         """Motion (4, 4) from scan to scan, without a clock."""
-        poses = [placed.pose for placed in self._placed(None, self._config, None)]
+        poses = [placed.pose for placed in self._placed(None, self._whole, None)]
         return [se3.relative(a, b) for a, b in pairwise(poses)]
 
     @property
@@ -103,7 +124,8 @@ class ClockWindow:
         """(S,) how far the points that were kept out lie from the surfaces of the other scans, 0 to 1, of each scan judged."""
         if clock not in self._scores:
             config = self._config.model_copy(update={"recovery": _NO_SEARCH})
-            placed = self._placed(clock, config, self._moving_on())[SKIPPED - 1 :]
+            motion = _KnownSteps([scan.stamp_ns for scan in self.scans], self._steps)
+            placed = self._placed(clock, config, motion)[SKIPPED - 1 :]
             is_judged = self._is_same_motion(placed)
             # Rings on flat ground agree best with themselves where the motion is lost: that is no evidence.
             self._scores[clock] = _distances(placed)[1:] if is_judged else np.full(len(placed) - 1, _LOST)
@@ -128,21 +150,15 @@ class ClockWindow:
             placed.append(_Placed(pose, *both))
         return placed
 
-    def _moving_on(self) -> ConstantVelocity:
-        """Constant velocity through the first scan, that of the first step."""
-        first, second = (scan.stamp_ns for scan in self.scans[:2])
-        motion, back = ConstantVelocity(), se3.inverse(self._steps[0])
-        motion.correct(first - 2 * (second - first), back @ back)
-        motion.correct(first - (second - first), back)
-        return motion
-
     def _is_same_motion(self, placed: list[_Placed]) -> bool:
-        """Whether the scans end where they do without a clock, as far as rotations within their sweeps allow."""
-        expected = reduce(np.matmul, self._steps[SKIPPED - 1 :])[:3, 3]
-        moved = se3.relative(placed[0].pose, placed[-1].pose)[:3, 3]
+        """Whether the scans move as they do without a clock, as far as rotations within their sweeps allow."""
         turn = max(float(so3.angle(step[:3, :3])) for step in self._steps)
-        allowed = _ASTRAY * float(np.linalg.norm(expected)) + _ASTRAY_M + _LEVER_M * turn
-        return float(np.linalg.norm(moved - expected)) <= allowed
+        for a, b, step in zip(placed[:-1], placed[1:], self._steps[SKIPPED - 1 :], strict=True):
+            expected, moved = step[:3, 3], se3.relative(a.pose, b.pose)[:3, 3]
+            allowed = _ASTRAY * float(np.linalg.norm(expected)) + _ASTRAY_M + _LEVER_M * turn
+            if float(np.linalg.norm(moved - expected)) > allowed:
+                return False
+        return True
 
     def _split(self, scan: Scan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Indices of the points for odometry and of those that are kept out, in their order, by chance."""

@@ -58,14 +58,19 @@ def choose_clock(sequence: Sequence, proposal: Proposal, sample: Scan, preproces
     sample : any scan of the recording
     """
     windows: list[ClockWindow] = []
-    choice = None
+    choice, is_moving = None, False
     for window in _moving(sequence, preprocess):
+        is_moving = True
+        if window.is_astray(None) or (not proposal.is_guess and window.is_astray(proposal.clock)):
+            continue
         windows.append(window)
         choice = _judge(windows, proposal, sample)
         if choice.verdict in ("clear", "compensated") or len(windows) == _MOST_WINDOWS:
             return choice
     if choice is not None:
         return choice
+    if is_moving:
+        return ClockChoice(None, "unclear", "point times: the motion of the scans is not clear enough to tell a clock")
     return ClockChoice(
         None, "standing", f"point times: {proposal.clock} may tell them; the sensor does not move enough to decide"
     )
@@ -86,7 +91,10 @@ def _moving(sequence: Sequence, preprocess: PreprocessConfig) -> Iterator[ClockW
 
 
 def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> ClockChoice:
-    """The clock under which the scans of the windows agree best, where that is clear."""
+    """The clock under which the scans of the windows agree best, where that is clear.
+
+    No times, the proposal and its reverse come first among those that are tried.
+    """
     forward = proposal.clock
     backward = replace(forward, is_reversed=True)
     tried: list[SweepClock | None] = [None, forward, backward]
@@ -119,9 +127,9 @@ def _verdict(
     count = sum(len(window.scores(None)) for window in windows)
     margin = f"t = {results[closest].t:.1f} against {closest}, {count} scans"
     is_clear = all(result.is_clear for result in results.values())
-    if not is_guess and (best is None or best.turn):
-        # The clock that is proposed must have been judged before another one, or none, is taken.
-        is_clear &= not any(window.is_astray(clock) for window in windows for clock in tried[:3])
+    # Under a wrong clock the motion may be lost. But what is proposed must have been judged before another, or none, is taken.
+    needed = tried if is_guess else tried[:3] if best != tried[1] else tried[:2]
+    is_clear &= not any(window.is_astray(clock) for window in windows for clock in needed)
     moving = best or next(clock for clock in tried if clock is not None)
     half = replace(moving, seconds=0.5 * moving.seconds)
     if is_clear and compare_clocks(windows, half, best).t > _HALF_T:

@@ -21,6 +21,7 @@ from lslam.errors import InterruptedRunError
 from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import deliver
 from lslam.pipeline.watch import Watch
+from lslam.types.sequence import StatedTimes
 from lslam.warned import MOST_ALIKE, hearing, warnings_so_far
 
 PACKAGE = Path(lslam.__file__).parent
@@ -58,8 +59,7 @@ def _levels_stay() -> Iterator[None]:
 @pytest.mark.parametrize(
     ("changes", "settings"),
     [
-        # Twelve scans, found to be compensated, are stated not to be.
-        ({"motion_compensated": False}, ()),
+        ({"motion_compensated": None, "stated_times": StatedTimes("none")}, ()),
         ({"motion_compensated": False}, ("preprocess.deskew=false",)),
         ({"scans": [*sample(8).scans, "000008.bin: 1001 bytes are not whole points", *sample(3).scans]}, ()),
         ({"problems": ["calibration is not used: calib.txt is empty"]}, ()),
@@ -142,7 +142,7 @@ def test_warnings_of_consecutive_and_concurrent_runs_do_not_mix(tmp_path: Path) 
 def test_a_resumed_run_keeps_its_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, threads: int) -> None:
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     settings = config_of("report.html=false", f"input.threads={threads}")
-    stub = replace(sample(COUNT), motion_compensated=False)
+    stub = replace(sample(COUNT), motion_compensated=None, stated_times=StatedTimes("none"))
     lslam.run(replace(stub, on_read=saying(3, "scan 3 looks odd")), settings, out=tmp_path / "whole")
     assert manifest(tmp_path / "whole")["problems"][1:] == ["scan 3 looks odd"]
 
