@@ -143,16 +143,17 @@ def test_a_resumed_run_keeps_its_warnings(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)
     settings = config_of("report.html=false", f"input.threads={threads}")
     stub = replace(sample(COUNT), motion_compensated=None, stated_times=StatedTimes("none"))
-    lslam.run(replace(stub, on_read=saying(7, "scan 7 looks odd")), settings, out=tmp_path / "whole")
-    assert manifest(tmp_path / "whole")["problems"][1:] == ["scan 7 looks odd"]
+    lslam.run(replace(stub, on_read=saying(3, "scan 3 looks odd")), settings, out=tmp_path / "whole")
+    whole = sorted(manifest(tmp_path / "whole")["problems"])
+    assert whole[1:] == ["scan 3 looks odd"]
 
     out, left = tmp_path / "out", [9]
     watch = Watch(on_step=lambda: left.__setitem__(0, left[0] - 1), should_stop=lambda: left[0] <= 0)
     with pytest.raises(InterruptedRunError):
-        lslam.run(replace(stub, on_read=saying(7, "scan 7 looks odd")), settings, out=out, watch=watch)
+        lslam.run(replace(stub, on_read=saying(3, "scan 3 looks odd")), settings, out=out, watch=watch)
     assert manifest(out)["problems"][0].startswith("interrupted after 9 of 12")
     lslam.run(stub, settings, out=out, resume=True)
-    assert manifest(out)["problems"] == manifest(tmp_path / "whole")["problems"]
+    assert sorted(manifest(out)["problems"]) == whole
 
 
 def test_a_resumed_map_keeps_its_warnings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
