@@ -219,7 +219,8 @@ def _stamps(table: TextTable, columns: tuple[int, ...], default_ns: int | None) 
         if named_ns == 1 and date is None and re.fullmatch(r"[-+]?\d*\.\d*[1-9]\d*", text):
             raise InputError(f"{table.path}, line {row.number}: {text!r} is no whole number of nanoseconds")
         if len(columns) == 2:
-            out[i] += seconds_to_ns(cells[columns[1]], table.path, row.number, part)
+            rest = cells[columns[1]] if columns[1] < len(cells) else ""
+            out[i] += seconds_to_ns(rest, table.path, row.number, part)
     return out
 
 

@@ -86,6 +86,12 @@ def test_one_hertz_is_no_index_and_a_second_column_of_something_else_no_fraction
     assert read_imu_csv(tmp_path / "imu.csv").stamps_ns.tolist() == [k * 500_000_000 for k in range(9)]
 
 
+def test_a_row_without_its_fraction_is_named(tmp_path: Path) -> None:
+    (tmp_path / "stamps.csv").write_text("#sec,nsec\n7,100000000\n7\n8,1\n" + "".join(f"{k},5\n" for k in range(9, 30)))
+    with pytest.raises(InputError, match=r"stamps\.csv, line 3: '' is no time"):
+        read_stamps(tmp_path / "stamps.csv")
+
+
 def test_a_cell_that_is_no_time_is_named(tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text(f"sec,nsec,{IMU}\n1,0,0,0,9.8,0,0,0\n1,later,0,0,9.8,0,0,0\n")
     with pytest.raises(InputError, match=r"imu\.csv, line 3: .*'later'|imu\.csv, line 3: '1,later"):
