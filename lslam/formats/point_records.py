@@ -150,7 +150,7 @@ def name_columns(tables: Sequence[NDArray[Any]]) -> tuple[str, ...]:
     """Names of the columns of arrays (N, K), x y z first, by their values in all of the arrays; `_` for those unknown.
 
     A ring is a small whole number that goes with the elevation; times run through a sweep in the order of the points; the first
-    column of other values that are not negative is the intensity. Of four columns the last is the intensity whatever it holds.
+    column of other values that are not negative is the intensity. Of four columns the last is the intensity where it is neither.
     """
     with np.errstate(all="ignore"):
         return _names([_rows(np.asarray(table, np.float64)) for table in tables], tables[0].shape[1])
@@ -162,10 +162,10 @@ def _names(kept: Sequence[Floats], count: int) -> tuple[str, ...]:
     rings = [k for k in columns if _is_ring(kept, k)]
     for k in columns:
         shades = [c for c in columns if c not in rings and _is_shade(kept, c)]
-        if "time" not in names and all(_is_time(table[:, k]) for table in kept):
+        if k in rings:
+            names.append("_" if "ring" in names else "ring")
+        elif "time" not in names and all(_is_time(table[:, k]) for table in kept):
             names.append("time")
-        elif k in rings and "ring" not in names:
-            names.append("ring")
         elif "intensity" not in names and (k in shades or len(columns) == 1):
             names.append("intensity")
         else:

@@ -181,6 +181,14 @@ def test_ranges_and_flags_are_no_times_and_no_rings() -> None:
     assert name_columns([table]) == ("x", "y", "z", "_", "intensity", "ring")
 
 
+def test_rings_one_after_the_other_are_no_times() -> None:
+    columns = revolution(rings=64)
+    kept = np.argsort(columns["ring"], kind="stable")
+    table = np.column_stack([columns[name][kept] for name in ("x", "y", "z", "intensity", "ring", "time")])
+    assert name_columns([table]) == ("x", "y", "z", "intensity", "ring", "time")
+    assert name_columns([table[:, [0, 1, 2, 3, 4]]]) == ("x", "y", "z", "intensity", "ring")
+
+
 def test_few_points_and_nothing_are_kittis() -> None:
     raw = np.frombuffer(struct.pack("<8f", 1, 2, 3, -5, 4, 5, 6, -7), np.uint8)
     assert recognise([raw]).record == KITTI
