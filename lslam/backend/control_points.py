@@ -130,6 +130,15 @@ def against_odometry(
     return _some(said, "pairs of control points")
 
 
+def as_surveyed_and_seen(
+    points: Many[ControlPoint], results: Many[ScanResult], geoid: str = ""
+) -> tuple[Floats, Floats]:
+    """(N, 3) m, of the points by their survey, east, north, up from the first, and by the results, in their world."""
+    there = _on_earth(points, geoid)
+    stamps = np.array([stamp_of(point.at, results) for point in points])
+    return geodesy.to_local(there, there[0]), _seen(points, stamps, results)
+
+
 def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
     """For the manifest."""
     off = np.stack([one.residual for one in residuals])

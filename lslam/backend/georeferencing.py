@@ -147,6 +147,15 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     )  # fmt: skip
 
 
+def final_fixes(sequence: Sequence, results: Many[ScanResult], config: Config) -> Fixes | None:
+    """The fixes of a recording beside its final poses, whether they were used or not; None where too few are usable."""
+    assert sequence.gnss is not None
+    T_lidar_gnss = sequence.calibration.T_lidar_gnss
+    arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
+    fixes = _usable(sequence.gnss, results, arm, config.gnss, config.graph)
+    return None if isinstance(fixes, str) else fixes
+
+
 def _on_one_clock(
     stream: GnssStream, results: Many[ScanResult], arm: Floats, level: Floats, config: Config
 ) -> tuple[Fixes | str, Faults]:

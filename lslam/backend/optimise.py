@@ -15,19 +15,30 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.control_points import against_odometry, contradicting, control_facts, control_residuals, with_control
-from lslam.backend.georeferencing import Placement, on_earth, place
+from lslam.backend.control_points import (
+    against_odometry,
+    as_surveyed_and_seen,
+    contradicting,
+    control_facts,
+    control_residuals,
+    with_control,
+)
+from lslam.backend.final_checks import fixes_against_points, redundancy, thicker_map
+from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
 from lslam.backend.inputs import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.config import Config
+from lslam.errors import GraphError
 from lslam.geometry import se3
-from lslam.graph.consistency import drift_of
+from lslam.graph.consistency import Drift, drift_of
 from lslam.graph.drift import tilt_factor
 from lslam.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
+from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
+from lslam.types.gnss import Georeference
 from lslam.types.inertial_state import InertialChain
 from lslam.types.manual import ControlPoint
 from lslam.types.scan_result import ScanResult
@@ -79,14 +90,48 @@ def run_back_end(
         moved = replace(graph, poses=out.keyframes)
         out = replace(out, georeference=_by_fixes(sequence, moved, given, out.results).georeference)
     if points and out.georeference is not None:
-        left = control_residuals(points, out.results, out.georeference, config.gnss.geoid)
-        out = replace(out, control=left, facts=out.facts | {"control_points": control_facts(left)})
-        probability = config.graph.probability
-        problems += against_odometry(points, results, keyframes, drift, probability, config.gnss.geoid)
-        problems += contradicting(left, probability)
+        out = _with_residuals(out, out.georeference, sequence, drift, given)
+    out = _compared_with_map(out, graph, given)
+    problems[:] = [problem for problem in problems if problem]
     for problem in problems:
         log.warning("%s", problem)
     return replace(out, problems=problems, facts={"keyframes": len(keyframes)} | out.facts | given.facts)
+
+
+def _with_residuals(
+    out: BackEnd, georeference: Georeference, sequence: Sequence, drift: Drift, given: Given
+) -> BackEnd:
+    """The outcome with what is left of the control points; what contradicts them is one of the problems."""
+    config, points, results = given.config, given.points, given.results
+    geoid, probability = config.gnss.geoid, config.graph.probability
+    left = control_residuals(points, out.results, georeference, geoid)
+    given.problems.extend(against_odometry(points, results, given.store.keyframes, drift, probability, geoid))
+    given.problems.extend(contradicting(left, probability))
+    single, facts = redundancy(*as_surveyed_and_seen(points, results, geoid))
+    if single and config.gnss.mode == "off":
+        log.warning("%s", single)
+    if sequence.gnss is not None and len(sequence.gnss):
+        fixes = final_fixes(sequence, out.results, config)
+        given.problems.append("" if fixes is None else fixes_against_points(fixes, points, georeference))
+    return replace(out, control=left, facts=out.facts | {"control_points": control_facts(left) | facts})
+
+
+def _compared_with_map(out: BackEnd, graph: PoseGraph, given: Given) -> BackEnd:
+    """The outcome, its thickness of planes beside that without fixes and control points, where such hold the poses."""
+    config, place = given.config, out.georeference
+    if place is None or place.method not in ("graph", "control") or out.solution is None:
+        return out
+    without, kept = graph.poses, [c for c in out.candidates if c.is_accepted and c.constraint is not None]
+    if kept and given.points:
+        try:
+            without = optimise(graph, config.graph).poses
+        except (GraphError, np.linalg.LinAlgError) as error:
+            log.debug("the graph without control points: %s", error)
+            return out
+    held_by = "control points" if given.points else "GNSS"
+    said, facts = thicker_map(given.store, without, out.keyframes, held_by)
+    given.problems.append(said)
+    return replace(out, facts=out.facts | facts)
 
 
 def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str, ...] = ("graph",)) -> Placement:
