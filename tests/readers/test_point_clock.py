@@ -55,15 +55,20 @@ def check_sound(sequence: Sequence, indices: range, atol: float = 1e-6) -> None:
         np.testing.assert_allclose(1e-9 * (scan.stamp_ns - START_NS - k * STEP_NS) + scan.times, SECONDS, atol=atol)
 
 
+@pytest.mark.parametrize("padding", [200, 2 * N])
 @pytest.mark.parametrize("first", [0, 5])
-def test_padded_points_have_no_say(tmp_path: Path, first: int) -> None:
+def test_padded_points_have_no_say(tmp_path: Path, first: int, padding: int) -> None:
+    """Nor where they are most of the points."""
+
     def rows(k: int) -> Rows:
         table = sweep("<f8", begin=begin_s(k))
-        return np.concatenate([table, np.zeros(200, table.dtype)]) if k >= first else table
+        return np.concatenate([table, np.zeros(padding, table.dtype)]) if k >= first else table
 
     sequence = recording(tmp_path, rows)
     assert not sequence.problems
-    assert any("11.1% of the points of a scan are no returns" in note for note in sequence.notes), sequence.notes
+    assert any(
+        f"{padding / (N + padding):.1%} of the points of a scan are no returns" in note for note in sequence.notes
+    ), sequence.notes
     for k in range(COUNT):
         scan = sequence.scan(k)
         assert scan.times is not None
