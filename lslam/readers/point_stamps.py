@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
+from lslam.types.scan import is_measured
 
 _UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _SHORTEST_S, _LONGEST_S = 0.005, 2.0  # of a sweep
@@ -40,7 +41,7 @@ def point_stamps(count: int, read: Callable[[int], PointCloud]) -> PointStamps |
             continue
         clock = next((clock for clock in cloud.clocks if clock.values.dtype.itemsize == 8), None)
         if clock is not None and len(cloud):
-            field, times = clock.name, clock.values
+            field, times = clock.name, clock.values[is_measured(cloud.points)]
             unit = unit or _unit_of(times)
             begin = _begin(times, unit) if unit else None
             if begin is not None:
@@ -58,8 +59,9 @@ def step_against(headers: Sequence[tuple[int, PointCloud]], rate_hz: float) -> f
     """By how much, s, absolute times of points step against the headers' stamps, ns, of a few scans; 0 below a period."""
     ahead = []
     for stamp, cloud in headers:
-        unit = "" if cloud.times is None else _unit_of(cloud.times)
-        begin = _begin(cloud.times, unit) if unit and cloud.times is not None else None
+        times = None if cloud.times is None else cloud.times[is_measured(cloud.points)]
+        unit = "" if times is None else _unit_of(times)
+        begin = _begin(times, unit) if unit and times is not None else None
         if begin is not None:
             ahead.append(begin[0] - stamp)
     step = (max(ahead) - min(ahead)) * 1e-9 if ahead else 0.0
