@@ -48,6 +48,8 @@ _LOST = 1.0
 STILL_M, STILL_RAD = 0.03, float(np.deg2rad(0.4))
 # Student's t of paired differences, the share of scans with the same sign and the relative difference of a clear decision.
 _T, _SAME_SIGN, _RELATIVE = 4.0, 0.75, 0.02
+# Likewise of a likely one.
+_LIKELY_T, _LIKELY_SIGN = 2.5, 0.6
 
 
 class ClockComparison(NamedTuple):
@@ -61,6 +63,11 @@ class ClockComparison(NamedTuple):
     def is_clear(self) -> bool:
         """Whether the first clock is better beyond doubt."""
         return self.t >= _T and self.same_sign >= _SAME_SIGN and self.relative >= _RELATIVE
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether the first clock is better, where other evidence speaks for it as well."""
+        return self.t >= _LIKELY_T and self.same_sign >= _LIKELY_SIGN and self.relative >= _RELATIVE
 
 
 class _KnownSteps(ConstantVelocity):

@@ -29,6 +29,8 @@ _TURNS, _FINER = (0.25, 0.5, 0.75), (0.125, 0.0625)
 _NEAR = 0.2
 # A sweep of half the length must not fit better than by so many standard deviations.
 _HALF_T = 2.0
+# Student's t of a clock against its reverse that leaves no doubt that scans are distorted, and in which sense.
+_FORWARD_T = 5.0
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,12 @@ def _verdict(
     closest = min(results, key=lambda name: results[name].t)
     count = sum(len(window.scores(None)) for window in windows)
     margin = f"t = {results[closest].t:.1f} against {closest}, {count} scans"
-    is_clear = all(result.is_clear for result in results.values())
+    # Under the reverse of a clock compensated scans agree as well as under the clock itself. Where it is worse beyond doubt they
+    # are not, and for the rest it is enough that the order of the points speaks for the clock too.
+    if best is not None and best == tried[1] and not is_guess and _is_forward(windows, best, tried[2]):
+        is_clear = all(result.is_likely for result in results.values())
+    else:
+        is_clear = all(result.is_clear for result in results.values())
     # Under a wrong clock the motion may be lost. But what is proposed must have been judged before another, or none, is taken.
     needed = tried if is_guess else tried[:3] if best != tried[1] else tried[:2]
     is_clear &= not any(window.is_astray(clock) for window in windows for clock in needed)
@@ -137,7 +144,8 @@ def _verdict(
     if not is_clear:
         return ClockChoice(
             None, "unclear",
-            f"point times: not clear whether {_name(best)} tells them ({margin}): left without, point_times states them", scores,
+            f"point times: not clear whether {_name(best or tried[1])} tells them ({margin}): left without, point_times states "
+            "them", scores,
         )  # fmt: skip
     if best is None:
         return ClockChoice(
@@ -145,6 +153,14 @@ def _verdict(
             f"point times: none fits, the scans agree best as they are, as motion compensated ones do ({margin})", scores,
         )  # fmt: skip
     return ClockChoice(best, "clear", f"point times: by {best}; clear by the agreement of scans ({margin})", scores)
+
+
+def _is_forward(windows: list[ClockWindow], best: SweepClock, reverse: SweepClock | None) -> bool:
+    """Whether the clock is far better than its reverse, and both were judged."""
+    if any(window.is_astray(reverse) for window in windows):
+        return False
+    result = compare_clocks(windows, best, reverse)
+    return result.is_clear and result.t >= _FORWARD_T
 
 
 def _is_alike(best: SweepClock | None, other: SweepClock | None, sample: Scan) -> bool:
