@@ -15,6 +15,7 @@ from lslam.locks import one_at_a_time
 from lslam.preprocessing.clock_proposals import azimuth_proposal, columns_clock, order_clock, propose_clock
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.readers.clocked import Clocked
+from lslam.readers.merged_lidars import MergedLidars
 from lslam.readers.selection import SequenceView
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence, StatedTimes
@@ -39,7 +40,10 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
         if stated.kind not in (None, "field"):
             raise InputError(f"{sequence.path}: point_times = {stated.kind!r} is of one LiDAR, and several are merged")
         return sequence
-    if stated.kind is None and (sequence.motion_compensated or is_stated_only):
+    is_merged = isinstance(
+        sequence, MergedLidars
+    )  # their points follow one another: no order, and no azimuth of one sensor
+    if stated.kind is None and (sequence.motion_compensated or is_stated_only or is_merged):
         return sequence
     if stated.kind == "none":
         return _with(sequence, ClockChoice(None, "stated", "point times: none, as stated"))

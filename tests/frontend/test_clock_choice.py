@@ -15,6 +15,8 @@ import pytest
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.frontend.point_times import with_point_times
+from lslam.readers.merged_lidars import MergedLidars
+from lslam.readers.selection import SequenceView
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan import Scan
@@ -135,6 +137,9 @@ def test_nothing_is_registered_where_times_are_there_or_are_not_wanted(monkeypat
     assert with_point_times(timed, PREPROCESS) is timed
     compensated = Untimed(motion_compensated=True)
     assert with_point_times(compensated, PREPROCESS) is compensated  # type: ignore[arg-type, comparison-overlap]
+    merged = MergedLidars.__new__(MergedLidars)
+    SequenceView.__init__(merged, Untimed(columns_first))  # type: ignore[arg-type]
+    assert with_point_times(merged, PREPROCESS) is merged
     quick = Untimed()
     assert with_point_times(quick, PREPROCESS, is_stated_only=True) is quick  # type: ignore[arg-type, comparison-overlap]
 
