@@ -137,6 +137,8 @@ def _verdict(
     # Under a wrong clock the motion may be lost. But what is proposed must have been judged before another, or none, is taken.
     needed = tried if is_guess else tried[:3] if best != tried[1] else tried[:2]
     is_clear &= not any(window.is_astray(clock) for window in windows for clock in needed)
+    # The order tells better where a sweep begins than scans that agree a little better with another place near by.
+    is_clear &= is_guess or best is None or not 0 < min(best.turn, 1 - best.turn) < _NEAR
     moving = best or next(clock for clock in tried if clock is not None)
     half = replace(moving, seconds=0.5 * moving.seconds)
     if is_clear and compare_clocks(windows, half, best).t > _HALF_T:
