@@ -23,8 +23,15 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, UsageError, cause
 from lslam.formats.bag_chunks import Topic, unpack, zstd
-from lslam.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, shown, suffix_of
-from lslam.formats.bag_parts import apart
+from lslam.formats.bag_listing import (
+    SUFFIXES,
+    copies_among,
+    left_out,
+    list_bag_files,
+    missing_parts,
+    shown,
+    suffix_of,
+)
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.bag_unpacking import unpacked
 from lslam.formats.mcap_records import McapFile
@@ -60,17 +67,9 @@ class Recording(Protocol):
         ...
 
 
-READERS: dict[str, Callable[[Path, Path], Recording]] = {
-    ".bag": Ros1Bag,
-    ".bag.active": Ros1Bag,
-    ".mcap": McapFile,
-    ".db3": SqliteBag,
-}
-_MAGIC: dict[bytes, Callable[[Path, Path], Recording]] = {
-    b"#ROSBAG": Ros1Bag,
-    b"\x89MCAP0": McapFile,
-    b"SQLite format 3": SqliteBag,
-}
+_Reader = Callable[[Path, Path], Recording]
+READERS: dict[str, _Reader] = {".bag": Ros1Bag, ".bag.active": Ros1Bag, ".mcap": McapFile, ".db3": SqliteBag}
+_MAGIC: dict[bytes, _Reader] = {b"#ROSBAG": Ros1Bag, b"\x89MCAP0": McapFile, b"SQLite format 3": SqliteBag}
 
 
 @dataclass
@@ -130,9 +129,13 @@ class Bag:
         self.path = path
         self.losses = left_out(path, files) + missing_parts(path, files)
         self.notes: list[str] = []
-        recordings, copies = apart(_recordings(files, self.notes, self.losses))
+        every = _recordings(files, self.notes, self.losses)
+        copies = copies_among([recording.topics for recording in every])
+        recordings = [recording for k, recording in enumerate(every) if k not in copies]
         self.losses += [recording.loss for recording in recordings if recording.loss]
-        self.notes += [f"{copy.path.name} is left out: all of it is in {of.path.name} as well" for copy, of in copies]
+        self.notes += [
+            f"{every[k].path.name} is left out: all of it is in {every[n].path.name} as well" for k, n in copies.items()
+        ]
         self.files = [recording.path for recording in recordings]
         topics: dict[tuple[str, str, str], BagTopic] = {}
         for recording in recordings:
@@ -208,8 +211,10 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
         raise failures[0]
     losses += [f"a part of the recording is not read: {failure}" for failure in failures]
     if packed:
-        what = "is compressed as a whole" if len(packed) == 1 else "are compressed as a whole"
-        notes.append(f"{shown(packed)} {what}: unpacked in the user's cache for as long as the recording is read")
+        are = "is" if len(packed) == 1 else "are"
+        notes.append(
+            f"{shown(packed)} {are} compressed as a whole: unpacked in the user's cache for as long as the recording is read"
+        )
     return recordings
 
 
@@ -235,7 +240,7 @@ def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
                 )
 
 
-def _reader(path: Path, there: Path) -> Callable[[Path, Path], Recording]:
+def _reader(path: Path, there: Path) -> _Reader:
     """By the file's first bytes, else by its name."""
     by_name = READERS[suffix_of(path)]
     if isinstance(there, RemotePath):

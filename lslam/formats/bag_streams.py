@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import struct
+from array import array
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,31 +38,25 @@ class Stream:
     recorded_ns: NDArray[np.int64]
 
 
+# What a message says: its stamp, ns, its frame and its numbers; None where it says nothing that can be used.
+_Row = tuple[int, str, Sequence[float]] | None
+
+
 def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
     """Samples (N, 6) of a sensor_msgs/Imu topic: acceleration, m/s2, and angular velocity, rad/s; nothing is converted.
 
     Messages that are damaged are left out, the reasons go to `broken`.
     """
-    stamps: list[int] = []
-    kept: list[int] = []
-    rows: list[bytes] = []
-    frame, order = "", "<"
-    for k, data in bag.numbered(topic, broken):
-        try:
-            header = read_header(topic, data)
-        except InputError as error:
-            broken.append(str(error))
-            continue
+
+    def sample(data: bytes) -> _Row:
+        header = read_header(topic, data)
         at = header.end if topic.encoding == "ros1" else 4 + -(-(header.end - 4) // 8) * 8
         if len(data) < at + _IMU_BYTES:
-            broken.append(f"{bag.path}: a message of {topic.name} has {len(data)} bytes, too few for an Imu")
-            continue
-        frame, order = frame or header.frame, header.order
-        kept.append(k)
-        stamps.append(header.stamp_ns)
-        rows.append(data[at + _ACCEL : at + _ACCEL + 24] + data[at + _GYRO : at + _GYRO + 24])
-    values = np.frombuffer(b"".join(rows), f"{order}f8").reshape(-1, 6).astype(np.float64)
-    return Stream(np.array(stamps, np.int64), values, frame, topic.name, recorded_ns(bag, topic, kept))
+            raise InputError(f"{bag.path}: a message of {topic.name} has {len(data)} bytes, too few for an Imu")
+        accel, gyro = (struct.unpack_from(f"{header.order}3d", data, at + offset) for offset in (_ACCEL, _GYRO))
+        return header.stamp_ns, header.frame, accel + gyro
+
+    return _read(bag, topic, broken, 6, sample)
 
 
 def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
@@ -67,58 +64,51 @@ def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
 
     Without a fix (status below 0, NaN) a message is left out.
     """
-    stamps: list[int] = []
-    kept: list[int] = []
-    rows: list[list[float]] = []
-    frame = ""
-    for k, data in bag.numbered(topic, broken):
-        try:
-            fix = bag.decode(topic, data)
-        except InputError as error:
-            broken.append(str(error))
-            continue
-        position = [float(fix.latitude), float(fix.longitude), float(fix.altitude)]
-        if fix.status.status < 0 or not np.isfinite(position).all():
-            continue
-        frame = frame or fix.header.frame_id.lstrip("/")
-        variance = (float(fix.position_covariance[0]) + float(fix.position_covariance[4])) / 2
-        is_known = fix.position_covariance_type > 0 and variance >= 0
-        kept.append(k)
-        stamps.append(stamp_of(fix))
-        rows.append([*position, float(np.sqrt(variance)) if is_known else np.nan])
-    return Stream(
-        np.array(stamps, np.int64),
-        np.array(rows, np.float64).reshape(-1, 4),
-        frame,
-        topic.name,
-        recorded_ns(bag, topic, kept),
-    )
+
+    def fix(data: bytes) -> _Row:
+        message = bag.decode(topic, data)
+        position = [float(message.latitude), float(message.longitude), float(message.altitude)]
+        if message.status.status < 0 or not np.isfinite(position).all():
+            return None
+        variance = (float(message.position_covariance[0]) + float(message.position_covariance[4])) / 2
+        is_known = message.position_covariance_type > 0 and variance >= 0
+        sigma = float(np.sqrt(variance)) if is_known else np.nan
+        return stamp_of(message), message.header.frame_id.lstrip("/"), [*position, sigma]
+
+    return _read(bag, topic, broken, 4, fix)
 
 
 def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
     """Poses T_world_body (N, 4, 4) of an Odometry or PoseStamped topic; its frame is that of the body."""
-    stamps: list[int] = []
-    kept: list[int] = []
-    rows: list[list[float]] = []
-    body = ""
+
+    def pose(data: bytes) -> _Row:
+        message = bag.decode(topic, data)
+        own = message.pose.pose if hasattr(message.pose, "pose") else message.pose
+        body = getattr(message, "child_frame_id", "").lstrip("/")
+        return stamp_of(message), body, _numbers(topic, own.position, own.orientation)
+
+    stream = _read(bag, topic, broken, 7, pose)
+    return replace(stream, values=_poses(stream.values))
+
+
+def _read(bag: Bag, topic: BagTopic, broken: list[str], width: int, row_of: Callable[[bytes], _Row]) -> Stream:
+    """The rows of `width` numbers that the messages of a topic say."""
+    stamps, messages, values = array("q"), array("q"), array("d")
+    frame = ""
     for k, data in bag.numbered(topic, broken):
         try:
-            message = bag.decode(topic, data)
-            pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-            row = _numbers(topic, pose.position, pose.orientation)
+            row = row_of(data)
         except InputError as error:
             broken.append(str(error))
             continue
-        body = body or getattr(message, "child_frame_id", "").lstrip("/")
-        kept.append(k)
-        stamps.append(stamp_of(message))
-        rows.append(row)
-    return Stream(np.array(stamps, np.int64), _poses(rows), body, topic.name, recorded_ns(bag, topic, kept))
-
-
-def recorded_ns(bag: Bag, topic: BagTopic, messages: list[int]) -> NDArray[np.int64]:
-    """When `messages` (N,) of a topic were recorded, ns."""
-    return np.array(bag.recorded_ns(topic), np.int64)[messages]
+        if row is not None:
+            stamps.append(row[0])
+            messages.append(k)
+            frame = frame or row[1]
+            values.extend(row[2])
+    recorded_ns = topic.stamps_ns[np.array(messages, np.int64)]
+    table = np.array(values, np.float64).reshape(-1, width)
+    return Stream(np.array(stamps, np.int64), table, frame, topic.name, recorded_ns)
 
 
 def is_static(topic: BagTopic) -> bool:
@@ -137,7 +127,7 @@ def read_transforms(bag: Bag, topic: BagTopic, broken: list[str]) -> Transforms:
                 found.setdefault(pair, []).append(row)
         except InputError as error:
             broken.append(str(error))
-    return {pair: _poses(rows) for pair, rows in found.items()}
+    return {pair: _poses(np.array(rows, np.float64)) for pair, rows in found.items()}
 
 
 def read_text(bag: Bag, name: str) -> str | None:
@@ -180,8 +170,7 @@ def _numbers(topic: BagTopic, p: Any, q: Any) -> list[float]:
     return row
 
 
-def _poses(rows: list[list[float]]) -> Floats:
-    table = np.array(rows, np.float64).reshape(-1, 7)
+def _poses(table: Floats) -> Floats:
     length = np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
     # Drivers publish (0, 0, 0, 0) where they do not know a rotation.
     quaternions = np.where(length > 0, table[:, 3:] / np.where(length > 0, length, 1), [0.0, 0.0, 0.0, 1.0])

@@ -19,7 +19,7 @@ from lslam.kernels.cache import cache_folder
 from lslam.remote import RemotePath
 
 CACHE = "bags"
-MAGIC = {
+_MAGIC = {
     b"\x28\xb5\x2f\xfd": "zstd",
     b"\x04\x22\x4d\x18": "lz4",
     b"\x1f\x8b": "gz",
@@ -63,7 +63,7 @@ def _kind(path: Path) -> str:
             head = stream.read(8)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    kind = next((kind for magic, kind in MAGIC.items() if head.startswith(magic)), "")
+    kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
     if not kind and (packing := packing_of(path)):
         fact = f"begins with {head!r}" if head else "has 0 bytes"
         raise InputError(f"{path} is not compressed by {packing} as its name says: it {fact}")

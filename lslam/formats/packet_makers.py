@@ -5,25 +5,8 @@ from __future__ import annotations
 import re
 
 # First bytes of data packets, by the makers' manuals and drivers.
-_FIRST_BYTES = {
-    b"\xee\xff": "Hesai",
-    b"\x55\xaa\x05\x0a": "RoboSense",
-    b"\x55\xaa\x05\x5a": "RoboSense",
-    b"\xa5\xff\x00\x5a": "RoboSense",
-}
-_WORDS = {
-    "Hesai": r"hesai|pandar",
-    "RoboSense": r"rslidar|robosense|\brs_",
-    "Velodyne": r"velodyne",
-    "Ouster": r"ouster",
-    "Livox": r"livox",
-    "Seyond": r"seyond|innovusion",
-    "Cepton": r"cepton",
-    "Blickfeld": r"blickfeld",
-    "SICK": r"sick",
-    "LSLidar": r"lslidar|leishen",
-}
-_PACKETS = re.compile(r"packet|velodynescan|pandarscan|rslidarscan|lslidarscan|udpframe|rawframe", re.IGNORECASE)
+_FIRST_BYTES = {b"\xee\xff": "Hesai", b"\x55\xaa\x05": "RoboSense", b"\xa5\xff\x00\x5a": "RoboSense"}
+_WORDS = {"Hesai": r"hesai|pandar", "RoboSense": r"rslidar|robosense", "Velodyne": "velodyne", "Ouster": "ouster"}
 
 
 def maker_by_bytes(data: bytes, size: int) -> str:
@@ -35,13 +18,13 @@ def maker_by_bytes(data: bytes, size: int) -> str:
 
 def maker_by_name(*names: str) -> str:
     """The maker by the names of a topic and its type; empty where they do not tell."""
-    text = " ".join(names)
-    return next((maker for maker, words in _WORDS.items() if re.search(words, text, re.IGNORECASE)), "")
+    text = " ".join(names).lower()
+    return next((maker for maker, words in _WORDS.items() if re.search(words, text)), "")
 
 
 def is_packets(kind: str) -> bool:
     """Whether messages of this type hold raw packets, by its name."""
-    return _PACKETS.search(kind.rsplit("/", 1)[-1]) is not None
+    return re.search(r"packet|(velodyne|pandar|rslidar)scan|udpframe", kind.rsplit("/", 1)[-1].lower()) is not None
 
 
 def not_decoded(maker: str, where: str = "") -> str:
