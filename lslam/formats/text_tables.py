@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.pose_rows import Row
+from lslam.formats.pose_rows import Row, date_to_ns
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _DATE_AND_TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\S+)")
@@ -33,7 +33,7 @@ class TextTable:
     separator: str | None
 
     def numbers(self, column: int) -> NDArray[np.float64]:
-        """(N,) float64 of a column, NaN for what is no number or not there."""
+        """(N,) float64 of a column, dates in seconds, NaN for what is no number or not there."""
         return np.array([_number(cells[column]) if column < len(cells) else np.nan for cells in self.cells], np.float64)
 
     def values(self, columns: list[int]) -> NDArray[np.float64]:
@@ -105,7 +105,13 @@ def _names_in(comments: list[str], width: int) -> list[str]:
 
 
 def _number(text: str) -> float:
+    """A number, or a date in seconds since 1970; NaN for anything else."""
     try:
         return float(text)
     except ValueError:
+        pass
+    try:
+        date_ns = date_to_ns(text)
+    except ValueError:
         return float("nan")
+    return float("nan") if date_ns is None else date_ns * 1e-9

@@ -163,5 +163,5 @@ def _placed(table: TextTable, scalar: str) -> PoseColumns:
     known = np.isfinite(first).all(axis=1)
     a, b, c = (first[known, k] if first.shape[1] > k else np.zeros(0) for k in range(3))
     rises = len(b) > 1 and bool(np.all(np.diff(b) > 0))
-    is_time = [True, (is_index(a) and rises) or is_fraction(a, b, False), is_index(a) and is_fraction(b, c, False)]
+    is_time = [True, (is_index(a) and rises) or is_fraction(a, b), is_index(a) and is_fraction(b, c)]
     return placed_columns(table.path, table, values, is_time, scalar)
