@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import calendar
 import re
+from collections.abc import Iterator
 from decimal import ROUND_HALF_EVEN, Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.geometry import se3, so3
+from lslam.geometry import so3
+from lslam.types.trajectory import Trajectory
 from lslam.untrusted import decimal_number
 
 Floats = NDArray[np.float64]
@@ -108,16 +110,11 @@ def seconds_text(stamp_ns: int) -> str:
     return f"{'-' if stamp_ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def poses_from_quaternions(t: Floats, q: Floats, rows: list[Row], path: Path) -> Floats:
-    """(N, 4, 4) from positions and quaternions xyzw; InputError with the line of a quaternion far from unit length."""
-    length = np.linalg.norm(q, axis=1)
-    wrong = np.flatnonzero(np.abs(length - 1) > 0.05)
-    if len(wrong):
-        i = int(wrong[0])
-        raise InputError(
-            f"{path}, line {rows[i].number}: quaternion of length {length[i]:.3g}, a rotation has length 1"
-        )
-    return se3.make(so3.from_quaternion(q), t)
+def pose_texts(trajectory: Trajectory, order: str) -> Iterator[list[str]]:
+    """Cells of each pose: the position and the quaternion in the order `xyzw` or `wxyz`."""
+    q = so3.to_quaternion(trajectory.poses[:, :3, :3])[:, ["xyzw".index(axis) for axis in order]]
+    for position, rotation in zip(trajectory.positions.tolist(), q.tolist(), strict=True):
+        yield [*(f"{v:.9f}" for v in position), *(f"{v:.12f}" for v in rotation)]
 
 
 def frame_in(comments: list[str]) -> str | None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.text_tables import TextTable
-from lslam.formats.time_columns import tokens_of
+from lslam.formats.time_columns import is_fraction, is_index, tokens_of
+from lslam.geometry import so3
 
 Floats = NDArray[np.float64]
+Prefix = tuple[str, ...]
 _POSITIONS = ("position", "positions", "pos", "translation", "trans", "point", "p", "t", "xyz")
 _ROTATIONS = ("orientation", "rotation", "quaternion", "quat", "rot", "q")
 # Words before a bare x, y or z that leave it a position.
@@ -25,6 +26,8 @@ _ANGLES = ("roll", "pitch", "yaw", "heading")
 _WAY_OUT = "name the columns t, x, y, z, qx, qy, qz, qw"
 # Share of a table's quaternions that must have length 1, and how far from it they may be.
 _MOST, _UNIT = 0.95, 0.05
+# Where x, y, z and w stand in a quaternion, by the place of w.
+_XYZW = {"last": [0, 1, 2, 3], "first": [1, 2, 3, 0]}
 
 
 @dataclass(frozen=True)
@@ -45,13 +48,14 @@ class PoseColumns:
         return self.position + self.rotation
 
 
-def named_columns(path: Path, names: tuple[str, ...]) -> PoseColumns | None:
+def named_columns(table: TextTable) -> PoseColumns | None:
     """The columns by their names; None when none of them is a position.
 
     Raises InputError when an axis is missing, or when several bodies have positions.
     """
-    positions: dict[tuple[str, ...], dict[str, int]] = {}
-    rotations: dict[tuple[str, ...], dict[str, int]] = {}
+    path, names = table.path, table.names
+    positions: dict[Prefix, dict[str, int]] = {}
+    rotations: dict[Prefix, dict[str, int]] = {}
     for k, name in enumerate(names):
         kind = _kind(tokens_of(name))
         if kind is not None:
@@ -59,8 +63,17 @@ def named_columns(path: Path, names: tuple[str, ...]) -> PoseColumns | None:
             (rotations if is_rotation else positions).setdefault(prefix, {}).setdefault(axis, k)
     if not positions:
         return None
-    prefix, others = _body(path, names, {p: axes for p, axes in positions.items() if len(axes) == 3} or positions)
-    position = positions[prefix]
+    bodies = {prefix: axes for prefix, axes in positions.items() if len(axes) == 3} or positions
+    # A body without a name goes first.
+    prefix = () if () in bodies else next(iter(bodies))
+    position = bodies.pop(prefix)
+    others = [", ".join(names[k] for k in axes.values()) for axes in bodies.values()]
+    chosen = ", ".join(names[k] for k in position.values())
+    if others and prefix != ():
+        raise InputError(
+            f"{path} has positions of {len(bodies) + 1} bodies: {chosen}; {'; '.join(others[:3])}: keep the columns of "
+            f"one, or {_WAY_OUT}"
+        )
     if len(rotations) > 1 and prefix not in rotations:
         raise InputError(f"{path} has rotations of {len(rotations)} bodies beside one position: {_WAY_OUT}")
     rotation = rotations.get(prefix, next(iter(rotations.values()), {}))
@@ -68,7 +81,7 @@ def named_columns(path: Path, names: tuple[str, ...]) -> PoseColumns | None:
     missing += [f"q{axis}" for axis in "xyzw" if rotation and axis not in rotation]
     if missing:
         raise InputError(f"{path}: no column for {', '.join(missing)} in the header {', '.join(names)}; {_WAY_OUT}")
-    notes = [f"the position is {_shown(names, position)}; left out: {', '.join(others)}"] if others else []
+    notes = [f"the position is {chosen}; left out: {', '.join(others)}"] if others else []
     angles = [name for name in names if not rotation and {*tokens_of(name)} & {*_ANGLES}]
     if angles:
         notes.append(f"left out: {', '.join(angles)}; rotations are read as quaternions (qx, qy, qz, qw)")
@@ -79,25 +92,7 @@ def named_columns(path: Path, names: tuple[str, ...]) -> PoseColumns | None:
     )
 
 
-def _body(
-    path: Path, names: tuple[str, ...], bodies: dict[tuple[str, ...], dict[str, int]]
-) -> tuple[tuple[str, ...], list[str]]:
-    """The prefix of the one body, and the columns of the others; a body without a name goes first."""
-    prefix = () if () in bodies else next(iter(bodies))
-    others = [_shown(names, axes) for key, axes in bodies.items() if key != prefix]
-    if others and prefix != ():
-        raise InputError(
-            f"{path} has positions of {len(bodies)} bodies: {_shown(names, bodies[prefix])}; {'; '.join(others[:3])}: keep "
-            f"the columns of one, or {_WAY_OUT}"
-        )
-    return prefix, others
-
-
-def _shown(names: tuple[str, ...], axes: dict[str, int]) -> str:
-    return ", ".join(names[k] for k in axes.values())
-
-
-def _kind(words: list[str]) -> tuple[bool, tuple[str, ...], str] | None:
+def _kind(words: list[str]) -> tuple[bool, Prefix, str] | None:
     """Whether a name is of a rotation or else of a position, the words before, and the axis; None when it is of neither.
 
     `field.pose.pose.position.x`, `p_RS_R_x [m]`, `q_RS_w []`, `pose.orientation.w`, `tx`, `qw`, `gt_x`, `easting`.
@@ -106,62 +101,74 @@ def _kind(words: list[str]) -> tuple[bool, tuple[str, ...], str] | None:
         words = words[:-1]
     if not words:
         return None
-    last, before = words[-1], words[:-1]
-    if before[:2] in (["p", "rs"], ["q", "rs"]) and last in "xyzw":  # EuRoC
-        return before[0] == "q", (), last
-    if len(last) > 1 and last[-1] in "xyzw":
+    *before, last = words
+    if last in _EARTH:
+        # A body of its own: beside x, y, z a column `n` is a count.
+        return False, (*before, "on Earth"), _EARTH[last]
+    if len(last) > 1:
         before, last = [*before, last[:-1]], last[-1]
-    if len(last) == 1 and last in "xyzw":
-        if before and before[-1] in _ROTATIONS:
-            return True, tuple(before[:-1]), last
-        if last != "w" and before and before[-1] in _POSITIONS:
-            return False, tuple(before[:-1]), last
-        return (False, tuple(before), last) if last != "w" and _BODIES.issuperset(before) else None
-    # A body of its own: beside x, y, z a column `n` is a count.
-    return (False, (*words[:-1], "on Earth"), _EARTH[words[-1]]) if words[-1] in _EARTH else None
+    if last not in "xyzw":
+        return None
+    if before[:2] in (["p", "rs"], ["q", "rs"]):  # EuRoC
+        return before[0] == "q", (), last
+    if before and before[-1] in _ROTATIONS:
+        return True, tuple(before[:-1]), last
+    if last == "w":
+        return None
+    if before and before[-1] in _POSITIONS:
+        return False, tuple(before[:-1]), last
+    return (False, tuple(before), last) if _BODIES.issuperset(before) else None
 
 
-def placed_columns(path: Path, table: TextTable, values: Floats, is_time: list[bool], scalar: str) -> PoseColumns:
-    """The columns of a table (N, K) without names: times, a position and, if there is one, a quaternion.
+def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
+    """The columns of a table without names: times, a position and, if there is one, a quaternion.
 
-    is_time : whether the first one, two or three columns may be the time; scalar : place of the quaternion's w, `first` or
-        `last`, or empty where nothing says it
+    scalar : place of the quaternion's w, `first` or `last`, or empty where nothing says it
     Raises InputError when no layout fits, or several do.
     """
+    values = np.stack([table.numbers(k) for k in range(len(table.cells[0]))], axis=1)
     width = values.shape[1]
-    line = f"{path}, line {table.rows[0].number}"
-    fits = [n for n in (1, 2, 3) if is_time[n - 1] and width >= n + 7 and _are_unit(values[:, n + 3 : n + 7])]
+    line = f"{table.path}, line {table.rows[0].number}"
+    leading = _leading_times(values)
+    fits = [n for n in leading if width >= n + 7 and _are_unit(values[:, n + 3 : n + 7])]
     if len(fits) > 1:
         raise InputError(f"{line}: {width} columns may be read in {len(fits)} ways: {_WAY_OUT} in a first line")
-    if not fits and width == 8:
-        fits = [1]
-    if not fits:
-        places = [n for n in (1, 2, 3) if is_time[n - 1] and width == n + 3]
-        if not places:
-            raise InputError(
-                f"{line}: {width} columns are no trajectory format lslam knows (12 or 16 numbers: KITTI; 8: TUM; 4: time and "
-                f"position; commas: EuRoC or named columns); {_WAY_OUT} in a first line, or --format forces a format"
-            )
-        n = places[0]
-        return PoseColumns((n, n + 1, n + 2), leading=n)
-    n = fits[0]
-    q = values[:, n + 3 : n + 7]
-    order = _scalar_by_motion(values[:, n : n + 3], q) if table.separator is not None or not scalar else ""
-    notes = []
-    if order and scalar and order != scalar:
-        notes.append(
-            f"quaternions are read with w {order}, which fits the motion; --format euroc or tum decides otherwise"
+    if not fits and width - 3 in leading:
+        return PoseColumns((width - 3, width - 2, width - 1), leading=width - 3)
+    if not fits and width != 8:
+        raise InputError(
+            f"{line}: {width} columns are no trajectory format lslam knows (12 or 16 numbers: KITTI; 8: TUM; 4: time and "
+            f"position; commas: EuRoC or named columns); {_WAY_OUT} in a first line, or --format forces a format"
         )
-    if not (order or scalar):
+    n = fits[0] if fits else 1
+    order = scalar
+    if table.separator is not None or not scalar:
+        order = _scalar_by_motion(values[:, n : n + 3], values[:, n + 3 : n + 7]) or scalar
+    if not order:
         raise InputError(
             f"{line}: a table without a header: {_WAY_OUT} (t,x,y,z,qx,qy,qz,qw), or use --format euroc for integer "
             "nanoseconds"
         )
+    notes = []
+    if scalar and order != scalar:
+        notes.append(
+            f"quaternions are read with w {order}, which fits the motion; --format euroc or tum decides otherwise"
+        )
     if width > n + 7:
         notes.append(f"{width} columns, of which those from column {n + 8} on are left out")
-    first = (order or scalar) == "first"
-    rotation = tuple(n + 3 + k for k in ((1, 2, 3, 0) if first else (0, 1, 2, 3)))
+    rotation = tuple(n + 3 + k for k in _XYZW[order])
     return PoseColumns((n, n + 1, n + 2), rotation, n, tuple(notes))
+
+
+def _leading_times(values: Floats) -> list[int]:
+    """How many of the first columns of a table (N, K) may be the time: one, two or three."""
+    if values.shape[1] < 4:
+        return []
+    a, b, c = values[np.isfinite(values[:, :3]).all(axis=1), :3].T
+    is_numbered = is_index(a)
+    rises = len(b) > 1 and bool(np.all(np.diff(b) > 0))
+    may_be = [True, (is_numbered and rises) or is_fraction(a, b), is_numbered and is_fraction(b, c)]
+    return [n for n, is_time in enumerate(may_be, start=1) if is_time]
 
 
 def _are_unit(q: Floats) -> bool:
@@ -174,17 +181,14 @@ def _are_unit(q: Floats) -> bool:
 
 def _scalar_by_motion(positions: Floats, q: Floats) -> str:
     """`first` or `last`, where w stands by the motion: a vehicle keeps to one direction of its body; empty when unclear."""
-    from lslam.geometry import so3
-
     good = np.isfinite(q).all(axis=1) & np.isfinite(positions).all(axis=1)
-    p, q = positions[good], q[good]
-    steps = np.diff(p, axis=0)
-    length = np.linalg.norm(steps, axis=1)
-    if length.sum() < 1.0 or not np.abs(np.linalg.norm(q, axis=1) - 1).max(initial=0.0) < _UNIT:
+    q, steps = q[good], np.diff(positions[good], axis=0)
+    path_m = np.linalg.norm(steps, axis=1).sum()
+    if path_m < 1.0 or not np.abs(np.linalg.norm(q, axis=1) - 1).max(initial=0.0) < _UNIT:
         return ""
     kept = {}
-    for place, columns in (("last", [0, 1, 2, 3]), ("first", [1, 2, 3, 0])):
+    for place, columns in _XYZW.items():
         R = so3.from_quaternion(q[:-1][:, columns])
-        kept[place] = float(np.linalg.norm(np.einsum("nji,nj->ni", R, steps).sum(axis=0)) / length.sum())
-    best, other = sorted(kept, key=lambda place: -kept[place])
+        kept[place] = float(np.linalg.norm(np.einsum("nji,nj->ni", R, steps).sum(axis=0)) / path_m)
+    other, best = sorted(kept, key=kept.__getitem__)
     return best if kept[best] > 0.9 and kept[other] < kept[best] - 0.1 else ""

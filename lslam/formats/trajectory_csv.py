@@ -10,17 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.pose_rows import (
-    Row,
-    check_finite,
-    check_increasing,
-    frame_in,
-    poses_from_quaternions,
-    write_lines,
-)
-from lslam.formats.text_tables import TextTable, looks_like_header, text_table
-from lslam.formats.time_columns import find_clock, is_fraction, is_index
-from lslam.formats.trajectory_columns import PoseColumns, named_columns, placed_columns
+from lslam.formats.pose_rows import Row, check_finite, check_increasing, frame_in, pose_texts, write_lines
+from lslam.formats.text_tables import looks_like_header, text_table
+from lslam.formats.time_columns import find_clock
+from lslam.formats.trajectory_columns import named_columns, placed_columns
 from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 
@@ -60,9 +53,8 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
         "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
         f"# frame: {trajectory.frame}",
     ]
-    q = np.roll(so3.to_quaternion(trajectory.poses[:, :3, :3]), 1, axis=-1)
-    for stamp, p, r in zip(trajectory.stamps_ns.tolist(), trajectory.positions.tolist(), q.tolist(), strict=True):
-        lines.append(",".join([str(stamp), *(f"{v:.9f}" for v in p), *(f"{v:.12f}" for v in r)]))
+    for stamp, pose in zip(trajectory.stamps_ns.tolist(), pose_texts(trajectory, "wxyz"), strict=True):
+        lines.append(",".join([str(stamp), *pose]))
     write_lines(path, lines)
 
 
@@ -83,17 +75,19 @@ def parse(
     table = text_table(path, rows, comments)
     if not table.rows:
         raise InputError(f"{path} has a header but no poses")
-    columns = named_columns(path, table.names) if table.names else None
-    if columns is None and looks_like_header(rows[0].text):
-        raise InputError(
-            f"{path}: no column for x, y, z in the header {', '.join(table.names)}; "
-            "name the columns t, x, y, z, qx, qy, qz, qw"
-        )
+    columns = named_columns(table) if table.names else None
     if columns is None:
+        if looks_like_header(rows[0].text):
+            raise InputError(
+                f"{path}: no column for x, y, z in the header {', '.join(table.names)}; "
+                "name the columns t, x, y, z, qx, qy, qz, qw"
+            )
         table = replace(table, names=())
-    _check_widths(table)
-    if columns is None:
-        columns = _placed(table, scalar)
+    width = len(table.names) or len(table.cells[0])
+    for row, cells in zip(table.rows, table.cells, strict=True):
+        if len(cells) < width or (table.separator is None and len(cells) != width):
+            raise InputError(f"{path}, line {row.number}: {len(cells)} columns, {width} expected")
+    columns = columns or placed_columns(table, scalar)
     values = table.values(list(columns.all))
     lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
     if lost.all():
@@ -126,42 +120,26 @@ def poses_of(values: Floats, rows: list[Row], path: Path) -> tuple[Floats, bool,
     """Poses (N, 4, 4) of positions (N, 3) or positions and quaternions xyzw (N, 7), whether their rotations are any, and notes.
 
     Quaternions of zeros everywhere are none, nor is one axis or identity everywhere along a path that bends: tools write
-    those for positions alone.
+    those for positions alone. Raises InputError with the line of a quaternion far from unit length.
     """
     p, q = values[:, :3], values[:, 3:]
+    alone = se3.make(np.eye(3), p)
     if q.shape[1] == 0:
-        return se3.make(np.eye(3), p), False, []
+        return alone, False, []
     if not q.any():
-        return se3.make(np.eye(3), p), False, ["all quaternions are zero: positions alone"]
-    poses = poses_from_quaternions(p, q, rows, path)
-    is_constant = len(q) > 2 and bool((q == q[0]).all()) and np.count_nonzero(q[0]) == 1
-    if is_constant and _bends(p):
-        return (
-            se3.make(np.eye(3), p),
-            False,
-            ["the quaternion is the same everywhere on a path that bends: positions alone"],
+        return alone, False, ["all quaternions are zero: positions alone"]
+    length = np.linalg.norm(q, axis=1)
+    wrong = np.flatnonzero(np.abs(length - 1) > 0.05)
+    if len(wrong):
+        i = int(wrong[0])
+        raise InputError(
+            f"{path}, line {rows[i].number}: quaternion of length {length[i]:.3g}, a rotation has length 1"
         )
-    return poses, True, []
+    if len(q) > 2 and (q == q[0]).all() and np.count_nonzero(q[0]) == 1 and _bends(p):
+        return alone, False, ["the quaternion is the same everywhere on a path that bends: positions alone"]
+    return se3.make(so3.from_quaternion(q), p), True, []
 
 
 def _bends(positions: Floats) -> bool:
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
     return bool(spread[1] > BENT * spread[0] and spread[1] > BENT * np.sqrt(len(positions)))
-
-
-def _check_widths(table: TextTable) -> None:
-    width = len(table.names) or len(table.cells[0])
-    for row, cells in zip(table.rows, table.cells, strict=True):
-        if len(cells) < width or (table.separator is None and len(cells) != width):
-            raise InputError(f"{table.path}, line {row.number}: {len(cells)} columns, {width} expected")
-
-
-def _placed(table: TextTable, scalar: str) -> PoseColumns:
-    """The columns of a table without names."""
-    values = np.stack([table.numbers(k) for k in range(len(table.cells[0]))], axis=1)
-    first = values[:, :3]
-    known = np.isfinite(first).all(axis=1)
-    a, b, c = (first[known, k] if first.shape[1] > k else np.zeros(0) for k in range(3))
-    rises = len(b) > 1 and bool(np.all(np.diff(b) > 0))
-    is_time = [True, (is_index(a) and rises) or is_fraction(a, b), is_index(a) and is_fraction(b, c)]
-    return placed_columns(table.path, table, values, is_time, scalar)

@@ -11,13 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import trajectory_csv
-from lslam.formats.pose_rows import (
-    Row,
-    check_increasing,
-    numbers,
-    seconds_text,
-    write_lines,
-)
+from lslam.formats.pose_rows import Row, check_increasing, numbers, pose_texts, seconds_text, write_lines
 from lslam.formats.stamp_files import read_times
 from lslam.formats.text_tables import TextTable
 from lslam.formats.time_columns import find_clock
@@ -130,10 +124,8 @@ def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> No
     """Write a TUM file, atomically: stamps with 9 decimals, xyzw, the frame in a comment; `comment` may have lines."""
     lines = ["# stamp_s tx ty tz qx qy qz qw", f"# frame: {trajectory.frame}"]
     lines += [f"# {line}" for line in comment.splitlines()]
-    q = so3.to_quaternion(trajectory.poses[:, :3, :3])
-    for stamp, p, r in zip(trajectory.stamps_ns.tolist(), trajectory.positions.tolist(), q.tolist(), strict=True):
-        pose = " ".join([*(f"{v:.9f}" for v in p), *(f"{v:.12f}" for v in r)])
-        lines.append(f"{seconds_text(stamp)} {pose}")
+    for stamp, pose in zip(trajectory.stamps_ns.tolist(), pose_texts(trajectory, "xyzw"), strict=True):
+        lines.append(" ".join([seconds_text(stamp), *pose]))
     write_lines(path, lines)
 
 
