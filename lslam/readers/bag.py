@@ -18,7 +18,7 @@ from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
-from lslam.readers.bag_clocks import points_off, stamps_by_points
+from lslam.readers.bag_clocks import points_off, stamps_by_points, step_against
 from lslam.readers.bag_halves import Halves, read_whole
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
 from lslam.readers.bag_links import Links, places_of
@@ -37,7 +37,6 @@ from lslam.readers.listing import measured_rate
 from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_clock import PointClock, open_clock, read_samples
-from lslam.readers.point_stamps import step_against
 from lslam.readers.point_times import Sample, TimeRule
 from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.sidecars import compensation_note, stated_times
@@ -240,7 +239,9 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
             uses=dict(opened.uses),
         )
     settle_unit(sequence)
-    by_points = stamps_by_points(bag, index.topic, index.messages, index.stamps_ns, lambda k: sequence.cloud(k)[0])
+    by_points = stamps_by_points(
+        bag, index.topic, index.messages, index.stamps_ns, sequence.rate_hz, lambda k: sequence.cloud(k)[0]
+    )
     if by_points is not None:
         sequence.headers_ns = sequence.stamps_ns = by_points.stamps_ns
         voice.notes.extend(by_points.notes)
@@ -285,8 +286,7 @@ def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
                 f"the points of {sequence.topic.name} have no times (looked for {', '.join(TIME_NAMES[:4])} and the like)"
             )
         return
-    stamps_and_clouds = [(sample.stamp_ns, sample.cloud) for sample in samples.values()]
-    step = step_against(stamps_and_clouds, sequence.rate_hz) if sequence.clock.rule.is_absolute else 0.0
+    step = step_against(sequence.clock, samples.values())
     if step:
         sequence.problems.append(
             f"the absolute times of the points step by {step:.3f} s against the stamps of the headers: the headers count"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,19 @@ from lslam.readers.bag_topics import HEADER
 from lslam.readers.clocks import OneClock
 from lslam.readers.point_clock import PointClock
 from lslam.readers.point_stamps import point_stamps
+from lslam.readers.point_times import Sample
 
 Stamps = NDArray[np.int64]
 _OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 
 
 def stamps_by_points(
-    bag: Bag, topic: BagTopic, messages: Stamps, recorded: Stamps, cloud: Callable[[int], PointCloud]
+    bag: Bag,
+    topic: BagTopic,
+    messages: Stamps,
+    recorded: Stamps,
+    rate_hz: float,
+    cloud: Callable[[int], PointCloud],
 ) -> OneClock | None:
     """Stamps (N,) by the absolute times of the points, better than the times of recording where the headers stand still.
 
@@ -28,7 +34,7 @@ def stamps_by_points(
     ends = (int(messages[0]), int(messages[-1]))
     if len(messages) < 2 or len({read_header(topic, bag.message(topic, k, HEADER)).stamp_ns for k in ends}) > 1:
         return None
-    points = point_stamps(len(messages), cloud)
+    points = point_stamps(len(messages), cloud, rate_hz)
     if points is None:
         return None
     # A clock of another epoch is brought onto that of the recording, by the scan that was recorded with the least delay.
@@ -37,6 +43,16 @@ def stamps_by_points(
     how = f", {-ahead * 1e-9:+.3f} s to the clock of the recording" if is_other else ""
     note = f"scan stamps from the absolute times of the points, field {points.field!r}{how}"
     return OneClock(points.stamps_ns - (ahead if is_other else 0), notes=(note,))
+
+
+def step_against(clock: PointClock, samples: Iterable[Sample]) -> float:
+    """By how much, s, absolute times of points step against the headers of a few scans; 0 below a period."""
+    if not clock.rule.is_absolute:
+        return 0.0
+    begins = [(clock.begin_ns(sample.cloud), sample.stamp_ns) for sample in samples]
+    ahead = [begin - stamp for begin, stamp in begins if begin is not None]
+    step_s = (max(ahead) - min(ahead)) * 1e-9 if ahead else 0.0
+    return step_s if step_s > 1 / clock.rate_hz else 0.0
 
 
 def points_off(

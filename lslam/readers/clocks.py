@@ -7,7 +7,6 @@ a driver repeats its own start, or is two clocks in turns. The times of recordin
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -103,10 +102,8 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
         return OneClock(headers, notes=tuple(notes))
     repaired = steps.copy()
     repaired[edges] = _intervals(steps[edges] - sizes if is_real_time else np.zeros(len(edges)), steps, period)
-    offset = h - np.concatenate(
-        [[h[0]], h[0] + np.cumsum(repaired)]
-    )  # of the clock at each message from that at the first
-    offset = _offsets(offset, h - w, limit)
+    since_first = np.concatenate([[0], np.cumsum(repaired)])
+    offset = _offsets(h - h[0] - since_first, h - w, limit)
     stamps = headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
     first = int(edges[0])
     places = f" and at {len(edges) - 1} more" if len(edges) > 1 else ""
@@ -219,29 +216,23 @@ def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
     increases was recorded with so little delay.
     """
     ahead = h - w
-    runs = np.cumsum(np.concatenate([[0], np.diff(h) <= 0]))
-    highest_before, highest_after = _running_max(ahead, runs), _running_max(ahead[::-1], runs[::-1])[::-1]
+    backward = np.flatnonzero(np.diff(h) <= 0)
     bounds = np.concatenate([[-1], edges, [len(h) - 1]])
     sizes = np.zeros(len(edges), np.int64)
     for i, k in enumerate(edges.tolist()):
-        before = int(ahead[max(int(bounds[i]) + 1, k + 1 - _LEVEL_SAMPLES) : k + 1].max())
-        after = int(ahead[k + 1 : min(int(bounds[i + 2]), k + _LEVEL_SAMPLES) + 1].max())
-        if h[k + 1] <= h[k]:
-            is_step = abs(after - before) > limit
-        elif after > before:
-            is_step = after > highest_before[k] + limit
+        before = int(ahead[max(bounds[i] + 1, k + 1 - _LEVEL_SAMPLES) : k + 1].max())
+        after = int(ahead[k + 1 : min(bounds[i + 2], k + _LEVEL_SAMPLES) + 1].max())
+        step = after - before
+        if h[k + 1] > h[k]:
+            at = int(np.searchsorted(backward, k))
+            begin = backward[at - 1] + 1 if at else 0
+            end = backward[at] + 1 if at < len(backward) else len(h)
+            stretch = ahead[begin : k + 1] if step > 0 else ahead[k + 1 : end]
+            is_step = max(before, after) > stretch.max() + limit
         else:
-            is_step = before > highest_after[k + 1] + limit
-        sizes[i] = after - before if is_step else 0
+            is_step = abs(step) > limit
+        sizes[i] = step if is_step else 0
     return sizes
-
-
-def _running_max(values: Stamps, runs: Stamps) -> Stamps:
-    """Largest value so far within each run of equal `runs`."""
-    out = np.empty_like(values)
-    for begin, end in pairwise([0, *_starts(runs).tolist(), len(runs)]):
-        out[begin:end] = np.maximum.accumulate(values[begin:end])
-    return out
 
 
 def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
@@ -256,19 +247,12 @@ def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
 def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:
     """Offsets of all messages, ns: one for each clock, 0 for the one nearest to the witness that tells enough messages."""
     order = np.argsort(offset, kind="stable")
-    group = np.empty(len(offset), np.int64)
-    group[order] = np.cumsum(np.concatenate([[0], np.diff(offset[order]) > 0.5 * limit]))
-    levels = np.array([int(np.sort(part)[len(part) // 2]) for part in np.split(offset[order], _starts(group[order]))])
-    highest = np.full(len(levels), np.iinfo(np.int64).min)
-    np.maximum.at(highest, group, ahead)
-    distance = np.abs(highest.astype(np.float64))
-    is_candidate = np.bincount(group) >= max(_MIN_SHARE * len(offset), 2)
-    if is_candidate.any():
-        distance[~is_candidate] = np.inf
-    moved: Stamps = levels[group] - levels[int(np.argmin(distance))]
+    clocks = np.split(order, np.flatnonzero(np.diff(offset[order]) > 0.5 * limit) + 1)
+    levels = offset[[int(clock[len(clock) // 2]) for clock in clocks]]
+    enough = max(_MIN_SHARE * len(offset), 2)
+    candidates = [k for k, clock in enumerate(clocks) if len(clock) >= enough] or range(len(clocks))
+    nearest = min(candidates, key=lambda k: abs(int(ahead[clocks[k]].max())))
+    moved = np.empty_like(offset)
+    for clock, level in zip(clocks, levels - levels[nearest], strict=True):
+        moved[clock] = level
     return moved
-
-
-def _starts(values: Stamps) -> Stamps:
-    """Where another value begins."""
-    return np.flatnonzero(np.diff(values)) + 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +26,8 @@ _STEP_SHARE = 0.05
 _FIRST, _ENOUGH = 3, 5000
 # A part of the sweep begins and ends once in each ring at most: more changes per point are no order of measuring.
 _OFTEN = 0.02
+# Absolute times that lie farther from the stamp are of another clock.
+_OTHER_CLOCK_NS = 10**9
 
 
 class TimedCloud(NamedTuple):
@@ -54,6 +56,17 @@ class PointClock:
 
         Points that were measured and whose time cannot be right are left out. Others stay: no method looks at them.
         """
+        timed = self._timed(cloud, stamp_ns)
+        # Another clock or only nominal stamps: the sequence's own stamps stay.
+        is_other = self.rule.is_absolute and abs(timed.shift_ns) >= _OTHER_CLOCK_NS
+        return timed._replace(shift_ns=0) if is_other else timed
+
+    def begin_ns(self, cloud: PointCloud) -> int | None:
+        """When the first point was measured, by absolute times; None for a scan that breaks the rule."""
+        times, begin = replace(self, is_of_one_scan=True)._timed(cloud, 0)[1:3]
+        return None if times is None or not len(times) else begin
+
+    def _timed(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
         rule = self.rule
         if not len(cloud):
             return TimedCloud(cloud, np.zeros(0, np.float32), 0)  # an empty scan is no scan of a sensor without times
@@ -75,7 +88,7 @@ class PointClock:
         rule, width = self.rule, _WIDER * self.rule.sweep
         usable = is_usable(cloud, values)
         values, over = _unwrapped(values, usable, width)
-        good = _densest(values, usable, width)
+        good = densest(values, usable, width)
         step = _step(values, usable, good, width)
         if step is not None:
             values, good = step
@@ -167,19 +180,11 @@ def _unwrapped(values: NDArray[Any], usable: NDArray[np.bool_], width: float) ->
     if values.dtype.itemsize > 4 or not usable.any():
         return plain, 0
     full = 1 << (8 * values.dtype.itemsize)
-    first = densest(plain[usable], width)[0]
+    first = plain[densest(plain, usable, width)].min()
     beyond = np.asarray((plain - first + full // 2) % full - full // 2 + first)
     # What is no nearer after it did not run over.
     beyond = np.where(np.abs(beyond - first) <= width, beyond, plain)
     return beyond, int(np.count_nonzero((beyond != plain) & usable))
-
-
-def _densest(values: NDArray[Any], among: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
-    """(N,) those of the values `among` that lie within the stretch of `width` that holds most of them."""
-    if not among.any():
-        return among
-    low, high = densest(values[among], width)
-    return np.asarray(among & (values >= low) & (values <= high))
 
 
 def _step(
@@ -189,7 +194,7 @@ def _step(
 
     good : the larger part. The part that begins in the order of the points comes first.
     """
-    rest = _densest(values, usable & ~good, width)
+    rest = densest(values, usable & ~good, width)
     if np.count_nonzero(rest) <= _STEP_SHARE * np.count_nonzero(usable):
         return None
     both = good | rest

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
-from lslam.types.scan import is_measured
+from lslam.readers.listing import DEFAULT_RATE_HZ
+from lslam.readers.point_clock import PointClock, read_samples
+from lslam.readers.point_times import Sample, learn_rule
 
-_UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_SHORTEST_S, _LONGEST_S = 0.005, 2.0  # of a sweep
-_AROUND_S = 2.0  # times of points that lie farther from their median are wrong
-_LOOKED_AT = 4  # scans that show whether it is a clock at all
+_SLOW_HZ = 1.0  # tried where no rate is stated and no sweep is as short as usual
 
 
 class PointStamps(NamedTuple):
@@ -26,90 +26,43 @@ class PointStamps(NamedTuple):
     field: str
 
 
-def point_stamps(count: int, read: Callable[[int], PointCloud]) -> PointStamps | None:
+def point_stamps(count: int, read: Callable[[int], PointCloud], rate_hz: float | None) -> PointStamps | None:
     """Begin of every scan by its points' own clock; None when their times are no clock's readings or do not increase.
 
     A scan whose points tell nothing gets its stamp from those beside it. All scans are read where the first few have a clock.
     """
-    unit = ""
-    begins: dict[int, tuple[int, float]] = {}
-    field = ""
+    clock = _clock(count, read, rate_hz)
+    if clock is None:
+        return None
+    begins: dict[int, int] = {}
     for index in range(count):
-        try:
-            cloud = read(index)
-        except InputError:
-            continue
-        clock = next((clock for clock in cloud.clocks if clock.values.dtype.itemsize == 8), None)
-        if clock is not None and len(cloud):
-            field, times = clock.name, clock.values[is_measured(cloud.points)]
-            unit = unit or _unit_of(times)
-            begin = _begin(times, unit) if unit else None
+        with suppress(InputError):
+            begin = clock.begin_ns(read(index))
             if begin is not None:
                 begins[index] = begin
-        if index + 1 == _LOOKED_AT and not _is_clock(begins):
-            return None
-    if not _is_clock(begins) or 2 * len(begins) < count:
+    sweep_ns = clock.rule.sweep * clock.rule.ns_per_unit
+    at, stamps = np.array(list(begins), np.int64), np.array(list(begins.values()), np.int64)
+    if not len(at) or 2 * len(at) < count or (np.diff(stamps) < 0.5 * sweep_ns).any():
         return None
-    at = np.array(list(begins), np.int64)
-    known = np.array([begin for begin, _ in begins.values()], np.int64)
-    return PointStamps(_filled(count, at, known), float(np.median([s for _, s in begins.values()])), field)
+    return PointStamps(_filled(count, at, stamps), sweep_ns * 1e-9, clock.rule.field)
 
 
-def step_against(headers: Sequence[tuple[int, PointCloud]], rate_hz: float) -> float:
-    """By how much, s, absolute times of points step against the headers' stamps, ns, of a few scans; 0 below a period."""
-    ahead = []
-    for stamp, cloud in headers:
-        times = None if cloud.times is None else cloud.times[is_measured(cloud.points)]
-        unit = "" if times is None else _unit_of(times)
-        begin = _begin(times, unit) if unit and times is not None else None
-        if begin is not None:
-            ahead.append(begin[0] - stamp)
-    step = (max(ahead) - min(ahead)) * 1e-9 if ahead else 0.0
-    return step if step > 1 / rate_hz else 0.0
+def _clock(count: int, read: Callable[[int], PointCloud], rate_hz: float | None) -> PointClock | None:
+    """The clock of the points when its readings are absolute, by a few scans."""
+    samples = list(read_samples(count, lambda index: Sample(read(index), 0)).values())
+    for rate in (rate_hz,) if rate_hz else (DEFAULT_RATE_HZ, _SLOW_HZ):
+        with suppress(InputError):
+            rule = learn_rule(samples, rate)
+            return PointClock(rule, rate) if rule is not None and rule.is_absolute else None
+    return None
 
 
-def _is_clock(begins: dict[int, tuple[int, float]]) -> bool:
-    """Whether sweeps follow each other without overlapping by half, or the only one begins much later than it lasts."""
-    starts = np.array([begin for begin, _ in begins.values()], np.int64)
-    sweeps = np.array([sweep for _, sweep in begins.values()])
-    if len(starts) == 1:
-        return bool(starts[0] * 1e-9 > 10 * sweeps[0])
-    return len(starts) > 1 and bool((np.diff(starts) * 1e-9 > 0.5 * np.minimum(sweeps[:-1], sweeps[1:])).all())
-
-
-def _unit_of(times: NDArray[Any]) -> str:
-    return next((unit for unit in _UNITS_NS if _begin(times, unit) is not None), "")
-
-
-def _begin(times: NDArray[Any], unit: str) -> tuple[int, float] | None:
-    """Earliest time of a scan's points, ns, and what they span, s, in `unit`; None when they do not span a sweep."""
-    finite = times[np.isfinite(times)] if times.dtype.kind == "f" else times
-    if not len(finite):
-        return None
-    scale = _UNITS_NS[unit]
-    # In the field's own type: absolute ns do not fit a float.
-    ordered = np.sort(finite)
-    off = np.array([float(x) for x in (ordered[-1] - ordered[0], ordered[0])])
-    middle = ordered[len(ordered) // 2]
-    reach = _AROUND_S * 1e9 / scale
-    if off[0] > reach:
-        ahead = np.where(ordered < middle, middle - ordered, ordered - middle).astype(np.float64)
-        ordered = ordered[ahead <= reach]
-    sweep_s = float(ordered[-1] - ordered[0]) * scale * 1e-9
-    if not _SHORTEST_S <= sweep_s <= _LONGEST_S or 2 * len(ordered) < len(finite):
-        return None
-    first = ordered[0]
-    begin = int(first) * scale if times.dtype.kind in "iu" else round(float(first) * scale)
-    return (begin, sweep_s) if abs(begin) < 2**62 else None
-
-
-def _filled(count: int, at: NDArray[np.int64], known: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(count,) ns: `known` at the indices `at`, evenly between them, at the median step before and after."""
-    stamps = np.empty(count, np.int64)
-    step = float(np.median(np.diff(known) / np.diff(at))) if len(at) > 1 else 0.0
+def _filled(count: int, at: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(count,) ns: `stamps` at the indices `at`, evenly between them, at the median step before and after."""
+    step = float(np.median(np.diff(stamps) / np.diff(at))) if len(at) > 1 else 0.0
     index = np.arange(count)
-    since = np.interp(index, at, known - known[0])
+    since = np.interp(index, at, stamps - stamps[0])
     since += step * (np.minimum(index - at[0], 0) + np.maximum(index - at[-1], 0))
-    stamps[:] = known[0] + np.rint(since).astype(np.int64)
-    stamps[at] = known
-    return stamps
+    filled: NDArray[np.int64] = stamps[0] + np.rint(since).astype(np.int64)
+    filled[at] = stamps
+    return filled

@@ -186,20 +186,23 @@ def _limits(values: NDArray[Any], width: float) -> tuple[float, float]:
         return 0.0, 0.0
     low, high = values.min(), values.max()
     if not float(high) - float(low) <= width:
-        low, high = densest(values, width)
-        if 2 * np.count_nonzero((values >= low) & (values <= high)) <= len(values):
+        dense = densest(values, np.ones(len(values), np.bool_), width)
+        if 2 * np.count_nonzero(dense) <= len(values):
             return 0.0, 0.0
+        low, high = values[dense].min(), values[dense].max()
     return float(low), float(low) + float(high - low)
 
 
-def densest(values: NDArray[Any], width: float) -> tuple[Any, Any]:
-    """First and last value of the stretch of `width` that holds most of the values (N > 0,), which are finite."""
-    ordered = np.sort(values)
+def densest(values: NDArray[Any], among: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
+    """(N,) those of the values `among`, finite ones, that lie within the stretch of `width` that holds most of them."""
+    if not among.any():
+        return among
+    ordered = np.sort(values[among])
     # From the first in the field's own type: absolute ns do not fit a float.
     ahead = (ordered - ordered[0]).astype(np.float64)
-    held = np.searchsorted(ahead, ahead + width, "right") - np.arange(len(ahead))
-    k = int(np.argmax(held))
-    return ordered[k], ordered[k + int(held[k]) - 1]
+    counts = np.searchsorted(ahead, ahead + width, "right") - np.arange(len(ahead))
+    k = int(np.argmax(counts))
+    return np.asarray(among & (values >= ordered[k]) & (values <= ordered[k + int(counts[k]) - 1]))
 
 
 def _is_swept(points: NDArray[np.float32], values: NDArray[Any], low: float, high: float) -> bool:
@@ -229,8 +232,7 @@ def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDA
     start_ns = (
         int(first) if values.dtype.kind in "iu" and rule.ns_per_unit == 1 else round(float(first) * rule.ns_per_unit)
     )
-    # Another clock or only nominal stamps: the sequence's own stamps stay.
-    return times, start_ns - stamp_ns if abs(start_ns - stamp_ns) < 1e9 else 0
+    return times, start_ns - stamp_ns
 
 
 def azimuth_times(points: NDArray[np.float32], sweep: Span) -> NDArray[np.float32]:

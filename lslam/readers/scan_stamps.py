@@ -58,7 +58,7 @@ def stamp_scans(
         words = clock.name.rsplit("/", 1)[-1]
     points = None
     if not clocks or _is_suspicious(clocks[0].stamps_ns):
-        points = _points(files, read)
+        points = _points(files, read, rate_hz)
         if points is not None:
             clocks.append(Clock(f"the absolute times of the points, field {points.field!r},", points.stamps_ns))
             words = words or clocks[0].name.rstrip(",")
@@ -104,7 +104,7 @@ def _own_clock(
     try:
         rows = rows_of_scans(path, stamps, files, voice)
     except InputError as error:
-        if not is_named and _points(files, read) is None:
+        if not is_named and _points(files, read, None) is None:
             raise
         voice.problems.append(f"stamps are not used: {error}")
         return None
@@ -135,8 +135,8 @@ def _is_suspicious(stamps: Stamps) -> bool:
     return bool(len(steps)) and bool((steps <= 0).any() or steps.max() > _STEP * np.median(steps))
 
 
-def _points(files: list[Path], read: Callable[[Path], PointCloud]) -> PointStamps | None:
-    return point_stamps(len(files), lambda index: read(files[index]))
+def _points(files: list[Path], read: Callable[[Path], PointCloud], rate_hz: float | None) -> PointStamps | None:
+    return point_stamps(len(files), lambda index: read(files[index]), rate_hz)
 
 
 class Rows(NamedTuple):
