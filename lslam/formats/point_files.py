@@ -18,7 +18,7 @@ from lslam.formats.las_files import read_las, write_las
 from lslam.formats.pcd_files import pcd_columns, pcd_header, write_pcd
 from lslam.formats.ply_files import ply_columns, ply_header, write_ply
 from lslam.formats.point_cloud import PointCloud, cloud_from_fields
-from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, named_table, recognise
+from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
 from lslam.remote import RemotePath
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.untrusted import MISFIT
@@ -168,7 +168,7 @@ def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray
     names = name_columns([table]) if record is None else record.names
     if len(names) != table.shape[1]:
         raise InputError(f"{path}: {table.shape[1]} columns where {' '.join(names)} are {len(names)}")
-    return named_table(table, names)
+    return {name: table[:, k] for k, name in enumerate(names) if name != "_"}
 
 
 def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:

@@ -8,7 +8,7 @@ measures, negative intensities, columns whose values depend on the number of the
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -69,13 +69,9 @@ class PointRecord:
             for name, code in zip(self.names, self.types, strict=True)
         )
 
-    def table(self, raw: NDArray[np.uint8]) -> NDArray[Any]:
-        """Points of bytes, whole ones alone."""
-        return raw[: len(raw) // self.size * self.size].view(self.dtype)
-
     def columns(self, raw: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """The named columns of bytes."""
-        table = self.table(raw)
+        table = raw.view(self.dtype)
         return {name: table[str(k)] for k, name in enumerate(self.names) if name != "_"}
 
     def unread(self) -> str:
@@ -122,6 +118,7 @@ class Recognition:
     fitting: tuple[PointRecord, ...] = ()
 
 
+@np.errstate(all="ignore")
 def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
     """The record of the points in these files, decided on all of them together.
 
@@ -130,15 +127,10 @@ def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
     files = [raw for raw in files if len(raw)]
     if not files:
         return Recognition(KITTI)
-    grave, slight = (
-        _faults(KITTI, files) if _divides(KITTI, files) else (f"{len(files[0])} bytes are no multiple of 16", "")
-    )
+    grave, slight = _faults(KITTI, files) or ("", "")
     if not grave and not slight:
         return Recognition(KITTI)
-    fitting = []
-    for candidate in _candidates(files):
-        if _divides(candidate, files) and not any(_faults(candidate, files)) and len(_valid(candidate, files)):
-            fitting.append(candidate)
+    fitting = [record for record in _candidates(files) if _faults(record, files) == ("", "")]
     # Two points of a record are no record of twice its size.
     fitting = [r for r in fitting if not any(r.size % s.size == 0 and r.size > s.size for s in fitting)]
     if len(fitting) == 1:
@@ -146,118 +138,98 @@ def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
     return Recognition(None if grave else KITTI, grave, tuple(fitting))
 
 
+@np.errstate(all="ignore")
 def name_columns(tables: Sequence[NDArray[Any]]) -> tuple[str, ...]:
     """Names of the columns of arrays (N, K), x y z first, by their values in all of the arrays; `_` for those unknown.
 
     A ring is a small whole number that goes with the elevation; times run through a sweep in the order of the points; the first
     column of other values that are not negative is the intensity. Of four columns the last is the intensity where it is neither.
     """
-    with np.errstate(all="ignore"):
-        return _names([_rows(np.asarray(table, np.float64)) for table in tables], tables[0].shape[1])
-
-
-def _names(kept: Sequence[Floats], count: int) -> tuple[str, ...]:
+    scans = [_measured(np.asarray(table, np.float64)) for table in tables]
     names = ["x", "y", "z"]
-    columns = range(3, count)
-    rings = [k for k in columns if _is_ring(kept, k)]
-    for k in columns:
-        shades = [c for c in columns if c not in rings and _is_shade(kept, c)]
-        if k in rings:
-            names.append("_" if "ring" in names else "ring")
-        elif "time" not in names and all(_is_time(table[:, k]) for table in kept):
-            names.append("time")
-        elif "intensity" not in names and (k in shades or len(columns) == 1):
-            names.append("intensity")
+    count = tables[0].shape[1]
+    for k in range(3, count):
+        if _is_ring(scans, k):
+            name = "ring"
+        elif all(_is_time(scan[:, k]) for scan in scans):
+            name = "time"
         else:
-            names.append("_")
+            name = "intensity" if count == 4 or _is_intensity(scans, k) else "_"
+        names.append("_" if name in names else name)
     return tuple(names)
 
 
-def named_table(table: NDArray[Any], names: Sequence[str]) -> Mapping[str, NDArray[Any]]:
-    """Columns of an array (N, K) by name, without those that are not read."""
-    return {name: table[:, k] for k, name in enumerate(names) if name != "_"}
+def _whole(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> list[Floats]:
+    """(N, K) of each file that holds whole points; empty unless most do: one may be cut off."""
+    whole = [raw[: _MOST_BYTES // record.size * record.size] for raw in files if len(raw) % record.size == 0]
+    if 2 * len(whole) <= len(files):
+        return []
+    tables = [raw.view(record.dtype) for raw in whole]
+    return [np.column_stack([table[str(k)].astype(np.float64) for k in range(len(record.names))]) for table in tables]
 
 
-def _divides(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> bool:
-    """Of most files: one may be cut off."""
-    return 2 * sum(len(raw) % record.size == 0 for raw in files) > len(files)
+def _measured(table: Floats) -> Floats:
+    """Rows whose points are finite and not the origin."""
+    points = table[:, :3]
+    return np.asarray(table[np.isfinite(points).all(1) & (points != 0).any(1)])
 
 
 def _candidates(files: Sequence[NDArray[np.uint8]]) -> list[PointRecord]:
-    """Records of one type with their columns named by the values, and those of mixed types."""
-    found = [parse_record(text) for text in _MIXED]
+    """Records of mixed types, and those of one type with their columns named by the values."""
+    candidates = [parse_record(text) for text in _MIXED]
     for code, counts in (("<f4", _COLUMNS_F4), ("<f8", _COLUMNS_F8)):
         for count in counts:
-            plain = PointRecord(("_",) * count, (code,) * count)
-            whole = [raw for raw in files if len(raw) % plain.size == 0]
-            if _divides(plain, files):
-                names = name_columns([plain.table(raw[:_MOST_BYTES]).view(code).reshape(-1, count) for raw in whole])
-                # Columns that mean nothing do not confirm a record.
-                if count == 3 or {"intensity", "ring", "time"} & set(names):
-                    found.append(PointRecord(names, plain.types))
-    return found
+            tables = _whole(PointRecord(("_",) * count, (code,) * count), files)
+            names = name_columns(tables) if tables else ()
+            # Columns that mean nothing do not confirm a record.
+            if names and (count == 3 or set(names[3:]) != {"_"}):
+                candidates.append(PointRecord(names, (code,) * count))
+    return candidates
 
 
-def _matrices(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> list[Floats]:
-    """(N, K) of each whole file."""
-    tables = [record.table(raw[:_MOST_BYTES]) for raw in files if len(raw) % record.size == 0]
-    return [np.column_stack([table[name].astype(np.float64) for name in table.dtype.names or ()]) for table in tables]
+def _faults(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> tuple[str, str] | None:
+    """What no measurement can be, and what is only unlikely; empty words where nothing is, None where few points tell."""
+    tables = _whole(record, files)
+    if not tables:
+        return f"{len(files[0])} bytes are no multiple of {record.size}", ""
+    scans = [_measured(table) for table in tables]
+    if sum(map(len, scans)) < _MIN_POINTS:
+        return None
+    return _impossible(record, scans), _unlikely(scans)
 
 
-def _rows(table: Floats) -> Floats:
-    """Rows of points that were measured: finite and not the origin."""
-    points = table[:, :3]
-    return np.asarray(table[np.isfinite(points).all(1) & (points != 0).any(1)], np.float64)
-
-
-def _valid(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> Floats:
-    with np.errstate(all="ignore"):
-        rows = np.concatenate([_rows(table) for table in _matrices(record, files)])
-    return rows if len(rows) >= _MIN_POINTS else rows[:0]
-
-
-def _faults(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> tuple[str, str]:
-    """What speaks against the record: what no measurement can be, and what is only unlikely; both empty when nothing does."""
-    with np.errstate(all="ignore"):
-        tables = _matrices(record, files)
-        rows = [_rows(table) for table in tables]
-        everything = np.concatenate(rows)
-        if len(everything) < _MIN_POINTS:
-            return "", ""
-        return _grave(record, rows, everything), _slight(everything[:, :3], rows)
-
-
-def _grave(record: PointRecord, rows: list[Floats], everything: Floats) -> str:
-    points = everything[:, :3]
-    size = np.abs(points)
-    floats = [k for k, code in enumerate(record.types) if "f" in code]
-    tiny = (np.abs(everything[:, floats]) < _SMALLEST_M) & (everything[:, floats] != 0)
+def _impossible(record: PointRecord, scans: list[Floats]) -> str:
+    rows = np.concatenate(scans)
+    columns = {name: k for k, name in enumerate(record.names)}
+    floats = rows[:, ["f" in code for code in record.types]]
+    is_tiny = ((np.abs(floats) < _SMALLEST_M) & (floats != 0)).any(1)
+    is_large = (np.abs(rows[:, :3]) > _LARGEST_M).any(1)
     # NaN in one coordinate alone marks a point of some drivers; bytes that are no numbers are too large or too small as well.
-    if max(np.mean((size > _LARGEST_M).any(1)), np.mean(tiny.any(1))) > _RARE:
+    if max(is_large.mean(), is_tiny.mean()) > _RARE:
         return "the values are no coordinates"
-    names = record.names
-    if "intensity" in names:
-        shade = everything[:, names.index("intensity")]
-        negative = float(np.mean((shade < 0) & (shade != -1)))
-        if negative > _RARE and not all(_is_time(table[:, names.index("intensity")]) for table in rows):
+    if "intensity" in columns:
+        k = columns["intensity"]
+        negative = _negative(rows[:, k])
+        if negative > _RARE and not all(_is_time(scan[:, k]) for scan in scans):
             return f"{negative:.0%} of the intensities are negative"
-    if "time" in names and not all(_is_time(table[:, names.index("time")]) for table in rows):
+    if "time" in columns and not all(_is_time(scan[:, columns["time"]]) for scan in scans):
         return "the times do not run through a sweep"
-    if "ring" in names and not _is_ring(rows, names.index("ring")):
+    if "ring" in columns and not _is_ring(scans, columns["ring"]):
         return "the rings do not go with the elevation"
     return ""
 
 
-def _slight(points: Floats, rows: list[Floats]) -> str:
-    level = np.hypot(points[:, 0], points[:, 1])
-    if np.mean(np.abs(points[:, 2]) > 6 * level) > 0.2:
+def _unlikely(scans: list[Floats]) -> str:
+    points = np.concatenate(scans)[:, :3]
+    if np.mean(np.abs(points[:, 2]) > 6 * np.hypot(points[:, 0], points[:, 1])) > 0.2:
         return "a fifth of the points is straight above or below"
-    for axis in "xy":
-        column = points[:, "xy".index(axis)]
-        for what, share in (("0", np.mean(column == 0)), ("whole numbers", np.mean(column == np.round(column)))):
-            if 0.05 < share < 0.95 or (what == "0" and share > 0.5):
-                return f"{share:.0%} of {axis} are {what}"
-        if any(_depends_on_row([table[:, "xy".index(axis)] for table in rows], m) for m in _PHASES):
+    for k, axis in enumerate("xy"):
+        zeros, whole = (float(np.mean(points[:, k] == other)) for other in (0, np.round(points[:, k])))
+        if zeros > 0.05:
+            return f"{zeros:.0%} of {axis} are 0"
+        if 0.05 < whole < 0.95:
+            return f"{whole:.0%} of {axis} are whole numbers"
+        if any(_depends_on_row([scan[:, k] for scan in scans], period) for period in _PHASES):
             return f"{axis} depends on the number of the row"
     return ""
 
@@ -273,22 +245,26 @@ def _depends_on_row(columns: list[Floats], period: int) -> bool:
     return max(negative) - min(negative) > 0.25 + 3 / least**0.5 or max(sizes) > 8 * min(sizes)
 
 
-def _is_shade(tables: Sequence[Floats], k: int) -> bool:
-    values = np.concatenate([table[:, k] for table in tables])
-    if not len(values):
-        return False
-    lengths = np.concatenate([np.linalg.norm(table[:, :3], axis=1) for table in tables])
-    is_range = bool(np.mean(np.abs(values - lengths) < 0.01 * lengths) > 0.9)
-    return bool(np.isfinite(values).all() and np.mean((values < 0) & (values != -1)) <= _RARE) and not is_range
+def _negative(values: Floats) -> float:
+    """Share of negative ones; -1 stands for none."""
+    return float(np.mean((values < 0) & (values != -1)))
 
 
-def _is_ring(tables: Sequence[Floats], k: int) -> bool:
+def _is_intensity(scans: Sequence[Floats], k: int) -> bool:
+    """Whether column k may be that: not negative, and not the range."""
+    rows = np.concatenate(scans)
+    lengths = np.linalg.norm(rows[:, :3], axis=1)
+    is_range = np.mean(np.abs(rows[:, k] - lengths) < 0.01 * lengths) > 0.9
+    return bool(len(rows) and np.isfinite(rows[:, k]).all() and _negative(rows[:, k]) <= _RARE and not is_range)
+
+
+def _is_ring(scans: Sequence[Floats], k: int) -> bool:
     """Whole numbers to 255 within which the elevation varies less than in all."""
-    values = np.concatenate([table[:, k] for table in tables])
+    rows = np.concatenate(scans)
+    values = rows[:, k]
     if len(values) < _MIN_POINTS or not ((values == np.round(values)) & (values >= 0) & (values <= 255)).all():
         return False
-    points = np.concatenate([table[:, :3] for table in tables])
-    elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    elevation = np.arctan2(rows[:, 2], np.hypot(rows[:, 0], rows[:, 1]))
     groups = [elevation[values == ring] for ring in np.unique(values)]
     within = sum(float(np.abs(group - np.median(group)).sum()) for group in groups) / len(values)
     return len(groups) > 1 and within < 0.4 * float(np.abs(elevation - np.median(elevation)).mean())
@@ -299,11 +275,9 @@ def _is_time(values: Floats) -> bool:
     if len(values) < _MIN_POINTS or not np.isfinite(values).all():
         return False
     low, high = float(values.min()), float(values.max())
-    span = high - low
-    if not (
-        _PERIODS_S[0] <= span <= _LONGEST_S
-        or any(_PERIODS_S[0] <= span * u <= _PERIODS_S[1] for u in (1e-3, 1e-6, 1e-9))
-    ):
+    span, (shortest, longest) = high - low, _PERIODS_S
+    fine_spans = [span * unit for unit in (1e-3, 1e-6, 1e-9)]
+    if not (shortest <= span <= _LONGEST_S or any(shortest <= fine <= longest for fine in fine_spans)):
         return False
     steps = np.diff(values)
     filled = np.histogram(values, 10, (low, high))[0] > _RARE * len(values)
