@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,24 +11,19 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_odometry_calib
 from lslam.formats.point_records import KITTI
-from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
-from lslam.printable import printable
+from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, to_lidar
-from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, load_stamps, nominal_stamps
+from lslam.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps
 from lslam.readers.lookup import sequence_number
-from lslam.readers.point_units import settle_unit
-from lslam.readers.scan_folder import clock_of_files
+from lslam.readers.scan_folder import calibration_in, clock_of_files, folder_sequence, stamps_by_rows
 from lslam.readers.scan_records import scan_record
-from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
     load_gnss,
     load_imu,
-    per_point_folder,
     read_info,
-    stated_times,
     vertical_correction,
 )
 from lslam.types.sequence import Calibration
@@ -62,7 +58,6 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if not files:
         raise InputError(f"{folder / 'velodyne'} holds no scans (*.bin): fetch the velodyne data of this sequence")
     voice = Voice([f"format {KIND}: {why}", *left_out, *compensation_note(info)], [])
-    name = info.name or (f"seq{folder.name}" if folder.name.isdigit() else printable(folder.name))
     files, stamps, rate = _stamps(folder, info, files, voice)
     calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
     record = scan_record(files, info, voice)
@@ -73,10 +68,11 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     compensated = True if is_benchmark else info.motion_compensated
     if info.motion_compensated is None and compensated:
         voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
-    sequence = FolderSequence(
-        name=name,
-        path=folder,
-        kind=KIND,
+    return folder_sequence(
+        folder,
+        KIND,
+        replace(info, name=info.name or f"seq{folder.name}") if folder.name.isdigit() else info,
+        voice,
         files=files,
         stamps_ns=stamps,
         rate_hz=rate,
@@ -86,19 +82,10 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         imu=load_imu(folder, info, voice.problems),
         gnss=load_gnss(folder, info, voice.problems),
         correction_deg=vertical_correction(info, files, record, voice.notes),
-        rows=info.rows,
-        cols=info.cols,
-        per_point=per_point_folder(folder, info),
-        rings=info.rings or info.rows,
         sensor=info.sensor or (None if has_toml or record != KITTI else "HDL-64E"),
         record=record,
-        unit_m=LENGTHS.get(info.point_unit or ""),
         clock=clock_of_files(files, record, stamps, rate, info, voice) if has_times and not compensated else None,
-        notes=voice.notes,
-        problems=voice.problems,
-        stated_times=stated_times(info),
     )
-    return settle_unit(sequence)
 
 
 def _stamps(
@@ -110,10 +97,7 @@ def _stamps(
         rate = info.rate_hz or DEFAULT_RATE_HZ
         voice.notes.append(f"no usable {path.name}: scans are stamped at {rate:g} Hz")
         return files, nominal_stamps(len(files), rate), rate
-    rows = rows_of_scans(path, stamps, files, voice)
-    files = [f for f, known in zip(files, rows.have, strict=True) if known]
-    checked, rate = check_stamps(rows.stamps_ns, info.rate_hz, path, voice.problems)
-    return files, checked, rate
+    return stamps_by_rows(files, stamps, path, info.rate_hz, voice)
 
 
 def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
@@ -121,12 +105,9 @@ def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
     if not path.is_file():
         voice.notes.append(f"{path} is missing: the camera's place is unknown")
         return None
-    try:
-        T_cam0_lidar = read_odometry_calib(path)
-    except InputError as error:
-        voice.problems.append(f"calibration is not used: {error}")
-        return None
-    if T_cam0_lidar is None:
+    problems = len(voice.problems)
+    T_cam0_lidar = calibration_in(path, read_odometry_calib, voice)
+    if T_cam0_lidar is None and len(voice.problems) == problems:
         voice.problems.append(f"{path} has no Tr (T_cam0_lidar): poses cannot be carried between camera and LiDAR")
     return T_cam0_lidar
 
@@ -141,15 +122,13 @@ def _ground_truth(
 ) -> Trajectory | None:
     number = sequence_number(folder.name) or folder.name
     usual = [above / "poses" / f"{number}.txt" for above in (folder.parent.parent, folder.parent)]
-    path: Path | None = next((p for p in usual if p.is_file()), usual[0])
+    path = next((p for p in usual if p.is_file()), None)
     if info.ground_truth is not None:
         path = find_ground_truth(folder, info, voice)
-    elif path is not None and not path.is_file():
-        if (folder / "poses.txt").is_file():
-            voice.notes.append(
-                f"{folder / 'poses.txt'} (SemanticKITTI) holds SLAM estimates, it is not taken as ground truth"
-            )
-        path = None
+    elif path is None and (folder / "poses.txt").is_file():
+        voice.notes.append(
+            f"{folder / 'poses.txt'} (SemanticKITTI) holds SLAM estimates, it is not taken as ground truth"
+        )
     if path is None:
         return None
     truth = load_poses(path, stamps, files, voice)

@@ -12,7 +12,6 @@ deg from OXTS, .14 when OXTS is taken to lag by 14 ms: its yaw is late in bends.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,22 +21,12 @@ from lslam.errors import InputError, cause
 from lslam.formats.calibration_files import read_raw_cam0_lidar, read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.point_files import SUFFIXES
-from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
-from lslam.printable import printable
+from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Voice, find_ground_truth, load_poses, oxts_truth, to_lidar
-from lslam.readers.listing import (
-    DEFAULT_RATE_HZ,
-    check_stamps,
-    list_scans,
-    load_stamps,
-    measured_rate,
-    nominal_stamps,
-    rows_of,
-)
-from lslam.readers.point_units import settle_unit
+from lslam.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps, rows_of
+from lslam.readers.scan_folder import calibration_in, folder_sequence, stamps_by_rows
 from lslam.readers.scan_records import scan_record
-from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
@@ -45,7 +34,6 @@ from lslam.readers.sidecars import (
     load_imu,
     per_point_folder,
     read_info,
-    stated_times,
     vertical_correction,
 )
 from lslam.types.gnss import GnssStream
@@ -112,10 +100,11 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
             "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
             "leaves scans as they are)"
         )
-    sequence = FolderSequence(
-        name=info.name or printable(folder.name),
-        path=folder,
-        kind=KIND,
+    return folder_sequence(
+        folder,
+        KIND,
+        info,
+        voice,
         files=files,
         stamps_ns=stamps,
         rate_hz=rate,
@@ -125,19 +114,10 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         imu=load_imu(folder, info, voice.problems) or _imu(oxts),
         gnss=load_gnss(folder, info, voice.problems) or _gnss(oxts),
         correction_deg=vertical_correction(info, files, record, voice.notes),
-        rows=info.rows,
-        cols=info.cols,
-        per_point=per_point,
         sweep_s=sweep,
-        rings=info.rings or info.rows,
         sensor=info.sensor or (None if has_toml else "HDL-64E"),
         record=record,
-        unit_m=LENGTHS.get(info.point_unit or ""),
-        notes=voice.notes,
-        problems=voice.problems,
-        stated_times=stated_times(info),
     )
-    return settle_unit(sequence)
 
 
 def _oxts(folder: Path, voice: Voice) -> Oxts | None:
@@ -178,7 +158,7 @@ def _stamps(
     if path is not None and stamps is not None:
         voice.notes.append(f"scan stamps from {path.name}")
         is_own = info.stamps is None or path != paths[0]
-        return *_common(files, stamps, path, info.rate_hz, voice), passed[path.name] if is_own else None
+        return *stamps_by_rows(files, stamps, path, info.rate_hz, voice), passed[path.name] if is_own else None
     if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns) or is_extract:
         rate = info.rate_hz or DEFAULT_RATE_HZ
         start = 0 if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns) else int(oxts.stamps_ns[0])
@@ -191,7 +171,7 @@ def _stamps(
     full = np.full(int(oxts.numbers.max()) + 1, -1, np.int64)
     full[oxts.numbers] = even
     source = folder / "oxts" / "timestamps.txt"
-    return *_common(files, even if (full < 0).any() else full, source, info.rate_hz, voice), AHEAD
+    return *stamps_by_rows(files, even if (full < 0).any() else full, source, info.rate_hz, voice), AHEAD
 
 
 def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], voice: Voice) -> NDArray[np.int64]:
@@ -214,15 +194,6 @@ def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], voice: Voi
     return even
 
 
-def _common(
-    files: list[Path], stamps: NDArray[np.int64], source: Path, rate_hz: float | None, voice: Voice
-) -> tuple[list[Path], NDArray[np.int64], float]:
-    rows = rows_of_scans(source, stamps, files, voice)
-    files = [f for f, known in zip(files, rows.have, strict=True) if known]
-    checked, _ = check_stamps(rows.stamps_ns, rate_hz, source, voice.problems)
-    return files, checked, rate_hz or measured_rate(checked)
-
-
 def _sweeps(folder: Path, files: list[Path], rate: float, voice: Voice) -> NDArray[np.float64]:
     """Duration of each sweep, s, from KITTI's start and end stamps, else one period."""
     voice.notes.append("per-point times from the azimuth: the HDL-64E turns clockwise and a scan starts behind")
@@ -241,21 +212,15 @@ def _sweeps(folder: Path, files: list[Path], rate: float, voice: Voice) -> NDArr
 
 
 def _calibration(day: Path, voice: Voice) -> Calibration:
-    T_lidar_imu = _optional(day / "calib_imu_to_velo.txt", read_rigid, voice)
-    T_cam0_lidar = _optional(day / "calib_velo_to_cam.txt", lambda path: read_raw_cam0_lidar(path.parent), voice)
+    matrices = []
+    for name, read in (("imu_to_velo", read_rigid), ("velo_to_cam", lambda path: read_raw_cam0_lidar(path.parent))):
+        path = day / f"calib_{name}.txt"
+        if not path.is_file():
+            voice.notes.append(f"{path} is missing")
+        matrices.append(calibration_in(path, read, voice) if path.is_file() else None)
+    T_lidar_imu, T_cam0_lidar = matrices
     # The OXTS position is that of the IMU's origin (devkit readme), so both extrinsics are one.
     return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu)
-
-
-def _optional(path: Path, read: Callable[[Path], NDArray[np.float64]], voice: Voice) -> NDArray[np.float64] | None:
-    if not path.is_file():
-        voice.notes.append(f"{path} is missing")
-        return None
-    try:
-        return read(path)
-    except InputError as error:
-        voice.problems.append(f"calibration is not used: {error}")
-        return None
 
 
 def _imu(oxts: Oxts | None) -> ImuStream | None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,12 @@ from lslam.printable import printable
 from lslam.readers.clocks import follow
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.ground_truth import Numbered, Voice, find_ground_truth, load_poses, pair_by_number, to_lidar
-from lslam.readers.listing import (
-    DEFAULT_RATE_HZ,
-    check_stamps,
-    list_scans,
-    nominal_stamps,
-)
+from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, nominal_stamps
 from lslam.readers.point_clock import PointClock, open_clock, read_samples
 from lslam.readers.point_times import Sample
 from lslam.readers.point_units import settle_unit
 from lslam.readers.scan_records import scan_record
-from lslam.readers.scan_stamps import StampedScans, stamp_scans
+from lslam.readers.scan_stamps import StampedScans, rows_of_scans, stamp_scans
 from lslam.readers.sidecars import (
     calibration_over,
     compensation_note,
@@ -49,6 +44,7 @@ from lslam.types.trajectory import Trajectory
 Stream = TypeVar("Stream", ImuStream, GnssStream)
 KIND = "scan-folder"
 Read = Callable[[Path], PointCloud]
+Matrix = NDArray[np.float64]
 SUBFOLDERS = ("data", "scans", "lidar", "points", "clouds", "pcd", "ply", "bin")
 STAMP_NAMES = ("times.txt", "timestamps.txt", "stamps.txt", "times.csv", "timestamps.csv", "stamps.csv")
 
@@ -76,23 +72,25 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
             f"{folder} is the inside of a KITTI sequence: give {whole} for its stamps, calibration, ground truth and the "
             "vertical correction of its points"
         )
-    calibration = calibration_over(info, Calibration(T_cam0_lidar=_tr(folder, voice)))
+    calib = folder / "calib.txt"
+    T_cam0_lidar = calibration_in(calib, read_odometry_calib, voice) if calib.is_file() else None
+    calibration = calibration_over(info, Calibration(T_cam0_lidar))
     record = scan_record(files, info, voice)
     read = partial(read_points, record=record)
     imu, gnss = load_imu(folder, info, voice.problems), load_gnss(folder, info, voice.problems)
     beside = [stream.stamps_ns for stream in (imu, gnss) if stream is not None and len(stream)]
     scans_of, truth = _stamps_and_truth(folder, info, files, read, beside, calibration, voice)
     files, stamps, rate, _ = scans_of
-    correction = info.vertical_correction_deg or 0.0
-    if correction:
-        voice.notes.append(f"vertical correction {correction:g} deg, as stated")
+    if info.vertical_correction_deg:
+        voice.notes.append(f"vertical correction {info.vertical_correction_deg:g} deg, as stated")
     clock = clock_of_files(files, record, stamps, rate, info, voice)
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
-    sequence = FolderSequence(
-        name=info.name or printable(folder.name),
-        path=folder,
-        kind=KIND,
+    return folder_sequence(
+        folder,
+        KIND,
+        info,
+        voice,
         files=files,
         stamps_ns=stamps,
         rate_hz=rate,
@@ -101,20 +99,48 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         ground_truth=truth,
         imu=_with_scans(imu, scans_of, "IMU", voice),
         gnss=_with_scans(gnss, scans_of, "GNSS", voice),
-        correction_deg=correction,
+        correction_deg=info.vertical_correction_deg or 0.0,
+        clock=clock,
+        sensor=info.sensor,
+        record=record,
+    )
+
+
+def folder_sequence(folder: Path, kind: str, info: SequenceInfo, voice: Voice, **parts: Any) -> FolderSequence:
+    """The sequence of `parts`, see `FolderSequence`, with what `info` says of every kind of folder, its points in m."""
+    sequence = FolderSequence(
+        name=info.name or printable(folder.name),
+        path=folder,
+        kind=kind,
         rows=info.rows,
         cols=info.cols,
         per_point=per_point_folder(folder, info),
-        clock=clock,
         rings=info.rings or info.rows,
-        sensor=info.sensor,
-        record=record,
         unit_m=LENGTHS.get(info.point_unit or ""),
         notes=voice.notes,
         problems=voice.problems,
         stated_times=stated_times(info),
+        **parts,
     )
     return settle_unit(sequence)
+
+
+def stamps_by_rows(
+    files: list[Path], stamps: NDArray[np.int64], source: Path, rate_hz: float | None, voice: Voice
+) -> tuple[list[Path], NDArray[np.int64], float]:
+    """The scans that have a row of stamps in `source`, the stamps of these, which increase, and the rate, Hz."""
+    rows = rows_of_scans(source, stamps, files, voice)
+    files = [file for file, has_row in zip(files, rows.have, strict=True) if has_row]
+    return files, *check_stamps(rows.stamps_ns, rate_hz, source, voice.problems)
+
+
+def calibration_in(path: Path, read: Callable[[Path], Matrix | None], voice: Voice) -> Matrix | None:
+    """What `read` makes of the file; None, which is a problem, where it cannot be read."""
+    try:
+        return read(path)
+    except InputError as error:
+        voice.problems.append(f"calibration is not used: {error}")
+        return None
 
 
 def _scans_in(folder: Path) -> tuple[Path, list[Path], list[str]] | None:
@@ -124,16 +150,6 @@ def _scans_in(folder: Path) -> tuple[Path, list[Path], list[str]] | None:
             if files:
                 return place, files, notes
     return None
-
-
-def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
-    if not (folder / "calib.txt").is_file():
-        return None
-    try:
-        return read_odometry_calib(folder / "calib.txt")
-    except InputError as error:
-        voice.problems.append(f"calibration is not used: {error}")
-        return None
 
 
 def _stamps_and_truth(
@@ -221,14 +237,10 @@ def _truth(
     return to_lidar(truth, frame, calibration, voice, T_body_lidar)
 
 
-def _mcd_extrinsics(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
+def _mcd_extrinsics(folder: Path, voice: Voice) -> Matrix | None:
     """T_body_lidar of a Multi-Campus recording, where its calibration lies beside the scans."""
     for path in sorted(folder.glob("*_calib.yaml")):
-        try:
-            T_body_lidar = read_mcd_extrinsics(path)
-        except InputError as error:
-            voice.problems.append(f"extrinsics are not used: {error}")
-            continue
+        T_body_lidar = calibration_in(path, read_mcd_extrinsics, voice)
         if T_body_lidar is not None:
             voice.notes.append(f"ground truth holds body poses, carried to the LiDAR with os_sensor of {path.name}")
             return T_body_lidar
