@@ -15,28 +15,31 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import AXES, organised
+from lslam.formats.point_cloud import AXES, float_table, organised, packed_columns
 from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
 _KINDS = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
+# Words of a line of text: digits, a char that was streamed as it is, and bytes that are no digits.
+_DIGITS = rb"([-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf))"
+_CHAR, _BYTES, _END = rb"([\s\S])", rb"([\s\S]{0,8}?)", rb" ?\r?(?:\n|\Z)"
 _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
 
 @dataclass(frozen=True)
 class _Header:
     names: list[str]
-    dtypes: list[np.dtype[Any]]
     counts: list[int]
+    dtype: np.dtype[Any]  # of one point, its fields numbered
     points: int
     shape: tuple[int, int]  # rows and columns
     encoding: str
     size: int  # bytes of the header itself
 
     @property
-    def record(self) -> int:
-        """Bytes of one point."""
-        return sum(d.itemsize * c for d, c in zip(self.dtypes, self.counts, strict=True))
+    def codes(self) -> list[np.dtype[Any]]:
+        """Types of the numbers of each field."""
+        return [self.dtype[k].base for k in range(len(self.names))]
 
 
 def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
@@ -50,10 +53,11 @@ def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
     header = _read_header(path, data)
     body = memoryview(data)[header.size :]
-    if header.points == 0:
-        return {name: np.zeros(0, kind) for name, kind in zip(header.names, header.dtypes, strict=True)}
-    read = {"ascii": _ascii_columns, "binary": _binary_columns}.get(header.encoding, _compressed_columns)
-    columns = {name: values for name, values in read(path, header, body).items() if name != "_"}
+    if header.encoding == "binary" or not header.points:
+        columns = packed_columns(path, "PCD", header.names, header.dtype, header.points, body)
+    else:
+        columns = (_ascii_columns if header.encoding == "ascii" else _compressed_columns)(path, header, body)
+    columns.pop("_", None)
     height, width = header.shape
     return columns | (organised(height, width) if height * width == header.points else {})
 
@@ -64,13 +68,9 @@ def write_pcd(
     """Write points (N, 3), m, and intensity (N,) as float32, atomically, in one of `ENCODINGS`."""
     if encoding not in ENCODINGS:
         raise UsageError(f"unknown PCD encoding {encoding!r}; known: {', '.join(ENCODINGS)}")
-    names = ["x", "y", "z"] if intensity is None else ["x", "y", "z", "intensity"]
-    table = np.empty((len(points), len(names)), np.float32)
-    table[:, :3] = points
-    if intensity is not None:
-        table[:, 3] = intensity
+    table = float_table(points, intensity)
     with atomic_write(path) as stream:
-        stream.write(pcd_header(len(table), names, encoding))
+        stream.write(pcd_header(len(table), ["x", "y", "z", "intensity"][: table.shape[1]], encoding))
         if encoding == "binary":
             stream.write(table.data)
         elif encoding == "ascii":
@@ -118,12 +118,19 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
             f"{path}: PCD header contradicts itself: {len(names)} FIELDS, {len(sizes)} SIZE, {len(kinds)} TYPE, "
             f"{len(repeats)} COUNT"
         )
-    dtypes = []
+    codes: list[str] = []
     for name, length, kind in zip(names, sizes, kinds, strict=True):
         if kind not in _KINDS or whole_number(length) not in _KINDS[kind]:
             raise InputError(f"{path}: PCD field {name!r} has TYPE {kind} with SIZE {length}, which does not exist")
-        dtypes.append(np.dtype(f"<{kind.lower()}{length}"))
+        codes.append(f"<{kind.lower()}{length}")
     counts = [_number(path, "COUNT", c) for c in repeats]
+    if not any(counts):
+        raise InputError(f"{path}: PCD header has no FIELDS")
+    shapes = [() if count == 1 else (count,) for count in counts]
+    try:
+        dtype = np.dtype([(str(k), code, shape) for k, (code, shape) in enumerate(zip(codes, shapes, strict=True))])
+    except ValueError:
+        raise InputError(f"{path}: PCD header says {sum(counts)} numbers a point: too many") from None
     width = _number(path, "WIDTH", *entries.get("WIDTH", ["0"]))
     height = _number(path, "HEIGHT", *entries.get("HEIGHT", ["1"]))
     points = _number(path, "POINTS", *entries.get("POINTS", [str(width * height)]))
@@ -134,7 +141,7 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     if encoding not in ENCODINGS:
         raise InputError(f"{path}: PCD DATA {encoding!r} is unknown; known: {', '.join(ENCODINGS)}")
-    return _Header(names, dtypes, counts, points, (height, width), encoding, size)
+    return _Header(names, counts, dtype, points, (height, width), encoding, size)
 
 
 def _number(path: Path, key: str, *words: str) -> int:
@@ -155,83 +162,64 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
             raise ValueError(f"header says {header.points} points, the file holds {len(lines)} lines of them")
         table = np.loadtxt([line.decode("ascii") for line in lines[: header.points]], np.float64, ndmin=2)
     except ValueError as error:
-        found = _rows_with_raw_bytes(header, bytes(body))
-        if found is None:
+        mixed = _rows_with_raw_bytes(header, bytes(body))
+        if mixed is None:
             raise InputError(f"{path}: PCD ascii data (counted from the first point) cannot be read: {error}") from None
-        table, unread = found
+        table, unread = mixed
     if table.shape != (header.points, width):
         raise InputError(f"{path}: PCD ascii lines hold {table.shape[1]} numbers where FIELDS and COUNT say {width}")
     columns, k = {}, 0
-    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
+    for name, count, code in zip(header.names, header.counts, header.codes, strict=True):
         values = table[:, k] if count == 1 else table[:, k : k + count]
         # Text holds the digits that it holds, whatever type its header names.
-        as_read = name.lower() in AXES or dtype.kind != "f"
+        as_read = name.lower() in AXES or code.kind != "f"
         label = f"{name} (bytes in place of digits)" if k in unread else name
-        columns[label] = values if as_read else values.astype(dtype)
+        columns[label] = values if as_read else values.astype(code)
         k += count
     return columns
 
 
 def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[NDArray[np.float64], set[int]] | None:
-    """Numbers of lines in which columns hold bytes in place of digits, a blank or the end of a line among them; what is left NaN.
+    """Numbers of lines in which columns hold bytes in place of digits, a blank or the end of a line among them.
 
-    C++ streams a char so: all columns of one byte are read as that. Any other one column of a few bytes is left NaN.
+    C++ streams a char so: all columns of one byte are read as that. Any other one column of a few bytes is left NaN and named.
     """
-    sizes = np.repeat([dtype.itemsize for dtype in header.dtypes], header.counts)
-    names = np.repeat(header.names, header.counts)
-    if 2 * len(sizes) * header.points > len(body) + 1:
+    if 2 * sum(header.counts) * header.points > len(body) + 1:
         return None
-    single = set(np.flatnonzero(sizes == 1).tolist())
-    others = [{k} for k in range(len(sizes)) if sizes[k] > 1 and str(names[k]).lower() not in AXES]
-    for raw in [single, *others] if single else others:
-        table = _match_rows(header.points, body, len(sizes), raw, raw == single)
-        if table is not None:
-            return table, set() if raw == single else raw
+    sizes = np.repeat([code.itemsize for code in header.codes], header.counts)
+    is_axis = np.repeat([name.lower() in AXES for name in header.names], header.counts)
+    chars = set(np.flatnonzero(sizes == 1).tolist())
+    others = [{k} for k in np.flatnonzero((sizes > 1) & ~is_axis).tolist()]
+    for raw in [chars, *others] if chars else others:
+        pattern = _CHAR if raw == chars else _BYTES
+        line = re.compile(b" ".join(pattern if k in raw else _DIGITS for k in range(len(sizes))) + _END, re.IGNORECASE)
+        rows = _matches(line, body, header.points)
+        if len(rows) == header.points:
+            words = np.array(rows, object)
+            for k in raw:
+                words[:, k] = [word[0] if raw == chars else np.nan for word in words[:, k]]
+            return words.astype(np.float64), set() if raw == chars else raw
     return None
 
 
-def _match_rows(points: int, body: bytes, width: int, raw: set[int], is_char: bool) -> NDArray[np.float64] | None:
-    number = rb"([-+]?(?:\d+\.?\d*(?:[eE][-+]?\d+)?|\.\d+(?:[eE][-+]?\d+)?|nan|inf))"
-    other = rb"([\s\S])" if is_char else rb"([\s\S]{0,8}?)"
-    words = [other if k in raw else number for k in range(width)]
-    line = re.compile(b" ".join(words) + rb" ?\r?(?:\n|\Z)", re.IGNORECASE)
-    table, position = np.empty((points, width)), 0
-    for row in table:
-        match = line.match(body, position)
-        if match is None:
-            return None
-        row[:] = [
-            float(word) if k not in raw else word[0] if is_char else np.nan for k, word in enumerate(match.groups())
-        ]
+def _matches(line: re.Pattern[bytes], body: bytes, count: int) -> list[tuple[bytes, ...]]:
+    """Groups of `line` in lines that follow each other, as far as they match."""
+    rows: list[tuple[bytes, ...]] = []
+    position = 0
+    while len(rows) < count and (match := line.match(body, position)):
+        rows.append(match.groups())
         position = match.end()
-    return table
-
-
-def _binary_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:
-    need = header.points * header.record
-    if len(body) < need:
-        raise InputError(
-            f"{path}: PCD header says {header.points} points of {header.record} bytes, the file holds "
-            f"{len(body) // header.record if header.record else 0}"
-        )
-    columns, offset = {}, 0
-    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        shape, strides = (header.points, count), (header.record, dtype.itemsize)
-        columns[name] = np.ndarray(
-            shape[:1] if count == 1 else shape, dtype, body, offset, strides[:1] if count == 1 else strides
-        )
-        offset += dtype.itemsize * count
-    return columns
+    return rows
 
 
 def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:
     if len(body) < 8:
         raise InputError(f"{path}: PCD compressed data end before their two sizes")
     packed, plain = struct.unpack("<II", body[:8])
-    if plain != header.points * header.record or packed > len(body) - 8:
+    if plain != header.points * header.dtype.itemsize or packed > len(body) - 8:
         raise InputError(
             f"{path}: PCD compressed data are {len(body) - 8} bytes for {plain}, the header needs {packed} for "
-            f"{header.points * header.record}"
+            f"{header.points * header.dtype.itemsize}"
         )
     from lslam.kernels.lzf import decompress
 
@@ -239,12 +227,12 @@ def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[s
     source = np.frombuffer(body[8 : 8 + packed], np.uint8).copy()
     if decompress(source, out) != plain:
         raise InputError(f"{path}: PCD compressed data are damaged")
-    columns, offset = {}, 0
-    for name, dtype, count in zip(header.names, header.dtypes, header.counts, strict=True):
-        length = header.points * dtype.itemsize * count
-        values = out[offset : offset + length].view(dtype)
+    columns, at = {}, 0
+    for name, count, code in zip(header.names, header.counts, header.codes, strict=True):
+        size = header.points * count * code.itemsize
+        values = out[at : at + size].view(code)
         columns[name] = values if count == 1 else values.reshape(header.points, count)
-        offset += length
+        at += size
     return columns
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import AXES
+from lslam.formats.point_cloud import AXES, packed_columns
 from lslam.untrusted import whole_number
 
 _TYPES = {
@@ -48,11 +48,11 @@ def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
         if "list" in codes and (element.name == "vertex" or encoding != "ascii"):
             raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
         if element.name == "vertex":
-            if element.count == 0:
-                return {name: np.zeros(0, code) for name, code in element.properties}
-            if encoding == "ascii":
+            if encoding == "ascii" and element.count:
                 return _ascii_columns(path, element, body, skipped)
-            return _binary_columns(path, element, body, order, skipped)
+            names = [name for name, _ in element.properties]
+            dtype = np.dtype([(str(k), order + code) for k, code in enumerate(codes)])
+            return packed_columns(path, "PLY", names, dtype, element.count, body, skipped)
         record = sum(np.dtype(code).itemsize for code in codes if code != "list")
         skipped += element.count * (record if encoding != "ascii" else 1)
     raise InputError(f"{path}: PLY header has no element 'vertex'")
@@ -146,19 +146,3 @@ def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int
         name: table[:, k] if name.lower() in AXES or not code.startswith("f") else table[:, k].astype(code)
         for k, (name, code) in enumerate(element.properties)
     }
-
-
-def _binary_columns(
-    path: Path, element: _Element, body: memoryview, order: str, skipped: int
-) -> dict[str, NDArray[Any]]:
-    record = sum(np.dtype(code).itemsize for _, code in element.properties)
-    held = max(len(body) - skipped, 0)
-    if held < element.count * record:
-        raise InputError(
-            f"{path}: PLY header says {element.count} points of {record} bytes, the file holds {held // record}"
-        )
-    columns, offset = {}, skipped
-    for name, code in element.properties:
-        columns[name] = np.ndarray((element.count,), np.dtype(order + code), body, offset, (record,))
-        offset += np.dtype(code).itemsize
-    return columns

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,31 @@ def organised(rows: int, cols: int) -> dict[str, NDArray[Any]]:
     if min(rows, cols) < 2:
         return {}
     return {ORGANISED: np.asarray(np.divmod(np.arange(rows * cols), cols)[0 if rows <= cols else 1], np.uint32)}
+
+
+def packed_columns(
+    path: Path, kind: str, names: Sequence[str], dtype: np.dtype[Any], count: int, data: memoryview, at: int = 0
+) -> dict[str, NDArray[Any]]:
+    """One array per field of `count` points that lie one behind the other from byte `at`; the fields of `dtype` are numbered.
+
+    Raises InputError when the data end early.
+    """
+    record = dtype.itemsize
+    room = max(len(data) - at, 0)
+    if room < count * record:
+        whole = room // record
+        raise InputError(f"{path}: {kind} header says {count} points of {record} bytes, the file holds {whole}")
+    table = np.ndarray((count,), dtype, data, at if count else 0)
+    return {name: table[str(k)] for k, name in enumerate(names)}
+
+
+def float_table(points: NDArray[Any], intensity: NDArray[Any] | None) -> NDArray[np.float32]:
+    """(N, 3) points, or (N, 4) with their intensity, as files hold them."""
+    table = np.empty((len(points), 3 if intensity is None else 4), "<f4")
+    table[:, :3] = points
+    if intensity is not None:
+        table[:, 3] = intensity
+    return table
 
 
 def cloud_from_fields(

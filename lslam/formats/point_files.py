@@ -17,7 +17,7 @@ from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
 from lslam.formats.pcd_files import pcd_columns, pcd_header, write_pcd
 from lslam.formats.ply_files import ply_columns, ply_header, write_ply
-from lslam.formats.point_cloud import PointCloud, cloud_from_fields
+from lslam.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
 from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
 from lslam.remote import RemotePath
 from lslam.types.cloud import ArrayCloud, Cloud
@@ -26,6 +26,7 @@ from lslam.untrusted import MISFIT
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
 _MOST_COLUMNS = 64
+_PLACES = ("xyz", "point", "points", "position", "positions")
 # Coordinates beyond are those of a projection; of a map they shall lie in finer steps.
 LARGE_M, COARSE_M = 1e5, 0.01
 _FEW = 8
@@ -47,16 +48,12 @@ def _read_columns(path: Path, record: PointRecord | None = None) -> Mapping[str,
     if suffix == ".bin":
         raw = read_bytes(path)
         record = record or record_of({path: raw})[0]
-        check_size(path, raw, record)
+        _check_size(path, raw, record)
         return record.columns(raw)
-    if suffix == ".pcd":
-        return pcd_columns(path)
-    if suffix == ".ply":
-        return ply_columns(path)
     if suffix == ".npy":
         return _npy_columns(path, record)
-    if suffix == ".txt":
-        return _text_columns(path)
+    if suffix in _COLUMNS:
+        return _COLUMNS[suffix](path)
     raise InputError(f"{path}: no point file lslam reads; known suffixes: {', '.join(SUFFIXES)}")
 
 
@@ -77,11 +74,11 @@ def read_bin(path: Path) -> NDArray[np.float32]:
     Raises InputError naming the file and its size when that is no multiple of 16 bytes.
     """
     raw = read_bytes(path)
-    check_size(path, raw, KITTI)
+    _check_size(path, raw, KITTI)
     return raw.view("<f4").reshape(-1, 4)
 
 
-def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
+def _check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
     """Raise InputError when the bytes of a file are no multiple of those of a point."""
     if len(raw) % record.size:
         what = "x, y, z, intensity as float32" if record == KITTI else str(record)
@@ -97,16 +94,15 @@ def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str
     Raises InputError with the sizes that would fit when no record fits or several do.
     """
     recognition = recognise(list(files.values()))
-    record = recognition.record
-    if record is not None:
-        return record, recognition.reason
+    if recognition.record is not None:
+        return recognition.record, recognition.reason
     path, raw = next((path, raw) for path, raw in files.items() if len(raw))
-    fitting = " or ".join(f"{r.size} bytes ({r})" for r in recognition.fitting)
-    if not fitting and len(raw) % KITTI.size:
-        check_size(path, raw, KITTI)
-    could = f"its values allow records of {fitting}" if fitting else (
-        f"it could be truncated, or its records are of {_other_sizes(len(raw), KITTI)} bytes"
-    )  # fmt: skip
+    if recognition.fitting:
+        records = " or ".join(f"{record.size} bytes ({record})" for record in recognition.fitting)
+        could = f"its values allow records of {records}"
+    else:
+        _check_size(path, raw, KITTI)
+        could = f"it could be truncated, or its records are of {_other_sizes(len(raw), KITTI)} bytes"
     raise InputError(f"{path}: as {KITTI} of {KITTI.size} bytes {recognition.reason}; {could}: {WAY_OUT}")
 
 
@@ -129,10 +125,7 @@ def write_points(path: Path, points: NDArray[Any], intensity: NDArray[Any] | Non
     elif suffix == ".pcd":
         write_pcd(path, points, intensity)
     elif suffix in (".bin", ".npy"):
-        table = np.zeros((len(points), 4), "<f4")
-        table[:, :3] = points
-        if intensity is not None:
-            table[:, 3] = intensity
+        table = float_table(points, np.zeros(len(points)) if intensity is None else intensity)
         with atomic_write(path) as stream:
             if suffix == ".npy":
                 np.save(stream, table)
@@ -173,20 +166,12 @@ def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray
 
 def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
     """Fields of one number each; three together are x, y and z where no field has these names."""
-    columns: dict[str, NDArray[Any]] = {}
-    names = {name.lower() for name in table.dtype.names or ()}
-    for name in table.dtype.names or ():
-        values = table[name]
-        if values.dtype.kind not in "fiu":
-            continue
-        if values.ndim == 1:
-            columns[name] = values
-        elif (
-            values.shape[1:] == (3,)
-            and name.lower() in ("xyz", "point", "points", "position", "positions")
-            and "x" not in names
-        ):
-            columns |= {axis: values[:, k] for k, axis in enumerate("xyz")}
+    numbers = [name for name in table.dtype.names or () if table[name].dtype.kind in "fiu"]
+    columns = {name: table[name] for name in numbers if table[name].ndim == 1}
+    is_placed = "x" in map(str.lower, columns)
+    for name in () if is_placed else numbers:
+        if name.lower() in _PLACES and table[name].shape[1:] == (3,):
+            columns |= {axis: table[name][:, k] for k, axis in enumerate(AXES)}
     return columns
 
 
@@ -200,6 +185,9 @@ def _text_columns(path: Path) -> dict[str, NDArray[Any]]:
     if table.shape[1] != 4:
         raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
     return dict(zip(KITTI.names, table.T, strict=True))
+
+
+_COLUMNS = {".pcd": pcd_columns, ".ply": ply_columns, ".txt": _text_columns}
 
 
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
@@ -224,11 +212,7 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
     with atomic_write(path) as stream:
         stream.write(ply_header(len(cloud), names, comment) if suffix == ".ply" else pcd_header(len(cloud), names))
         for block in cloud.blocks():
-            table = np.empty((len(block), len(names)), "<f4")
-            table[:, :3] = block.points
-            if block.intensity is not None:
-                table[:, 3] = block.intensity
-            stream.write(table.data)
+            stream.write(float_table(block.points, block.intensity).data)
 
 
 def read_cloud(path: Path) -> ArrayCloud:
