@@ -87,7 +87,7 @@ class BagSequence(Scans):
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
     uses: dict[str, str] = field(default_factory=dict)
-    halves: Halves = field(default_factory=Halves)
+    halves: Halves = field(default_factory=dict)
     revolutions: Revolutions | None = None
     unit_m: float | None = None
 
@@ -207,7 +207,7 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
         opened, frame = open_packets(bag, topic, voice)
         stamps = opened.revolutions.stamps_ns
         ((name, _),) = choose_lidars(topic, [frame or UNNAMED], info.lidar_frame, voice)
-        index = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, Halves())
+        index = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, {})
         found: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
     else:
         found = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]

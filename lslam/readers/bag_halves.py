@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,20 +25,9 @@ _LOOKED_AT = 40  # stamps; of more of them so many are looked at before the reco
 _BINS = 90  # of azimuth
 _FULL = 5 / 6  # of all directions, by 12 deg: the sensor turns, and what it sees again is another revolution
 _SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
-_CELL_RAD = 1e-3  # of directions: those of another return are the same, those between two columns are not
-_BURST = 0.25  # of the time between scans: what is recorded together was measured together
 
-
-@dataclass(frozen=True)
-class Halves:
-    """Further messages of a scan by the first of them; what is recorded within `burst_ns` is taken to be measured together."""
-
-    others: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
-    burst_ns: float = 0.0
-
-    def is_burst(self, topic: BagTopic, first: int, other: int) -> bool:
-        """Whether two messages were recorded together; a bag whose times of recording are the stamps does not tell."""
-        return 0 < int(topic.stamps_ns[other]) - int(topic.stamps_ns[first]) <= self.burst_ns
+# Further messages of a scan, by the first of them.
+Halves = Mapping[int, tuple[int, ...]]
 
 
 def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
@@ -57,11 +47,7 @@ def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
 
 def read_whole(bag: Bag, topic: BagTopic, k: int, halves: Halves) -> tuple[PointCloud, int]:
     """As `read_cloud`, with what the other messages of its stamp add."""
-    cloud, shift = read_cloud(bag, topic, k)
-    for other in halves.others.get(k, ()):
-        more, base = read_cloud(bag, topic, other)
-        whole = join(cloud, more, base - shift, halves.is_burst(topic, k, other))
-        cloud = cloud if whole is None else whole
+    cloud, shift, _ = _put_together(bag, topic, (k, *halves.get(k, ())))
     return cloud, shift
 
 
@@ -71,38 +57,38 @@ def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, fra
     On many stamps not all are looked at: what is no part of a scan after all is left out when the scan is read.
     """
     groups = _groups(messages, stamps, frames)
-    steps = np.diff(np.unique(stamps))
-    none = Halves(burst_ns=_BURST * float(np.median(steps)) if len(steps) else 0.0)
-    looked_at = np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _LOOKED_AT)).round().astype(int)).tolist()
-    parts = {n: _parts(bag, topic, groups[n], none) for n in (looked_at if groups else [])}
+    if not groups:
+        return {}
+    parts: dict[int, tuple[int, ...]] = {}
+    for n in np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _LOOKED_AT)).round().astype(int)).tolist():
+        parts[n] = ()
+        with suppress(InputError):
+            parts[n] = _put_together(bag, topic, groups[n])[2]
     if not any(parts.values()):
-        return none
-    found = {group[0]: parts.get(n, group[1:]) for n, group in enumerate(groups) if parts.get(n, group[1:])}
-    said = "" if len(parts) == len(groups) else f", as {sum(map(bool, parts.values()))} of {len(parts)} looked at are"
+        return {}
+    halves = {group[0]: others for n, group in enumerate(groups) if (others := parts.get(n, group[1:]))}
+    sample = "" if len(parts) == len(groups) else f", as {sum(map(bool, parts.values()))} of {len(parts)} looked at are"
     voice.notes.append(
-        f"{topic.name}: {len(found)} scans come in several messages of one stamp, which see other directions, rings or times: "
-        f"put together{said}"
+        f"{topic.name}: {len(halves)} scans come in several messages of one stamp, which see other directions, rings or times: "
+        f"put together{sample}"
     )
-    return replace(none, others=found)
+    return halves
 
 
-def join(a: PointCloud, b: PointCloud, later_ns: int = 0, is_burst: bool = False) -> PointCloud | None:
+def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
     """Both as one cloud in the order they were measured, where they are parts of one scan; None where they are not.
 
-    later_ns : of the base of b's times, which are ns then; is_burst : they were recorded together
+    later_ns : of the base of b's times, which are ns then
     """
-    if not len(b):
-        return a
-    if not len(a):
-        return b
+    if not len(a) or not len(b):
+        return a if len(a) else b
     if later_ns:
         a, b = _moved(a, 0), _moved(b, later_ns)
-    times = _times_of_both(a, b)
     is_alike = (a.times is None) == (b.times is None) and (a.rings is None) == (b.rings is None)
-    if not is_alike or not _adds(a.select(is_measured(a.points)), b.select(is_measured(b.points)), is_burst):
+    if not is_alike or not _is_complement(a.select(is_measured(a.points)), b.select(is_measured(b.points))):
         return None
     first, last = a, b
-    if times is not None and _when(times[1])[1] < _when(times[0])[1]:
+    if a.times is not None and b.times is not None and _when(b.times)[1] < _when(a.times)[1]:
         first, last = b, a
     of_last = {clock.name: clock.values for clock in last.clocks}
     return replace(
@@ -127,39 +113,23 @@ def _groups(messages: Stamps, stamps: Stamps, frames: list[str]) -> list[tuple[i
     return [tuple(group) for group in by_stamp.values() if 1 < len(group) <= _MOST]
 
 
-def _parts(bag: Bag, topic: BagTopic, group: tuple[int, ...], halves: Halves) -> tuple[int, ...]:
-    """Which messages of a group add to the first."""
-    try:
-        cloud, shift = read_cloud(bag, topic, group[0])
-        parts = []
-        for k in group[1:]:
-            more, base = read_cloud(bag, topic, k)
-            whole = join(cloud, more, base - shift, halves.is_burst(topic, group[0], k))
-            if whole is not None and len(more):
-                cloud = whole
-                parts.append(k)
-        return tuple(parts)
-    except InputError:
-        return ()
+def _put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[PointCloud, int, tuple[int, ...]]:
+    """The cloud of messages of one stamp, ns from it to the base of their times, and which messages add to the first."""
+    cloud, shift = read_cloud(bag, topic, group[0])
+    parts = []
+    for k in group[1:]:
+        more, base = read_cloud(bag, topic, k)
+        whole = join(cloud, more, base - shift)
+        if whole is not None and len(more):
+            cloud = whole
+            parts.append(k)
+    return cloud, shift, tuple(parts)
 
 
 def _moved(cloud: PointCloud, later_ns: int) -> PointCloud:
     """The cloud with times in ns that count from an earlier base."""
     clocks = (replace(clock, values=clock.values.astype(np.int64) + later_ns) for clock in cloud.clocks)
     return replace(cloud, clocks=tuple(clocks))
-
-
-def _times_of_both(a: PointCloud, b: PointCloud) -> tuple[NDArray[Any], NDArray[Any]] | None:
-    if a.times is None or b.times is None or a.times.dtype != b.times.dtype:
-        return None
-    return a.times, b.times
-
-
-def _adds(a: PointCloud, b: PointCloud, is_burst: bool) -> bool:
-    """Whether b sees what a does not; of both only what was measured."""
-    if not len(a) or not len(b):
-        return len(b) > 0
-    return _is_complement(a, b) or (is_burst and _sees_between(a, b))
 
 
 def _is_complement(a: PointCloud, b: PointCloud) -> bool:
@@ -172,32 +142,16 @@ def _is_complement(a: PointCloud, b: PointCloud) -> bool:
         if len(own) and not np.isin(own, a.rings).any():
             return True
     is_turning = max(float(of.reshape(-1, 3).any(axis=1).mean()) for of in (of_a, of_b)) > _FULL
-    times = _times_of_both(a, b)
-    return times is not None and not is_turning and _overlap(*times) <= _SHARED
-
-
-def _sees_between(a: PointCloud, b: PointCloud) -> bool:
-    """Whether b sees directions between those of a, every second column, say; another return of the same beams does not."""
-    of_a, of_b = (
-        np.round(np.column_stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))]) / _CELL_RAD).astype(np.int64)
-        @ [1 << 20, 1]
-        for x, y, z in (cloud.points.T.astype(np.float64) for cloud in (a, b))
-    )
-    return bool(np.isin(of_b, of_a).mean() <= _SHARED)
+    if is_turning or a.times is None or b.times is None:
+        return False
+    (a0, _, a1), (b0, _, b1) = _when(a.times), _when(b.times)
+    shorter = min(a1 - a0, b1 - b0)
+    return shorter > 0 and min(a1, b1) - max(a0, b0) <= _SHARED * shorter
 
 
 def _azimuths(cloud: PointCloud) -> NDArray[np.int64]:
-    """(90,) points of each 4 deg; those at the sensor itself were not measured."""
-    x, y = cloud.points[:, 0], cloud.points[:, 1]
-    turn = np.degrees(np.arctan2(y, x))[(x != 0) | (y != 0)]
-    return np.histogram(turn, _BINS, (-180, 180))[0]
-
-
-def _overlap(a: NDArray[Any], b: NDArray[Any]) -> float:
-    """Which part of the shorter span of times the other shares."""
-    (a0, _, a1), (b0, _, b1) = _when(a), _when(b)
-    shorter = min(a1 - a0, b1 - b0)
-    return float((min(a1, b1) - max(a0, b0)) / shorter) if shorter > 0 else 1.0
+    """(90,) points of each 4 deg."""
+    return np.histogram(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0])), _BINS, (-180, 180))[0]
 
 
 def _when(times: NDArray[Any]) -> tuple[float, float, float]:

@@ -57,31 +57,27 @@ def choose_lidars(
     another in the middle of the recording is no other LiDAR. Raises UsageError for names that the topic does not have.
     """
     counts = Counter(names)
-    if wanted not in (None, ALL):
-        assert wanted is not None
-        return [(name, _of(names, name)) for name in _wished(topic, counts, wanted)]
     changes = [k for k, (a, b) in enumerate(pairwise(names), 1) if a != b]
-    if len(changes) < len(counts):
+    first, *others = (name for name, _ in counts.most_common())
+    if wanted not in (None, ALL):
+        chosen = _wished(topic, counts, str(wanted))
+    elif len(changes) < len(counts):
         if changes:
             voice.problems.append(
                 f"{topic.name}: the frame of the scans changes from {names[0]} to {names[changes[0]]} at message {changes[0]}: "
                 "taken for one LiDAR that was renamed; --lidar-frame takes the scans of one name"
             )
         return [(names[0], np.ones(len(names), np.bool_))]
-    ranked = [name for name, _ in counts.most_common()]
-    if wanted == ALL:
-        return [(name, _of(names, name)) for name in ranked]
-    first, *others = ranked
-    left_out = ", ".join(f"{name} ({counts[name]})" for name in others)
-    voice.problems.append(
-        f"{topic.name} holds the scans of {len(ranked)} LiDARs in turns: those of {first} ({counts[first]} messages) are read, "
-        f"those of {left_out} are not; --lidar-frame {others[0]} takes another one, --lidar-frame {ALL} merges them"
-    )
-    return [(first, _of(names, first))]
-
-
-def _of(names: Sequence[str], name: str) -> NDArray[np.bool_]:
-    return np.array([n == name for n in names], np.bool_)
+    elif wanted == ALL:
+        chosen = [first, *others]
+    else:
+        chosen = [first]
+        left_out = ", ".join(f"{name} ({counts[name]})" for name in others)
+        voice.problems.append(
+            f"{topic.name} holds the scans of {len(counts)} LiDARs in turns: those of {first} ({counts[first]} messages) are "
+            f"read, those of {left_out} are not; --lidar-frame {others[0]} takes another one, --lidar-frame {ALL} merges them"
+        )
+    return [(name, np.array(names) == name) for name in chosen]
 
 
 def _wished(topic: BagTopic, counts: Counter[str], wanted: str) -> list[str]:

@@ -151,7 +151,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     for name, mine in chosen:
         its = [names[k] for k in np.flatnonzero(mine)]
         halves = find_halves(bag, topic, messages[mine], headers[mine], its, voice)
-        own = mine & is_own & ~np.isin(messages, [k for others in halves.others.values() for k in others])
+        own = mine & is_own & ~np.isin(messages, [k for others in halves.values() for k in others])
         what = f"{topic.name}: scans" if len(chosen) == 1 else f"{topic.name}: scans of {name}"
         order, ordered = put_in_order(headers[own], recorded[own], what, voice)
         if np.array_equal(ordered, headers[own][order]):

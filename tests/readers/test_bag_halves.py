@@ -105,17 +105,6 @@ def test_blocks_of_rings_are_put_together(tmp_path: Path) -> None:
     assert_whole(open_sequence(write(tmp_path / "a.mcap", messages)), 4)
 
 
-COLUMNS = np.arange(1440) // 8 % 2 == 0
-
-
-def test_every_second_column_is_put_together_where_both_are_recorded_at_once(tmp_path: Path) -> None:
-    """A stamp that stands still for two turns gives the same picture, but for the times of recording."""
-    messages = [m for k in range(4) for m in parted(k, [COLUMNS, ~COLUMNS])]
-    assert_whole(open_sequence(write(tmp_path / "a.mcap", messages)), 4)
-    apart = [m for k in range(4) for m in parted(2 * k, [COLUMNS, ~COLUMNS], STEP_NS)]
-    assert max(map(len, open_sequence(write(tmp_path / "b.mcap", apart)))) == 720
-
-
 def test_halves_of_a_sensor_that_does_not_turn_are_told_by_their_times(tmp_path: Path) -> None:
     """Seventy degrees, scanned twice in a sweep: all directions are seen by both halves."""
 
