@@ -24,11 +24,12 @@ from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
 from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
+    GNSS,
+    IMU,
     check_parts,
     choose_clouds,
     index_scans,
-    load_fixes,
-    load_imu,
+    load_companion,
     put_in_order,
     say_broken,
 )
@@ -172,8 +173,8 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
         lidars += _lidars_of(bag, topic, info, voice, bool(lidars))
     (leading, sequence, opened), frame = lidars[0], lidars[0][0].frame
     stamps, own = sequence.stamps_ns, opened if info.imu_topic is None else None
-    imu = load_imu(bag, info.imu_topic, voice) if own is None or own.imu is None else None
-    gnss = load_fixes(bag, info.gnss_topic, voice)
+    imu = load_companion(bag, IMU, info.imu_topic, voice) if own is None or own.imu is None else None
+    gnss = load_companion(bag, GNSS, info.gnss_topic, voice)
     for what, stream in (("IMU", imu), ("GNSS", gnss)):
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
             voice.problems.append(no_shared_time(what))

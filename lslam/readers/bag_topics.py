@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -76,13 +76,12 @@ def check_parts(bag: Bag, topic: BagTopic) -> None:
 
     They are when the next one begins where one has ended, or soon after, and neither tells of the time of the other.
     """
-    spans: dict[Path, tuple[int, int, int]] = {}
+    stamps: dict[Path, list[Stamps]] = {}
     for recording, part in topic.parts:
         if len(part):
-            begin, end, count = spans.get(recording.path, (int(part.stamps_ns[0]), 0, 0))
-            span = min(begin, int(part.stamps_ns[0])), max(end, int(part.stamps_ns[-1]))
-            spans[recording.path] = (*span, count + len(part))
-    parts = sorted((*span, path) for path, span in spans.items())
+            stamps.setdefault(recording.path, []).append(part.stamps_ns)
+    spans = ((path, np.concatenate(pieces)) for path, pieces in stamps.items())
+    parts = sorted((int(own.min()), int(own.max()), len(own), path) for path, own in spans)
     for (begin, end, count, path), (start, stop, following_count, following) in pairwise(parts):
         wrong = ""
         if start - end > _APART_NS:
@@ -97,24 +96,53 @@ def check_parts(bag: Bag, topic: BagTopic) -> None:
             )
 
 
-def load_imu(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:
-    """The IMU on topic `wanted`, or on the only one that has one; None, said in `voice`, when there are several."""
-    return _load(bag, wanted, voice, "IMU", "--imu-topic", "Imu", read_imu)
+@dataclass(frozen=True)
+class Companion:
+    """A kind of messages that ride along: its name, flag and message type, how it is read, and the options that need it."""
+
+    name: str
+    flag: str
+    type: str
+    read: Callable[[Bag, BagTopic, list[str]], Stream]
+    wish: str
 
 
-def load_fixes(bag: Bag, wanted: str | None, voice: Voice) -> Stream | None:
-    """The satellite fixes on topic `wanted`, or on the only one that has some; None, said in `voice`, when there are several."""
-    return _load(bag, wanted, voice, "GNSS", "--gnss-topic", "NavSatFix", read_fixes)
+IMU = Companion("IMU", "--imu-topic", "Imu", read_imu, "--imu")
+GNSS = Companion("GNSS", "--gnss-topic", "NavSatFix", read_fixes, "--gnss and --georeference")
 
 
-def why_no_imu(bag: Bag) -> LslamError:
-    """What to tell one who asks for the IMU of a bag that gave none: choose among several, or there is none."""
-    return _why_none(bag, "IMU", "--imu-topic", "Imu", "--imu")
+def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) -> Stream | None:
+    """What rides along on topic `wanted`, or on the only one of its kind; None, said in `voice`, when there are several."""
+    topics = bag.of_type(kind.type)
+    if wanted is not None:
+        topics = [_named(bag, topics, wanted, kind.flag, f"{kind.type} messages")]
+    if len(topics) > 1:
+        voice.problems.append(
+            f"{kind.name}: {len(topics)} topics have one, none is used until one is chosen:\n{_flags(topics, kind.flag)}"
+        )
+    if len(topics) != 1:
+        return None
+    topic, what, broken = topics[0], f"{kind.name}: samples", list[str]()
+    stream = kind.read(bag, topic, broken)
+    say_broken(broken, topic.name, voice)
+    if not len(stream.stamps_ns):
+        voice.problems.append(f"{kind.name}: {topic.name} holds {len(topic)} messages and none that can be used")
+        return None
+    own = np.flatnonzero(_no_copies(stream.stamps_ns, lambda i: stream.values[i].tobytes(), what, voice))
+    order, stamps = put_in_order(stream.stamps_ns[own], stream.recorded_ns[own], what, voice)
+    voice.notes.append(f"{kind.name} from {topic.name} ({len(topic)} messages, frame {stream.frame or 'unnamed'})")
+    kept = own[order]
+    return replace(stream, stamps_ns=stamps, values=stream.values[kept], recorded_ns=stream.recorded_ns[kept])
 
 
-def why_no_fixes(bag: Bag) -> LslamError:
-    """As `why_no_imu`, of satellite fixes."""
-    return _why_none(bag, "GNSS", "--gnss-topic", "NavSatFix", "--gnss and --georeference")
+def why_none(bag: Bag, kind: Companion) -> LslamError:
+    """What to tell one who asks for what a bag did not give: choose among several, or there is none."""
+    topics = bag.of_type(kind.type)
+    if len(topics) > 1:
+        flags = _flags(topics, kind.flag)
+        return UsageError(f"{bag.path} has {kind.name} on {len(topics)} topics, choose one:\n{flags}")
+    fact = f"{topics[0].name} holds none that can be used" if topics else f"no topic is sensor_msgs/{kind.type}"
+    return InputError(f"{bag.path} has no {kind.name}: {fact}; {_listing(bag)}; run without {kind.wish}")
 
 
 def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> list[ScanIndex]:
@@ -254,58 +282,16 @@ def say_broken(broken: Sequence[str], topic: str, voice: Voice) -> None:
         voice.problems.append(f"{len(broken) - _SAID} more messages of {topic} are damaged")
 
 
-def _load(
-    bag: Bag,
-    wanted: str | None,
-    voice: Voice,
-    what: str,
-    flag: str,
-    kind: str,
-    read: Callable[[Bag, BagTopic, list[str]], Stream],
-) -> Stream | None:
-    topics = bag.of_type(kind)
-    if wanted is not None:
-        topic = _named(bag, topics, wanted, flag, f"{kind} messages")
-    elif len(topics) == 1:
-        topic = topics[0]
-    else:
-        if topics:
-            voice.problems.append(
-                f"{what}: {len(topics)} topics have one, none is used until one is chosen:\n{_flags(topics, flag)}"
-            )
-        return None
-    broken: list[str] = []
-    stream = read(bag, topic, broken)
-    say_broken(broken, topic.name, voice)
-    if not len(stream.stamps_ns):
-        voice.problems.append(f"{what}: {topic.name} holds {len(topic)} messages and none that can be used")
-        return None
-    own = _no_copies(stream.stamps_ns, lambda i: stream.values[i].tobytes(), f"{what}: samples", voice)
-    order, stamps = put_in_order(stream.stamps_ns[own], stream.recorded_ns[own], f"{what}: samples", voice)
-    voice.notes.append(f"{what} from {topic.name} ({len(topic)} messages, frame {stream.frame or 'unnamed'})")
-    kept = np.flatnonzero(own)[order]
-    return replace(stream, stamps_ns=stamps, values=stream.values[kept], recorded_ns=stream.recorded_ns[kept])
-
-
-def _why_none(bag: Bag, what: str, flag: str, kind: str, wish: str) -> LslamError:
-    topics = bag.of_type(kind)
-    if len(topics) > 1:
-        return UsageError(f"{bag.path} has {what} on {len(topics)} topics, choose one:\n{_flags(topics, flag)}")
-    fact = f"{topics[0].name} holds none that can be used" if topics else f"no topic is sensor_msgs/{kind}"
-    return InputError(f"{bag.path} has no {what}: {fact}; {_listing(bag)}; run without {wish}")
-
-
 def _named(bag: Bag, topics: list[BagTopic], wanted: str, flag: str, what: str) -> BagTopic:
-    for topic in topics:
-        if topic.name.strip("/") == wanted.strip("/"):
-            return topic
-    there = next((t for t in bag.topics if t.name.strip("/") == wanted.strip("/")), None)
+    for own in topics:
+        if own.name.strip("/") == wanted.strip("/"):
+            return own
+    other = next((t for t in bag.topics if t.name.strip("/") == wanted.strip("/")), None)
     fact = (
-        "is not there" if there is None else f"holds {len(there)} messages of type {there.type or 'unknown'}, no {what}"
+        "is not there" if other is None else f"holds {len(other)} messages of type {other.type or 'unknown'}, no {what}"
     )
-    if topics:
-        raise UsageError(f"{flag} {wanted}: the topic {fact} in {bag.path}; choose one:\n{_flags(topics, flag)}")
-    raise UsageError(f"{flag} {wanted}: the topic {fact} in {bag.path}; {_listing(bag)}")
+    way_out = f"choose one:\n{_flags(topics, flag)}" if topics else _listing(bag)
+    raise UsageError(f"{flag} {wanted}: the topic {fact} in {bag.path}; {way_out}")
 
 
 def _flags(topics: list[BagTopic], flag: str) -> str:

@@ -14,7 +14,7 @@ from lslam.formats.bag_files import Bag
 from lslam.formats.calibration_files import read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.stamp_files import read_stamps
-from lslam.readers.bag_topics import why_no_fixes, why_no_imu
+from lslam.readers.bag_topics import GNSS, IMU, why_none
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND
 from lslam.readers.lookup import sequence_number
@@ -61,7 +61,7 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
         return sequence
     bag: Bag | None = getattr(sequence, "bag", None)
     if bag is not None:
-        raise why_no_imu(bag)
+        raise why_none(bag, IMU)
     number = sequence_number(sequence.path.name)
     if not isinstance(sequence, FolderSequence):
         raise InputError(
@@ -84,7 +84,7 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
         return sequence
     bag: Bag | None = getattr(sequence, "bag", None)
     if bag is not None:
-        raise why_no_fixes(bag)
+        raise why_none(bag, GNSS)
     number = sequence_number(sequence.path.name)
     if not isinstance(sequence, FolderSequence):
         return sequence
