@@ -14,6 +14,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol
@@ -137,11 +138,13 @@ class Bag:
             f"{every[k].path.name} is left out: all of it is in {every[n].path.name} as well" for k, n in copies.items()
         ]
         self.files = [recording.path for recording in recordings]
+        # A file that was cut off may have lost the type, which the other parts tell.
+        types = {(t.name, t.encoding): t.type for recording in recordings for t in recording.topics if t.type}
         topics: dict[tuple[str, str, str], BagTopic] = {}
         for recording in recordings:
             for topic in recording.topics:
-                kind = _OLD_NAMES.get(topic.type, topic.type)
-                key = (topic.name, kind or _type_elsewhere(topic, recordings), topic.encoding)
+                kind = topic.type or types.get((topic.name, topic.encoding), "")
+                key = (topic.name, _OLD_NAMES.get(kind, kind), topic.encoding)
                 topics.setdefault(key, BagTopic(*key)).parts.append((recording, topic))
         self.topics = sorted(topics.values(), key=lambda t: t.name)
         _check_encodings(path, self.topics)
@@ -218,26 +221,16 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
     return recordings
 
 
-def _type_elsewhere(topic: Topic, recordings: list[Recording]) -> str:
-    """What the other files say of the type of a topic whose own file lost it; empty where they say nothing, or several things."""
-    types = {
-        t.type for r in recordings for t in r.topics if (t.name, t.encoding) == (topic.name, topic.encoding) and t.type
-    }
-    return types.pop() if len(types) == 1 else ""
-
-
 def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
     """Raise InputError for a topic of ROS 1 that is one of ROS 2 as well."""
-    there: dict[str, BagTopic] = {}
-    for topic in topics:
-        if len(topic) and topic.encoding in _ENCODINGS:
-            other = there.setdefault(topic.name, topic)
-            if other.encoding != topic.encoding:
-                files = ", ".join(t.parts[0][0].path.name for t in (other, topic))
-                raise InputError(
-                    f"{path} holds bags of ROS 1 and of ROS 2 ({files}) that are no copies of each other, and {topic.name} is in "
-                    "both: name one of them"
-                )
+    legible = [topic for topic in topics if len(topic) and topic.encoding in _ENCODINGS]
+    for topic, other in pairwise(legible):
+        if other.name == topic.name and other.encoding != topic.encoding:
+            files = ", ".join(t.parts[0][0].path.name for t in (topic, other))
+            raise InputError(
+                f"{path} holds bags of ROS 1 and of ROS 2 ({files}) that are no copies of each other, and {topic.name} is in "
+                "both: name one of them"
+            )
 
 
 def _reader(path: Path, there: Path) -> _Reader:

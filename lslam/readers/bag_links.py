@@ -39,10 +39,9 @@ class Links:
         """Read /tf_static; a pair that it tells of differently is named."""
         for pair, poses in self._read(True).items():
             self.static[pair] = poses[-1]
-            metres, turn = _spread(poses)
-            if metres > _STILL_M or turn > _STILL_RAD:
+            if not _is_still(poses):
                 self.voice.problems.append(
-                    f"/tf_static says more than one thing of {pair[0]} -> {pair[1]}, {_apart(metres, turn)}: the last one counts"
+                    f"/tf_static says more than one thing of {pair[0]} -> {pair[1]}, {_spread_text(poses)}: the last one counts"
                 )
 
     def find(self, a: str, b: str) -> tuple[Floats, str] | None:
@@ -60,34 +59,29 @@ class Links:
         """Why `find` gives nothing."""
         if not a or not b:
             return "messages name no frame"
-        moving = {pair: poses[0] for pair, poses in self._told.items() if pair not in self._still}
+        moving = {pair: poses[0] for pair, poses in self._of_tf.items() if pair not in self._still}
         every = {**moving, **self._still}
         if moving and chain(every, a, b) is not None:
             broken = [pair for pair in moving if chain({p: T for p, T in every.items() if p != pair}, a, b) is None]
-            what = ", ".join(f"{p} -> {c}, which {self._behaviour((p, c))}" for p, c in broken or list(moving))
-            return f"the way from frame {a} to {b} leads over {what}"
+            links = []
+            for parent, child in broken or moving:
+                poses = self._of_tf[parent, child]
+                how = "/tf says only once" if len(poses) == 1 else f"changes on /tf ({_spread_text(poses)})"
+                links.append(f"{parent} -> {child}, which {how}")
+            return f"the way from frame {a} to {b} leads over {', '.join(links)}"
         there = "no transform leads" if every else "there is no /tf_static that leads"
         return f"{there} from frame {a} to {b}"
 
     @cached_property
-    def _told(self) -> Transforms:
+    def _of_tf(self) -> Transforms:
         """All that /tf says, (N, 4, 4) by pair."""
         return self._read(False)
 
     @cached_property
     def _still(self) -> Transforms:
         """/tf_static, and of /tf what it says more than once and always the same."""
-        same = {
-            pair: poses[0]
-            for pair, poses in self._told.items()
-            if len(poses) > 1
-            and all(d <= limit for d, limit in zip(_spread(poses), (_STILL_M, _STILL_RAD), strict=True))
-        }
+        same = {pair: poses[0] for pair, poses in self._of_tf.items() if len(poses) > 1 and _is_still(poses)}
         return {**same, **self.static}
-
-    def _behaviour(self, pair: tuple[str, str]) -> str:
-        poses = self._told[pair]
-        return "/tf says only once" if len(poses) == 1 else f"changes on /tf ({_apart(*_spread(poses))})"
 
     def _read(self, wants_static: bool) -> Transforms:
         found: dict[tuple[str, str], list[Floats]] = {}
@@ -143,5 +137,11 @@ def _spread(poses: Floats) -> tuple[float, float]:
     )
 
 
-def _apart(metres: float, turn: float) -> str:
+def _is_still(poses: Floats) -> bool:
+    metres, turn = _spread(poses)
+    return metres <= _STILL_M and turn <= _STILL_RAD
+
+
+def _spread_text(poses: Floats) -> str:
+    metres, turn = _spread(poses)
     return f"{metres:.3f} m and {np.degrees(turn):.1f} deg apart"

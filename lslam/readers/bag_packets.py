@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +30,7 @@ _OUSTER_FRAME = "os_sensor"
 class BagPackets:
     """Satisfies `Packets`.
 
-    stamps_ns, sizes, sources : (N,); topic, message, number : (N,) where each lies: of `topics`, of the topic, in the message
+    stamps_ns, sizes, sources : (N,); places : (N, 3) which of `topics`, message of the topic, and packet of the message
     heads : (N, P) the bytes at `positions` of each
     """
 
@@ -37,9 +39,7 @@ class BagPackets:
     stamps_ns: Integers
     sizes: Integers
     sources: Integers
-    topic: NDArray[np.int8]
-    message: NDArray[np.int32]
-    number: NDArray[np.int16]
+    places: NDArray[np.int32]
     positions: tuple[int, ...]
     heads: NDArray[np.uint8]
 
@@ -52,14 +52,11 @@ class BagPackets:
 
     def payloads(self, which: Integers) -> NDArray[np.uint8]:
         """(K, size) the packets `which`, which are of one size."""
-        rows: list[NDArray[np.uint8]] = []
-        there, packets = (-1, -1), np.zeros((0, 0), np.uint8)
-        for k in which.tolist():
-            if there != (place := (int(self.topic[k]), int(self.message[k]))):
-                topic = self.topics[place[0]]
-                there, packets = place, read_packets(topic, self.bag.message(topic, place[1]))[1]
-            rows.append(packets[self.number[k]])
-        return np.stack(rows) if rows else np.zeros((0, 0), np.uint8)
+        rows = []
+        for (n, message), places in groupby(self.places[which].tolist(), itemgetter(0, 1)):
+            packets = read_packets(self.topics[n], self.bag.message(self.topics[n], message))[1]
+            rows.append(packets[[number for _, _, number in places]])
+        return np.concatenate(rows) if rows else np.zeros((0, 0), np.uint8)
 
 
 def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
@@ -102,16 +99,16 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
             inside = [i for i, p in enumerate(positions) if p < size]
             head[:, inside] = packets[:, [positions[i] for i in inside]]
             heads.append(head)
-            places.append(np.column_stack([np.full((count, 2), (n, k)), np.arange(count)]))
+            places.append(np.column_stack([np.full((count, 2), (n, k)), np.arange(count)]).astype(np.int32))
         say_broken(broken, topic.name, voice)
     if not sum(map(len, sizes)):
         raise InputError(f"{bag.path}: {topics[0].name} holds no packets that can be read")
-    place = np.concatenate(places)
-    of_all = np.concatenate(sizes)
-    return BagPackets(
-        bag, tuple(topics), np.concatenate(stamps), of_all, np.zeros(len(of_all), np.int64), place[:, 0].astype(np.int8),
-        place[:, 1].astype(np.int32), place[:, 2].astype(np.int16), positions, np.concatenate(heads),
-    ), frame  # fmt: skip
+    all_sizes = np.concatenate(sizes)
+    packets_of_all = BagPackets(
+        bag, tuple(topics), np.concatenate(stamps), all_sizes, np.zeros_like(all_sizes),
+        np.concatenate(places), positions, np.concatenate(heads),
+    )  # fmt: skip
+    return packets_of_all, frame
 
 
 def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
