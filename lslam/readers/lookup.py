@@ -39,26 +39,25 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
     if data_root is None and os.environ.get("LSLAM_DATA"):
         data_root = Path(os.environ["LSLAM_DATA"])
     here = Path.cwd()
-    if data_root is None:
-        found = _sequences(here, text) or _drives(here, text)
-        if not found:
-            raise InputError(
-                f"no sequence {text!r}: {path} does not exist, nor is it in {here}; names such as seq07 need --data-root or "
-                "LSLAM_DATA where their data set is elsewhere"
-            )
-    else:
+    places = [here]
+    if data_root is not None:
         root = data_root.expanduser()
         if not root.is_dir():
             raise InputError(f"no sequence {text!r}: the data root {root} does not exist")
         if (root / text).is_dir() or is_recording(root / text):
             return root / text
-        found = _sequences(root, text) or _drives(root, text) or _sequences(here, text) or _drives(here, text)
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise InputError(f"{text!r} may be any of {', '.join(str(p) for p in found)}: name one of them")
-    assert data_root is not None
-    raise InputError(_not_found(text, data_root.expanduser()))
+        places = [root, here]
+    matches = next((m for place in places if (m := _sequences(place, text) or _drives(place, text))), [])
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        raise InputError(f"{text!r} may be any of {', '.join(str(p) for p in matches)}: name one of them")
+    if data_root is not None:
+        raise InputError(_not_found(text, places[0]))
+    raise InputError(
+        f"no sequence {text!r}: {path} does not exist, nor is it in {here}; names such as seq07 need --data-root or "
+        "LSLAM_DATA where their data set is elsewhere"
+    )
 
 
 def is_recording(path: Path) -> bool:
@@ -89,13 +88,12 @@ def _drives(root: Path, text: str) -> list[Path]:
     wanted = _DRIVE_NAME.match(text.rsplit("/", 1)[-1])
     if not wanted:
         return []
-    found = []
-    for path in _all_drives(root):
-        have = _DRIVE.match(path.name)
-        assert have is not None
-        if all(wanted[k] in (None, have[k]) for k in ("date", "number", "kind")):
-            found.append(path)
-    return found
+    parts = {name: part for name, part in wanted.groupdict().items() if part is not None}
+    return [
+        path
+        for path in _all_drives(root)
+        if (drive := _DRIVE.match(path.name)) and parts.items() <= drive.groupdict().items()
+    ]
 
 
 def _all_drives(root: Path) -> list[Path]:
@@ -106,13 +104,9 @@ def _all_drives(root: Path) -> list[Path]:
 
 
 def _not_found(text: str, root: Path) -> str:
-    sequences = [
-        p for part in _ROOTS if (root / part / "sequences").is_dir() for p in (root / part / "sequences").iterdir()
-    ]
-    names = [f"seq{p.name}" for p in sequences if p.is_dir()]
-    names += [p.name for p in _all_drives(root)]
-    names += [p.name for p in root.iterdir() if p.is_dir() and p.name not in ("sequences", "poses")]
-    names = sorted(set(names))
+    sequences = [p for part in _ROOTS for p in (root / part / "sequences").glob("*/")]
+    folders = [p.name for p in root.glob("*/") if p.name not in ("sequences", "poses")]
+    names = sorted({*(f"seq{p.name}" for p in sequences), *(p.name for p in _all_drives(root)), *folders})
     near = difflib.get_close_matches(text, names, n=3, cutoff=0.5) or names[:12]
     hint = f"; there are {', '.join(near)}" if near else "; it is empty"
     return f"no sequence {text!r}: looked for {Path(text)}, {root / text}, sequences/ and raw drives under {root}{hint}"

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.bag_files import Bag
 from lslam.formats.calibration_files import read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.stamp_files import read_stamps
@@ -59,20 +58,24 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """
     if sequence.imu is not None:
         return sequence
-    bag: Bag | None = getattr(sequence, "bag", None)
+    bag = getattr(sequence, "bag", None)
     if bag is not None:
         raise why_none(bag, IMU)
-    number = sequence_number(sequence.path.name)
     if not isinstance(sequence, FolderSequence):
         raise InputError(
             f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu, by a method that needs none"
         )
-    if sequence.kind != KIND or number not in DRIVES:
+    if not _is_cut(sequence):
         raise InputError(
             f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
             "add it, or run without --imu, by a method that needs none"
         )
-    return _with_imu(sequence, *_drive_of(sequence, number, data_root, "IMU", "imu.csv", "--imu"))
+    oxts, stamps_ns, T_lidar_imu, source = _samples(sequence, data_root, "IMU", "imu.csv", "--imu")
+    return replace(
+        sequence, imu=ImuStream(stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy()),
+        calibration=replace(sequence.calibration, T_lidar_imu=T_lidar_imu),
+        notes=[*sequence.notes, f"IMU of {source}"], problems=list(dict.fromkeys([*sequence.problems, *oxts.problems])),
+    )  # fmt: skip
 
 
 def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
@@ -82,102 +85,70 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """
     if sequence.gnss is not None:
         return sequence
-    bag: Bag | None = getattr(sequence, "bag", None)
+    bag = getattr(sequence, "bag", None)
     if bag is not None:
         raise why_none(bag, GNSS)
-    number = sequence_number(sequence.path.name)
-    if not isinstance(sequence, FolderSequence):
+    if not isinstance(sequence, FolderSequence) or not _is_cut(sequence):
         return sequence
-    if sequence.kind != KIND or number not in DRIVES:
-        return sequence
-    return _with_gnss(
-        sequence, *_drive_of(sequence, number, data_root, "satellite fixes", "gnss.csv", "--gnss and --georeference")
-    )
-
-
-def _drive_of(
-    sequence: FolderSequence, number: str, data_root: Path | None, what: str, file: str, flags: str
-) -> tuple[Path, int]:
-    """Folder of the raw drive, and the frame in it that is the first scan."""
-    date, drive, first = DRIVES[number]
-    places = _places(sequence.path, data_root)
-    folders = [
-        place / above / day / f"{date}_drive_{drive:04d}_{kind}"
-        for kind in ("extract", "sync")
-        for above, day in (("raw", date), ("", date), ("raw", ""), ("", ""), ("kitti_raw", date))
-        for place in places
-    ]
-    found = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
-    if found is None:
-        looked = ", ".join(str(f / "oxts") for f in folders if f.parent.parent.name == "raw")
-        raise InputError(
-            f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and the raw drive in "
-            f"{looked}, and there without raw/ and {date}/; fetch {date}_drive_{drive:04d}_sync or _extract, or run without "
-            f"{flags}"
-        )
-    return found, first
-
-
-def _with_imu(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence:
-    oxts, stamps, T_lidar_imu, when = _samples(sequence, drive, first)
-    imu = ImuStream(stamps, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
-    return replace(
-        sequence, imu=imu, calibration=replace(sequence.calibration, T_lidar_imu=T_lidar_imu),
-        notes=[*sequence.notes, f"IMU of {when}"], problems=_all_problems(sequence, oxts),
-    )  # fmt: skip
-
-
-def _with_gnss(sequence: FolderSequence, drive: Path, first: int) -> FolderSequence:
-    oxts, stamps, T_lidar_imu, when = _samples(sequence, drive, first)
-    gnss = GnssStream(stamps, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
+    flags = "--gnss and --georeference"
+    oxts, stamps_ns, T_lidar_imu, source = _samples(sequence, data_root, "satellite fixes", "gnss.csv", flags)
     # The position that OXTS gives is that of the IMU's origin (devkit readme).
     return replace(
-        sequence, gnss=gnss, calibration=replace(sequence.calibration, T_lidar_gnss=T_lidar_imu),
-        notes=[*sequence.notes, f"GNSS of {when}"], problems=_all_problems(sequence, oxts),
+        sequence, gnss=GnssStream(stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy()),
+        calibration=replace(sequence.calibration, T_lidar_gnss=T_lidar_imu),
+        notes=[*sequence.notes, f"GNSS of {source}"], problems=list(dict.fromkeys([*sequence.problems, *oxts.problems])),
     )  # fmt: skip
 
 
-def _all_problems(sequence: FolderSequence, oxts: Oxts) -> list[str]:
-    return list(dict.fromkeys([*sequence.problems, *oxts.problems]))
+def _is_cut(sequence: Sequence) -> bool:
+    """Whether a sequence is known to be cut from a raw drive."""
+    return sequence.kind == KIND and sequence_number(sequence.path.name) in DRIVES
 
 
 def _samples(
-    sequence: FolderSequence, drive: Path, first: int
+    sequence: FolderSequence, data_root: Path | None, what: str, file: str, flags: str
 ) -> tuple[Oxts, NDArray[np.int64], NDArray[np.float64], str]:
-    """OXTS of the drive, its stamps (N,), ns, on the sequence's clock, T_lidar_imu (4, 4), and in words where from."""
-    day = drive.parent / drive.name[: len("2011_09_30")]
-    beside = [folder / CALIBRATION for folder in (drive.parent, drive, day, drive.parent.parent)]
+    """OXTS of the drive, its stamps (N,), ns, on the sequence's clock, T_lidar_imu (4, 4), and in words where from.
+
+    Raises InputError that names `what` is missing, the `file` that would have it, and the `flags` that ask for it.
+    """
+    date, number, first = DRIVES[sequence_number(sequence.path.name)]
+    folders = [
+        place / above / day / f"{date}_drive_{number:04d}_{kind}"
+        for kind in ("extract", "sync")
+        for above, day in (("raw", date), ("", date), ("raw", ""), ("", ""), ("kitti_raw", date))
+        for place in _places(sequence.path, data_root)
+    ]
+    drive = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
+    if drive is None:
+        looked = ", ".join(str(f / "oxts") for f in folders if f.parent.parent.name == "raw")
+        raise InputError(
+            f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and the raw drive in "
+            f"{looked}, and there without raw/ and {date}/; fetch {date}_drive_{number:04d}_sync or _extract, or run "
+            f"without {flags}"
+        )
+    beside = [folder / CALIBRATION for folder in (drive.parent, drive, drive.parent / date, drive.parent.parent)]
     calibration = next((path for path in beside if path.is_file()), None)
     if calibration is None:
         raise InputError(f"{beside[0]} is missing: it says how the IMU sits, fetch the calibration of that day")
-    T_lidar_imu = read_rigid(calibration)
     oxts = read_oxts(drive / "oxts")
     if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns):
         raise InputError(f"{drive / 'oxts'} holds no samples with stamps (data/*.txt and timestamps.txt)")
-    begin_ns, clock = _begin(drive, oxts, first)
-    stamps = oxts.stamps_ns - begin_ns + int(sequence.stamps_ns[0])
-    rate = 1e9 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    when = f"{drive} at {rate:.0f} Hz, its frame {first} by {clock} taken as the first scan"
-    return oxts, stamps, T_lidar_imu, when
+    begin_ns, clock = _begin(drive, first)
+    stamps_ns = oxts.stamps_ns - begin_ns + int(sequence.stamps_ns[0])
+    rate_hz = 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
+    source = f"{drive} at {rate_hz:.0f} Hz, its frame {first} by {clock} taken as the first scan"
+    return oxts, stamps_ns, read_rigid(calibration), source
 
 
-def _begin(drive: Path, oxts: Oxts, first: int) -> tuple[int, str]:
+def _begin(drive: Path, first: int) -> tuple[int, str]:
     """When the first scan was taken, ns, and which file says so: camera 0 is what KITTI's times.txt counts from."""
-    assert oxts.stamps_ns is not None
     sync = drive.with_name(drive.name.replace("_extract", "_sync"))
-    for path in (sync / "image_00" / "timestamps.txt", sync / "velodyne_points" / "timestamps.txt"):
-        if path.is_file():
-            stamps = read_stamps(path)
-            if len(stamps) > first:
-                return int(stamps[first]), f"{path.parent.name}/{path.name}"
-    if drive == sync:
-        k = int(np.searchsorted(oxts.numbers, first))
-        if k < len(oxts.numbers):
-            return int(oxts.stamps_ns[k]), "oxts/timestamps.txt"
-    if sync != drive and (sync / "oxts" / "timestamps.txt").is_file():
-        stamps = read_stamps(sync / "oxts" / "timestamps.txt")
-        if len(stamps) > first:
-            return int(stamps[first]), f"{sync.name}/oxts/timestamps.txt"
+    for name in ("image_00", "velodyne_points", "oxts"):
+        path = sync / name / "timestamps.txt"
+        stamps_ns = read_stamps(path) if path.is_file() else ()
+        if len(stamps_ns) > first:
+            return int(stamps_ns[first]), f"{name}/{path.name}"
     raise InputError(
         f"{drive} does not say when its frame {first} was taken: image_00/timestamps.txt of {sync} is needed"
     )
