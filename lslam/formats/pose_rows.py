@@ -52,22 +52,6 @@ def read_rows(path: Path) -> tuple[list[Row], list[str]]:
     return rows, comments
 
 
-def numbers(rows: list[Row], columns: int, path: Path, what: str, may_be_nan: bool = False) -> Floats:
-    """(N, columns) float64; InputError with the line that is short or long, no number or not finite, NaN aside if it may be."""
-    table = []
-    for row in rows:
-        fields = row.text.split()
-        if len(fields) != columns:
-            raise InputError(f"{path}, line {row.number}: {len(fields)} columns where {what} has {columns}")
-        try:
-            table.append([float(field) for field in fields])
-        except ValueError:
-            raise InputError(f"{path}, line {row.number}: not a number in {row.text[:60]!r}") from None
-    values = np.array(table, np.float64).reshape(len(rows), columns)
-    check_finite(np.nan_to_num(values, posinf=np.inf, neginf=-np.inf) if may_be_nan else values, rows, path)
-    return values
-
-
 def check_finite(values: Floats, rows: list[Row], path: Path) -> None:
     """InputError with the first line that holds NaN or infinity."""
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))

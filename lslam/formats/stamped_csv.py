@@ -45,10 +45,7 @@ def read_stamped_csv(
     header = [_spellings(name) for name in table.names]
     where = [_find(header, names) for names in (*columns, *optional)]
     shown = ", ".join(table.names)
-    width = len(table.names)
-    for row, cells in zip(table.rows, table.cells, strict=True):
-        if len(cells) != width:
-            raise InputError(f"{path}, line {row.number}: {len(cells)} columns where the header has {width}")
+    table.check_widths(len(table.names), "the header")
     clock = find_clock(table, [k for k in where if k is not None])
     if clock is None:
         raise InputError(f"{path}, line 1: no time column ({TIME_COLUMNS}) in {shown!r}")

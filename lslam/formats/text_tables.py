@@ -46,6 +46,12 @@ class TextTable:
                 raise InputError(f"{self.path}, line {row.number}: not a number in {row.text[:60]!r}") from None
         return values
 
+    def check_widths(self, width: int, whose: str, is_least: bool = False) -> None:
+        """InputError with the line that is not as wide as `whose` width; wider ones pass where it is the least."""
+        for row, cells in zip(self.rows, self.cells, strict=True):
+            if len(cells) < width or (len(cells) > width and not is_least):
+                raise InputError(f"{self.path}, line {row.number}: {len(cells)} columns where {whose} has {width}")
+
     def select(self, mask: NDArray[np.bool_]) -> TextTable:
         """The rows where `mask` (N,) is true."""
         kept = np.flatnonzero(mask).tolist()

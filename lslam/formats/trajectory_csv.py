@@ -84,9 +84,7 @@ def parse(
             )
         table = replace(table, names=())
     width = len(table.names) or len(table.cells[0])
-    for row, cells in zip(table.rows, table.cells, strict=True):
-        if len(cells) < width or (table.separator is None and len(cells) != width):
-            raise InputError(f"{path}, line {row.number}: {len(cells)} columns, {width} expected")
+    table.check_widths(width, "the header" if table.names else "the first line", is_least=table.separator is not None)
     columns = columns or placed_columns(table, scalar)
     values = table.values(list(columns.all))
     lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)

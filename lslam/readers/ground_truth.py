@@ -15,7 +15,7 @@ from lslam.formats.oxts_files import POS_ACC, ROLL, YAW, Oxts
 from lslam.formats.pose_rows import read_rows
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.formats.trajectory_lines import MatrixRows, fits_kitti, read_matrices
+from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
 from lslam.geometry import geodesy, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.readers.listing import file_numbers, rows_of
@@ -60,13 +60,10 @@ def load_poses(path: Path, stamps_ns: NDArray[np.int64], files: list[Path], voic
     """Poses of `path` in the frame of the file; rows without time get the stamps of the scans they belong to."""
     try:
         lines, _ = read_rows(path)
-        if lines and fits_kitti(lines[0].text):
-            table = read_matrices(path, lines)
-            if table.stamps_ns is None:
-                return _pair(path, table, stamps_ns, files, voice)
-        truth = read_trajectory(path)
+        is_kitti = bool(lines) and fits_kitti(lines[0].text)
+        truth = without_lost(read_matrices(path, lines)) if is_kitti else read_trajectory(path)
         voice.notes += [f"ground truth {path}: {note}" for note in truth.notes]
-        return truth
+        return truth if truth.has_stamps else _pair(truth, stamps_ns, files, voice)
     except InputError as error:
         voice.problems.append(f"ground truth is not used: {error}")
         return None
@@ -161,28 +158,24 @@ def to_lidar(
     return replace(truth, frame="lidar")
 
 
-def _pair(
-    path: Path, table: MatrixRows, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice
-) -> Trajectory | None:
-    count = len(table.poses)
-    rows, rule = rows_of(files, count)
-    if table.note is not None:
-        voice.notes.append(f"ground truth {path}: {table.note}")
-        numbers_of_files = file_numbers(files)
-        if numbers_of_files is not None and int(table.numbers[-1]) != count - 1:
-            row_of = {int(number): k for k, number in enumerate(table.numbers)}
-            rows = np.array([row_of.get(int(number), -1) for number in numbers_of_files], np.int64)
-            rule = "by the number in the file name"
-    have = (rows >= 0) & ~np.isnan(table.poses[rows]).any(axis=(1, 2))
+def _pair(truth: Trajectory, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice) -> Trajectory | None:
+    """The poses of the scans, by the numbers of their files or by index, with the stamps of the scans."""
+    numbers = scans_of(truth)
+    count = int(numbers[-1]) + 1
+    scans, rule = rows_of(files, count)
+    numbers_of_files = file_numbers(files)
+    if numbers_of_files is not None and len(truth) < count != len(files):
+        scans, rule = numbers_of_files, "by the number in the file name"
+    have = np.isin(scans, numbers)
     if not have.any():
-        voice.problems.append(f"ground truth {path} has no pose for any scan")
+        voice.problems.append(f"ground truth {truth.source} has no pose for any scan")
         return None
-    if count != len(files) or not have.all():
+    if len(truth) != len(files) or not have.all():
         voice.problems.append(
-            f"{path} has {count} poses for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
+            f"{truth.source} has {len(truth)} poses for {len(files)} scans: the {int(have.sum())} common ones are used, {rule}"
         )
-    frame = "cam0" if table.is_cam0 else "unknown"
-    return Trajectory(stamps_ns[have], table.poses[rows[have]], frame, True, None, str(path))
+    poses = truth.poses[np.searchsorted(numbers, scans[have])]
+    return Trajectory(stamps_ns[have], poses, truth.frame, source=truth.source)
 
 
 def oxts_truth(
