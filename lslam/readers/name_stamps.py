@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,77 +41,67 @@ def stamps_in_names(files: list[Path]) -> NameStamps | None:
     """
     stems = [path.stem for path in files]
     shapes = {re.sub(r"\d+", "#", stem) for stem in stems}
-    found = list(_dates(stems))
+    readings = list(_dates(stems))
     if len(shapes) == 1:
         shape = shapes.pop()
         groups = [list(column) for column in zip(*(re.findall(r"\d+", stem) for stem in stems), strict=True)]
-        found += [*_pairs(groups, shape.split("#")[1:-1]), *_numbers(groups)]
-    for stamps, words in found:
+        readings += [*_pairs(groups, shape.split("#")[1:-1]), *_numbers(groups)]
+    for stamps, words in readings:
         if len(np.unique(stamps)) == len(stamps):
             return NameStamps(np.array(stamps, np.int64), words)
-    return NameStamps(None, found[0][1]) if found else None
+    return NameStamps(None, readings[0][1]) if readings else None
 
 
 def _dates(stems: list[str]) -> Iterator[tuple[list[int], str]]:
-    matches = [_DATE.search(stem) for stem in stems]
     stamps = []
-    for match in matches:
+    for stem in stems:
+        match = _DATE.search(stem)
         if match is None:
             return
         year, _, month, day, hour, _, minute, second, fraction, zone = match.groups()
         try:
-            begin = datetime.strptime(
-                f"{year}{month}{day}{hour}{minute}{second}{'+0000' if zone in (None, 'Z') else zone}", "%Y%m%d%H%M%S%z"
-            )
+            begin = datetime.fromisoformat(f"{year}-{month}-{day}T{hour}:{minute}:{second}{zone or 'Z'}")
         except ValueError:
             return
-        seconds = round((begin - datetime(1970, 1, 1, tzinfo=UTC)).total_seconds())
-        stamps.append(seconds * 10**9 + int((fraction or "").ljust(9, "0")))
+        stamps.append(int(begin.timestamp()) * 10**9 + int((fraction or "").ljust(9, "0")))
     if min(stamps) >= _EARLIEST_NS and max(stamps) <= _LATEST_NS:
         yield stamps, "dates, UTC where they state no other zone"
 
 
 def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[int], str]]:
     """Seconds and the number behind them."""
-    for k, separator in enumerate(between):
-        whole, rest = groups[k], groups[k + 1]
-        is_alone = len(groups) == 2 and all(len(text) == 9 for text in rest) and max(map(len, whole)) < 9
-        if separator not in tuple("._-,") or max(map(len, rest)) > 9 or not (_is_time(whole, 10**9) or is_alone):
+    for (whole, rest), separator in zip(pairwise(groups), between, strict=True):
+        lengths = {len(text) for text in rest}
+        is_alone = len(groups) == 2 and lengths == {9} and max(map(len, whole)) < 9
+        is_time = _is_time(whole, 10**9) or is_alone
+        if separator not in tuple("._-,") or max(lengths) > 9 or not is_time or _counts(rest):
             continue
-        if _counts(rest):
-            continue
-        seconds = [int(text) * 10**9 for text in whole]
-        decimals = [s + int(text.ljust(9, "0")) for s, text in zip(seconds, rest, strict=True)]
-        units = [s + int(text) for s, text in zip(seconds, rest, strict=True)]
-        is_padded = len({len(text) for text in rest}) == 1 or any(len(t) > 1 and t[0] == "0" for t in rest)
-        digits = len(rest[0])
-        if is_padded:
-            yield decimals, f"seconds and {digits} decimals" if len({len(t) for t in rest}) == 1 else "decimal seconds"
-            continue
+        decimals = [int(a) * 10**9 + int(b.ljust(9, "0")) for a, b in zip(whole, rest, strict=True)]
+        units = [int(a) * 10**9 + int(b) for a, b in zip(whole, rest, strict=True)]
         a, b = _unevenness(decimals), _unevenness(units)
-        is_clear = min(a, b) < _CLEARLY * max(a, b)
-        if b < a if is_clear else max(map(len, rest)) == 9:
-            yield units, "seconds and nanoseconds without leading zeros"
-        else:
+        is_decimal = a < b if min(a, b) < _CLEARLY * max(a, b) else max(lengths) < 9
+        if len(lengths) == 1:
+            yield decimals, f"seconds and {len(rest[0])} decimals"
+        elif is_decimal or any(text[0] == "0" and text != "0" for text in rest):
             yield decimals, "decimal seconds"
+        else:
+            yield units, "seconds and nanoseconds without leading zeros"
 
 
 def _numbers(groups: list[list[str]]) -> Iterator[tuple[list[int], str]]:
     for unit, scale in _UNITS.items():
         for texts in groups:
-            if _is_time(texts, scale) and not (len(texts) > 1 and len(set(texts)) == 1):
+            if _is_time(texts, scale) and (len(texts) == 1 or len(set(texts)) > 1):
                 yield [int(text) * scale for text in texts], f"{unit} since 1970"
     varying = [texts for texts in groups if len(set(texts)) > 1]
-    if len(varying) == 1 and len(varying[0]) > 2 and max(map(len, varying[0])) <= 18:
-        values = np.sort(np.array([int(text) for text in varying[0]], np.int64))
-        step = float(np.median(np.diff(values)))
-        for unit, scale in _UNITS.items():
-            if (
-                step >= _NO_COUNT
-                and _SHORTEST_NS <= step * scale <= _LONGEST_NS
-                and int(values[-1]) * scale < _EARLIEST_NS
-            ):
-                yield [int(text) * scale for text in varying[0]], f"{unit} of a clock that began elsewhere"
+    if len(varying) != 1 or len(varying[0]) < 3 or max(map(len, varying[0])) > 18:
+        return
+    values = [int(text) for text in varying[0]]
+    step = float(np.median(np.diff(np.sort(values))))
+    for unit, scale in _UNITS.items():
+        is_clock = step >= _NO_COUNT and _SHORTEST_NS <= step * scale <= _LONGEST_NS
+        if is_clock and max(values) * scale < _EARLIEST_NS:
+            yield [value * scale for value in values], f"{unit} of a clock that began elsewhere"
 
 
 def _is_time(texts: list[str], scale: int) -> bool:

@@ -129,9 +129,8 @@ def stamps_by_rows(
     files: list[Path], stamps: NDArray[np.int64], source: Path, rate_hz: float | None, voice: Voice
 ) -> tuple[list[Path], NDArray[np.int64], float]:
     """The scans that have a row of stamps in `source`, the stamps of these, which increase, and the rate, Hz."""
-    rows = rows_of_scans(source, stamps, files, voice)
-    files = [file for file, has_row in zip(files, rows.have, strict=True) if has_row]
-    return files, *check_stamps(rows.stamps_ns, rate_hz, source, voice.problems)
+    files, stamps = rows_of_scans(source, stamps, files, voice)
+    return files, *check_stamps(stamps, rate_hz, source, voice.problems)
 
 
 def calibration_in(path: Path, read: Callable[[Path], Matrix | None], voice: Voice) -> Matrix | None:

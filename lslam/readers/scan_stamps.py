@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,26 +48,33 @@ def stamp_scans(
     A clock that goes back, stands still or steps gives way to the next one that contradicts it, which is said. Raises
     InputError when the file has another number of rows than there are scans and nothing tells which belong together.
     """
-    files, clocks, words = _named(files, voice)
-    own = None if path is None else _own_clock(path, files, read, bool(clocks), voice)
-    if own is not None:
-        have, clock = own
-        files = [file for file, has in zip(files, have, strict=True) if has]
-        clocks = [clock, *(Clock(c.name, c.stamps_ns[have]) for c in clocks)]
-        words = clock.name.rsplit("/", 1)[-1]
-    points = None
+    by_name, words = _stamps_by_name(files, voice)
+    files = sorted(files, key=lambda file: by_name.get(file, 0))
+    clocks: list[Clock] = []
+    points: PointStamps | None = None
+    own = None if path is None else load_stamps(path, voice.problems)
+    if path is not None and own is not None:
+        try:
+            files, own = rows_of_scans(path, own, files, voice)
+            clocks, words = [Clock(str(path), own)], path.name
+        except InputError as error:
+            points = None if by_name else _points(files, read, rate_hz)
+            if not by_name and points is None:
+                raise
+            voice.problems.append(f"stamps are not used: {error}")
+    if by_name:
+        clocks.append(Clock("the stamps in the file names", np.array([by_name[file] for file in files], np.int64)))
     if not clocks or _is_suspicious(clocks[0].stamps_ns):
-        points = _points(files, read, rate_hz)
-        if points is not None:
-            clocks.append(Clock(f"the absolute times of the points, field {points.field!r},", points.stamps_ns))
-            words = words or clocks[0].name.rstrip(",")
+        points = points or _points(files, read, rate_hz)
+    if points is not None:
+        clocks.append(Clock(f"the absolute times of the points, field {points.field!r},", points.stamps_ns))
     if not clocks:
         return None
-    voice.notes.append(f"scan stamps from {words}")
-    source = clocks[0].name if own is not None else files[0].parent
+    voice.notes.append(f"scan stamps from {words or clocks[0].name.rstrip(',')}")
     agreed, raw = _agreed(clocks, voice), clocks[0].stamps_ns
     for stamps in beside[:1]:
         agreed = onto(stamps, raw, agreed)
+    source = clocks[0].name if clocks[0].name == str(path) else files[0].parent
     checked, rate = check_stamps(agreed, rate_hz, source, voice.problems)
     if points is not None and rate_hz is None and rate * points.sweep_s < 0.5:
         rate = round(1 / points.sweep_s, 1)
@@ -77,38 +83,16 @@ def stamp_scans(
     return StampedScans(files, checked, rate, raw)
 
 
-def _named(files: list[Path], voice: Voice) -> tuple[list[Path], list[Clock], str]:
-    """The files in the order of the stamps in their names, these stamps, and what they are in words."""
+def _stamps_by_name(files: list[Path], voice: Voice) -> tuple[dict[Path, int], str]:
+    """The stamps, ns, in the names of the files, none where they hold none, and what they are in words."""
     names = stamps_in_names(files)
     if names is None:
-        return files, [], ""
+        return {}, ""
     if names.stamps_ns is None:
         voice.problems.append(f"stamps in the file names are not used: as {names.words} they repeat")
-        return files, [], ""
-    order = np.argsort(names.stamps_ns, kind="stable")
-    files = [files[k] for k in order]
-    return (
-        files,
-        [Clock("the stamps in the file names", names.stamps_ns[order])],
-        (f"the file names: {names.words}, as in {files[0].name}"),
-    )
-
-
-def _own_clock(
-    path: Path, files: list[Path], read: Callable[[Path], PointCloud], is_named: bool, voice: Voice
-) -> tuple[NDArray[np.bool_], Clock] | None:
-    """Which scans have a stamp in the file `path`, (N,) bool, and the stamps of these; None where other clocks are better."""
-    stamps = load_stamps(path, voice.problems)
-    if stamps is None:
-        return None
-    try:
-        rows = rows_of_scans(path, stamps, files, voice)
-    except InputError as error:
-        if not is_named and _points(files, read, None) is None:
-            raise
-        voice.problems.append(f"stamps are not used: {error}")
-        return None
-    return rows.have, Clock(str(path), rows.stamps_ns)
+        return {}, ""
+    stamps = dict(zip(files, names.stamps_ns.tolist(), strict=True))
+    return stamps, f"the file names: {names.words}, as in {min(files, key=stamps.__getitem__).name}"
 
 
 def _agreed(clocks: list[Clock], voice: Voice) -> Stamps:
@@ -121,9 +105,9 @@ def _agreed(clocks: list[Clock], voice: Voice) -> Stamps:
         if stands_still(stamps, other.stamps_ns):
             voice.problems.append(f"{first.name}: its stamps stand still: {other.name} are used")
             return other.stamps_ns
-        held = agree(stamps, np.zeros_like(stamps), other, first.name)
-        voice.problems.extend(held.problems)
-        stamps = held.stamps_ns
+        agreement = agree(stamps, np.zeros_like(stamps), other, first.name)
+        voice.problems.extend(agreement.problems)
+        stamps = agreement.stamps_ns
         if np.any(np.diff(stamps) <= 0):
             voice.problems.append(f"{first.name}: its stamps do not increase: {other.name} are used")
             return other.stamps_ns
@@ -139,72 +123,57 @@ def _points(files: list[Path], read: Callable[[Path], PointCloud], rate_hz: floa
     return point_stamps(len(files), lambda index: read(files[index]), rate_hz)
 
 
-class Rows(NamedTuple):
-    """Which scans have a stamp, (N,) bool, and the stamps of these, ns."""
-
-    have: NDArray[np.bool_]
-    stamps_ns: Stamps
-
-
-def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -> Rows:
-    """The rows of a stamps file that belong to the scans: by a column of names or numbers, by the numbers in the file names, or
-    by the gaps that lost rows leave.
+def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -> tuple[list[Path], Stamps]:
+    """The scans that have a stamp in the file `path`, and these: by a column of names or numbers, by the numbers in the file
+    names, or by the gaps that lost rows leave.
 
     Raises InputError when the counts differ and nothing tells.
     """
     count = len(files)
-    labelled = _labelled(path, files, len(stamps))
-    whole = np.ones(count, bool)
-    if labelled is None and len(stamps) == count:
-        return Rows(whole, stamps)
     counts = f"{path} has {len(stamps)} stamps for {count} scans"
-    if labelled is not None:
-        have = labelled >= 0
-        if not have.all() or len(stamps) != count:
+    rows = _labelled(path, files, len(stamps))
+    if rows is not None:
+        without = np.count_nonzero(rows < 0)
+        if without or len(stamps) != count:
+            voice.problems.append(f"{counts}: they go together by name, {without} scans without one are left out")
+    elif len(stamps) == count:
+        return files, stamps
+    else:
+        filled = _filled_gaps(stamps, count)
+        if filled is not None:
             voice.problems.append(
-                f"{counts}: they go together by name, {int((~have).sum())} scans without one are left out"
+                f"{counts}: the lost rows leave gaps of whole intervals, which hold just the {count - len(stamps)} scans "
+                "without one; their stamps follow from the rows beside"
             )
-        return Rows(have, stamps[labelled[have]])
-    rows, rule = rows_of(files, len(stamps))
-    steps = np.diff(stamps)
-    is_gapless = len(stamps) < count and bool(len(steps)) and steps.min() > 0 and not _is_suspicious(stamps)
-    if rule.startswith("by the number") or is_gapless:
+            return files, filled
+        rows, rule = rows_of(files, len(stamps))
         # Rows that were lost from the middle would leave a gap.
-        have = rows >= 0
-        voice.problems.append(f"{counts}: the {int(have.sum())} common ones are used, {rule}")
-        return Rows(have, stamps[rows[have]])
-    filled = _filled_gaps(stamps, count)
-    if filled is None:
-        raise InputError(
-            f"{counts}, and neither numbers, names nor gaps tell which belong together: add or remove rows, put the scans' "
-            "names in a column, or remove the file for stamps at a constant rate"
-        )
-    voice.problems.append(
-        f"{counts}: the lost rows leave gaps of whole intervals, which hold just the {count - len(stamps)} scans without one; "
-        "their stamps follow from the rows beside"
-    )
-    return Rows(whole, filled)
+        is_gapless = 1 < len(stamps) < count and not _is_suspicious(stamps)
+        if not rule.startswith("by the number") and not is_gapless:
+            raise InputError(
+                f"{counts}, and neither numbers, names nor gaps tell which belong together: add or remove rows, put the "
+                "scans' names in a column, or remove the file for stamps at a constant rate"
+            )
+        voice.problems.append(f"{counts}: the {np.count_nonzero(rows >= 0)} common ones are used, {rule}")
+    return [file for file, row in zip(files, rows.tolist(), strict=True) if row >= 0], stamps[rows[rows >= 0]]
 
 
 def _labelled(path: Path, files: list[Path], count: int) -> NDArray[np.int64] | None:
     """(N,) row of each file, -1 for none, by a column that names the files or their numbers; None when there is no such one."""
-    rows, _ = read_rows(path)
-    cells = [row.text.replace(",", " ").replace(";", " ").split() for row in rows][-count:]
+    cells = [row.text.replace(",", " ").replace(";", " ").split() for row in read_rows(path)[0]][-count:]
     if len(cells) != count or min(map(len, cells)) < 2:
         return None
-    numbers = file_numbers(files)
-    for column in range(min(map(len, cells))):
-        texts = [row[column] for row in cells]
-        names: list[object] = [Path(text).name for text in texts]
-        labels: list[object] = [file.name for file in files]
-        if not set(names) & set(labels):
-            labels = [file.stem for file in files]
-        if numbers is not None and column == 0 and not set(names) & set(labels):
-            names, labels = [whole_number(text) for text in texts], numbers.tolist()
-            if None in names or any(b <= a for a, b in pairwise(names)):  # type: ignore[operator]
-                continue
-        if len(set(names)) == count and len(set(names) & set(labels)) > 0.5 * min(count, len(labels)):
-            row_of = {name: k for k, name in enumerate(names)}
+    columns = list(zip(*cells, strict=False))
+    names, stems, numbers = [file.name for file in files], [file.stem for file in files], file_numbers(files)
+    candidates: list[tuple[list[Any], list[Any]]] = []
+    for column in columns:
+        texts = [Path(text).name for text in column]
+        candidates += [(names, texts), (stems, texts)]
+    if numbers is not None:
+        candidates.append((numbers.tolist(), [whole_number(text) for text in columns[0]]))
+    for labels, texts in candidates:
+        row_of = {text: k for k, text in enumerate(texts)}
+        if len(row_of) == count and len(row_of.keys() & set(labels)) > 0.5 * min(count, len(labels)):
             return np.array([row_of.get(label, -1) for label in labels], np.int64)
     return None
 
