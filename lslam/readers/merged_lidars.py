@@ -88,7 +88,7 @@ class MergedLidars(SequenceView):
     def scan(self, index: int) -> Scan:
         """Read scan `index` of the leading LiDAR and the points of the others that belong to it. Raises InputError as it does."""
         scan = self.whole.scan(index)
-        times = _zeros(scan) if scan.times is None and self._is_timed else scan.times
+        times = np.zeros(len(scan), np.float32) if scan.times is None and self._is_timed else scan.times
         parts = [replace(scan, times=times, lidars=np.zeros(len(scan), np.uint8))]
         for number, source in enumerate(self._sources, 1):
             parts += self._parts(source, index, scan.stamp_ns, number)
@@ -109,10 +109,12 @@ class MergedLidars(SequenceView):
         for scan in held.values():
             if scan is None or not len(scan):
                 continue
-            times = _zeros(scan) if scan.times is None or source.sweep is None else scan.times
-            at_ns = scan.stamp_ns + np.round(times.astype(np.float64) * 1e9).astype(np.int64)
-            kept = np.ones(len(scan), np.bool_) if source.sweep is None else (at_ns >= begin) & (at_ns < end)
-            kept &= _is_far(scan.points)
+            at_ns = np.full(len(scan), scan.stamp_ns)
+            kept = _is_far(scan.points)
+            if source.sweep is not None:
+                if scan.times is not None:
+                    at_ns += np.round(scan.times.astype(np.float64) * 1e9).astype(np.int64)
+                kept &= (at_ns >= begin) & (at_ns < end)
             if kept.any():
                 yield _moved(scan, kept, at_ns, stamp_ns, source.lidar.T_lidar_other, number)
 
@@ -186,9 +188,8 @@ def _period_ns(sequence: Sequence) -> int:
 
 def _apart_ns(stamps: NDArray[np.int64], others: NDArray[np.int64]) -> float:
     """Median distance from stamps (M,) to the nearest of `others` (N,), ns."""
-    after = np.clip(np.searchsorted(others, stamps), 1, max(len(others) - 1, 1))
-    near = np.minimum(np.abs(stamps - others[after - 1]), np.abs(stamps - others[np.minimum(after, len(others) - 1)]))
-    return float(np.median(near))
+    nearest = np.interp(stamps, others, np.arange(len(others))).round().astype(int)
+    return float(np.median(np.abs(stamps - others[nearest])))
 
 
 def _read(lidar: FurtherLidar, index: int) -> Scan | None:
@@ -219,11 +220,7 @@ def _moved(
     times = ((at_ns[kept] - stamp_ns) * 1e-9).astype(np.float32)
     rings = part.rings
     if rings is not None:
-        known = rings != NO_RING
-        has_rings = int(rings[known].max(initial=0)) < RINGS_APART
-        rings = (
-            np.where(known, rings + np.uint16(number * RINGS_APART), NO_RING).astype(np.uint16) if has_rings else None
-        )
+        rings = np.where(rings == NO_RING, NO_RING, rings + np.uint16(number * RINGS_APART)).astype(np.uint16)
     return replace(part, points=points, times=times, rings=rings, lidars=np.full(len(part), number, np.uint8))
 
 
@@ -242,7 +239,3 @@ def _joined(scan: Scan, parts: list[Scan], is_timed: bool) -> Scan:
         times=column("times") if is_timed else None, lidars=column("lidars"),
         fault="; ".join(filter(None, dict.fromkeys(part.fault for part in full))),
     )  # fmt: skip
-
-
-def _zeros(scan: Scan) -> NDArray[np.float32]:
-    return np.zeros(len(scan), np.float32)
