@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import lzma
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from zlib import error as zlib_error
@@ -18,7 +17,6 @@ from lslam.formats.bag_listing import packing_of
 from lslam.kernels.cache import cache_folder
 from lslam.remote import RemotePath
 
-CACHE = "bags"
 _MAGIC = {
     b"\x28\xb5\x2f\xfd": "zstd",
     b"\x04\x22\x4d\x18": "lz4",
@@ -26,6 +24,7 @@ _MAGIC = {
     b"BZh": "bz2",
     b"\xfd7zXZ\0": "xz",
 }
+_LIBRARIES = {"lz4": "lz4.frame", "gz": "gzip", "bz2": "bz2", "xz": "lzma"}
 _BLOCK = 1 << 20
 # Recordings shrink to a tenth at best; what grows further was made to fill a disk.
 _MOST, _LEAST = 1000, 1 << 30
@@ -45,7 +44,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, str]]:
         return
     if isinstance(path, RemotePath):
         raise UsageError(f"{path} is compressed as a whole and cannot be read in place from storage: copy it")
-    folder = cache_folder(CACHE)
+    folder = cache_folder("bags")
     if folder is None:
         raise OutputError(f"{path} needs a folder to be unpacked in: name a folder of your own in XDG_CACHE_HOME")
     with tempfile.NamedTemporaryFile(dir=folder, suffix=".unpacked") as target:
@@ -73,7 +72,8 @@ def _kind(path: Path) -> str:
 def _unpack(path: Path, kind: str, target: Any) -> str:
     size, most = 0, max(_MOST * path.stat().st_size, _LEAST)
     try:
-        with _open(path, kind) as source:
+        library = zstd() if kind == "zstd" else import_module(_LIBRARIES[kind])
+        with library.open(path, "rb") as source:
             while data := source.read1(_BLOCK):
                 size += len(data)
                 if size > most:
@@ -91,15 +91,3 @@ def _write(path: Path, target: Any, data: bytes) -> None:
         target.write(data)
     except OSError as error:
         raise OutputError(f"{path} cannot be unpacked into {target.name}: {cause(error)}") from None
-
-
-def _open(path: Path, kind: str) -> Any:
-    """A stream over what is packed in `path`, in one frame or several."""
-    if kind == "lz4":
-        import lz4.frame
-
-        return lz4.frame.open(path, "rb")
-    if kind == "zstd":
-        return zstd().open(path, "rb")
-    openers: dict[str, Any] = {"gz": gzip.open, "bz2": bz2.open, "xz": lzma.open}
-    return openers[kind](path, "rb")

@@ -14,7 +14,7 @@ from lslam.formats.ouster_packets import IMU_SIZE
 
 # velodyne_msgs: a header, and packets of a stamp and 1206 bytes. Ouster's, whatever their package: the bytes alone.
 SCANS, PACKET = "VelodyneScan", "PacketMsg"
-_STAMP_BYTES = 8
+_PACKET_BYTES = 8 + velodyne_packets.SIZE  # of velodyne_msgs/VelodynePacket
 
 
 def is_decoded(topic: BagTopic) -> bool:
@@ -41,17 +41,13 @@ def read_packets(topic: BagTopic, data: bytes) -> tuple[NDArray[np.int64], NDArr
             return np.zeros(1, np.int64), np.frombuffer(data, np.uint8, size, at + 4)[None], ""
         header = read_header(topic, data)
         # Numbers of CDR lie at multiples of their size, counted from behind its first four bytes.
-        at = header.end if is_ros1 else -(-header.end // 4) * 4
-        count = int(np.frombuffer(data, f"{header.order}u4", 1, at)[0])
-        length = _STAMP_BYTES + velodyne_packets.SIZE
-        stride = length if is_ros1 else -(-length // 4) * 4
-        padded = data[at + 4 :] + bytes(stride - length)
-        names, formats = (
-            ["s", "ns", "data"],
-            [f"{header.order}u4", f"{header.order}u4", (np.uint8, velodyne_packets.SIZE)],
-        )
-        layout: Any = {"names": names, "formats": formats, "offsets": [0, 4, _STAMP_BYTES], "itemsize": stride}
-        table: NDArray[Any] = np.frombuffer(padded, np.dtype(layout), count)
+        at, gap = (header.end, 0) if is_ros1 else (-(-header.end // 4) * 4, -_PACKET_BYTES % 4)
+        word = f"{header.order}u4"
+        count = int(np.frombuffer(data, word, 1, at)[0])
+        fields: Any = [
+            ("s", word), ("ns", word), ("data", np.uint8, velodyne_packets.SIZE), ("gap", np.uint8, gap),
+        ]  # fmt: skip
+        table = np.frombuffer(data[at + 4 :] + bytes(gap), fields, count)
     except (ValueError, IndexError):
         raise InputError(f"a message of {topic.name} with {len(data)} bytes is no {topic.type}") from None
     stamps = table["s"].astype(np.int64) * 10**9 + table["ns"]

@@ -119,9 +119,8 @@ class BagSequence(Scans):
         stamp += timed.shift_ns
         off = points_off(self.clock, self.headers_ns, self.stamps_ns, index, stamp, timed.times)
         if off:
-            fault = "; ".join(
-                filter(None, (fault, f"the clock of its points is {off * 1e-9:+.3f} s off: the header counts"))
-            )
+            what = f"the clock of its points is {off * 1e-9:+.3f} s off: the header counts"
+            fault = f"{fault}; {what}" if fault else what
             stamp = int(self.stamps_ns[index])
         return Scan(cloud.points, stamp, index, cloud.intensity, timed.times, cloud.rings, fault=fault)
 
@@ -152,9 +151,8 @@ def _others(path: Path) -> str:
     names = [p.name for p in parts_beside(path)]
     if not names:
         return ""
-    is_one = len(names) == 1
-    are = "is another part" if is_one else "are other parts"
-    return f"; by {'its name' if is_one else 'their names'} {shown(names)} {are} of it: a folder of its parts is read as one"
+    one, several = f"by its name {names[0]} is another part", f"by their names {shown(names)} are other parts"
+    return f"; {one if len(names) == 1 else several} of it: a folder of its parts is read as one"
 
 
 def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
@@ -209,16 +207,15 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
         stamps = opened.revolutions.stamps_ns
         ((name, _),) = choose_lidars(topic, [frame or UNNAMED], info.lidar_frame, voice)
         index = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, {})
-        found: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
+        sources: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
     else:
-        found = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]
-    others = replace(info, rate_hz=None, rings=None, sensor=None)
-    return [
-        (index, _scans_of(bag, index, opened, others, Voice([], [])), opened)
-        if k or has_leading
-        else (index, _scans_of(bag, index, opened, info, voice), opened)
-        for k, (index, opened) in enumerate(found)
-    ]
+        sources = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]
+    lidars: list[_Lidar] = []
+    for index, opened in sources:
+        if lidars or has_leading:
+            info, voice = replace(info, rate_hz=None, rings=None, sensor=None), Voice([], [])
+        lidars.append((index, _scans_of(bag, index, opened, info, voice), opened))
+    return lidars
 
 
 def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceInfo, voice: Voice) -> BagSequence:
@@ -365,8 +362,7 @@ def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory |
 
 
 def _find(links: Links, lidar: str, frame: str, what: str, voice: Voice) -> NDArray[np.float64] | None:
-    found = links.find(lidar, frame) if frame else None
-    if found is None:
-        return None
-    voice.notes.append(f"extrinsics of the {what}: T_{lidar}_{frame}, {found[1]}")
-    return found[0]
+    T, source = (links.find(lidar, frame) if frame else None) or (None, "")
+    if T is not None:
+        voice.notes.append(f"extrinsics of the {what}: T_{lidar}_{frame}, {source}")
+    return T
