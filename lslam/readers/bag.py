@@ -203,11 +203,11 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
 def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_leading: bool) -> list[_Lidar]:
     """The LiDARs of a topic that are read; what `info` says of the sensor is said of the leading one."""
     if is_decoded(topic):
-        opened, frame = open_packets(bag, topic, voice)
-        stamps = opened.revolutions.stamps_ns
+        turns, frame = open_packets(bag, topic, voice)
+        stamps = turns.revolutions.stamps_ns
         ((name, _),) = choose_lidars(topic, [frame or UNNAMED], info.lidar_frame, voice)
-        index = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, {})
-        sources: list[tuple[ScanIndex, Opened | None]] = [(index, opened)]
+        whole = ScanIndex(topic, name, frame, np.arange(len(stamps)), stamps, {})
+        sources: list[tuple[ScanIndex, Opened | None]] = [(whole, turns)]
     else:
         sources = [(index, None) for index in index_scans(bag, topic, info.lidar_frame, voice)]
     lidars: list[_Lidar] = []
