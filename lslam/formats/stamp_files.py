@@ -15,23 +15,16 @@ from lslam.formats.time_columns import find_clock
 from lslam.remote import as_path
 
 
-def read_stamps(path: Path) -> NDArray[np.int64]:
-    """(N,) int64 ns from a text file, one stamp a line: `_stamps_and_rows` without the lines."""
-    return _stamps_and_rows(path)[0]
-
-
 def read_times(path: str | Path) -> NDArray[np.int64]:
     """Stamps (N,) int64 ns that increase, as of KITTI's `times.txt`. Raises InputError for a file without any."""
-    path = as_path(path)
-    stamps, rows = _stamps_and_rows(path)
-    if not rows:
+    stamps = read_stamps(as_path(path), must_increase=True)
+    if not len(stamps):
         raise InputError(f"{path} holds no times")
-    check_increasing(stamps, rows, path)
     return stamps
 
 
-def _stamps_and_rows(path: Path) -> tuple[NDArray[np.int64], list[Row]]:
-    """(N,) int64 ns of a text file and its lines.
+def read_stamps(path: Path, must_increase: bool = False) -> NDArray[np.int64]:
+    """(N,) int64 ns of a text file, one stamp a line.
 
     The time is in the column that a header names, else in the first one or two; an index before it and columns behind it
     are left out. Seconds may be decimal or scientific (KITTI's times.txt), whole numbers of nanoseconds, or dates such as
@@ -40,12 +33,12 @@ def _stamps_and_rows(path: Path) -> tuple[NDArray[np.int64], list[Row]]:
     """
     rows, comments = read_rows(path)
     rows = [Row(row.number, text) for row in rows if (text := row.text.split("#")[0].strip())]
-    if not rows:
-        return np.zeros(0, np.int64), []
-    table = text_table(path, rows, comments)
-    if not table.rows:
-        return np.zeros(0, np.int64), []
+    table = text_table(path, rows, comments) if rows else None
+    if table is None or not table.rows:
+        return np.zeros(0, np.int64)
     clock = find_clock(table) or find_clock(replace(table, names=()))
     if clock is None:
         raise InputError(f"{path}, line {table.rows[0].number}: no column is a time (s, ns or date)")
-    return clock.stamps_ns, table.rows
+    if must_increase:
+        check_increasing(clock.stamps_ns, table.rows, path)
+    return clock.stamps_ns

@@ -24,10 +24,8 @@ _SNAP = 0.3  # of the interval, how far an interval across a step may lie from w
 _MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others are brought onto
 MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
 _JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
-_LARGEST = 2.0**61
 _OFFSETS = 100  # of different clocks that are tried
 _JITTER = 0.03  # of the interval, by which stamps of arrival vary and those of a sensor do not
-_FAR = 1000  # durations of a recording, by which nothing pauses within it
 _MANY, _UNEVEN = 0.3, 0.25  # share of all messages; of the interval
 
 
@@ -64,8 +62,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
 
     Where both clocks pause, nothing is wrong. An interval of the headers is a step where the witness contradicts it and it is
     impossible for a clock whose messages are recorded late and never early. Regular headers remain regular: the interval
-    across a step is a whole number of periods. A witness that runs at another speed, as of a recording that was played back,
-    counts only against steps that go back, or forward by far more than the whole recording lasts.
+    across a step is a whole number of periods. A witness that runs at another speed does not count.
     """
     if _in_turns(headers, witness.stamps_ns):
         late_ns = np.zeros_like(late_ns)
@@ -74,34 +71,31 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
     period, speed = _period_and_speed(h, w)
     if not period or _in_parts(h):
         return OneClock(headers)
-    is_real_time = _SLOWEST <= speed <= _FASTEST
-    notes: list[str] = []
-    if not is_real_time:
-        notes.append(
+    if not _SLOWEST <= speed <= _FASTEST:
+        note = (
             f"{what}: {witness.name} run {speed:.3g} times as fast as the stamps of the headers, as of a recording that was "
             "played back or written anew: the headers count"
         )
-        w = w[0] + np.rint(np.clip((w - w[0]) * speed, -_LARGEST, _LARGEST)).astype(np.int64)
+        return OneClock(headers, notes=(note,))
     steps, jumps = np.diff(h), np.diff(w)
     spread = _recording_spread(w, period)
-    limit = max(0.5 * period, spread, 0.5 * period + float(late_ns.max()) if late_ns.any() else 0.0)
+    limit = max(0.5 * period + float(late_ns.max()), spread)
     is_apart = np.abs(steps - jumps) > limit
     is_odd = np.abs(steps - period) > 0.5 * period
-    if not is_real_time:
-        is_apart &= (steps < 0) | (steps > _FAR * float(w[-1] - w[0]))
     edges = np.flatnonzero(is_apart & is_odd)
     sizes = _step_sizes(h, w, edges, limit)
-    pauses = np.abs(jumps[is_apart & ~is_odd])
-    if is_real_time and len(pauses) and pauses.max() > _JUMP_INTERVALS * max(period, spread):
-        notes.append(
-            f"{what}: {witness.name} jump by up to {pauses.max() * 1e-9:.3f} s where the stamps of the headers go on: the "
-            "headers count"
+    notes: tuple[str, ...] = ()
+    longest = np.abs(jumps[is_apart & ~is_odd]).max(initial=0)
+    if longest > _JUMP_INTERVALS * max(period, spread):
+        notes = (
+            f"{what}: {witness.name} jump by up to {longest * 1e-9:.3f} s where the stamps of the headers go on: the headers "
+            "count",
         )
     edges, sizes = edges[sizes != 0], sizes[sizes != 0]
     if not len(edges):
-        return OneClock(headers, notes=tuple(notes))
+        return OneClock(headers, notes=notes)
     repaired = steps.copy()
-    repaired[edges] = _intervals(steps[edges] - sizes if is_real_time else np.zeros(len(edges)), steps, period)
+    repaired[edges] = _intervals(steps[edges] - sizes, steps, period)
     since_first = np.concatenate([[0], np.cumsum(repaired)])
     offset = _offsets(h - h[0] - since_first, h - w, limit)
     stamps = headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
@@ -112,7 +106,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
         f"{what}: the stamps of their headers {how} at message {keep[first + 1]}{places}, where {witness.name} go on by "
         f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
     )
-    return OneClock(stamps, (problem,), tuple(notes))
+    return OneClock(stamps, (problem,), notes)
 
 
 def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str) -> OneClock:
