@@ -45,8 +45,7 @@ from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.readers import open_sequence
-from lslam.readers.clocked import Clocked
-from lslam.readers.selection import select
+from lslam.readers.selection import Clocked, select
 from lslam.remote import as_path
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map

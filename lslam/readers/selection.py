@@ -1,7 +1,8 @@
-"""A part of a sequence: what --start, --count and --skip-frames leave."""
+"""Views of a sequence: the part that --start, --count and --skip-frames leave, with rings, or with times of the points."""
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -10,9 +11,11 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
 from lslam.preprocessing.rings import RingRule, decide_rings
+from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.types.scan import NO_RING, Scan
 from lslam.types.sequence import Scans, Sequence
 
+log = logging.getLogger("lslam")
 # Scans the rule is decided on: the first that can be read.
 _LOOKED_AT = 5
 
@@ -56,6 +59,26 @@ class Selection(SequenceView):
         if not 0 <= index < len(self.indices):
             raise IndexError(f"scan {index} of {len(self.indices)}")
         return self.whole.scan(int(self.indices[index]))
+
+
+class Clocked(SequenceView):
+    """The sequence with the times of its points by `clock`, without any where that is None; all else is the sequence's own."""
+
+    def __init__(self, whole: Sequence, clock: SweepClock | None, **own: Any) -> None:
+        super().__init__(whole, **own)
+        self.sweep_clock = clock
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`; says so where its points break the rule. Raises InputError as the sequence does."""
+        scan = self.whole.scan(index)
+        if self.sweep_clock is None:
+            return replace(scan, times=None)
+        if not len(scan):
+            return replace(scan, times=np.zeros(0, np.float32))
+        times, why = self.sweep_clock.times_of(scan.points)
+        if why:
+            log.warning("scan %d: point times: %s", scan.index, why)
+        return replace(scan, times=times)
 
 
 def select(sequence: Sequence, start: int = 0, count: int | None = None, skip_frames: int = 1) -> Sequence:
