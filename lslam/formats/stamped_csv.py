@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.formats.pose_rows import read_rows
-from lslam.formats.text_tables import TextTable, text_table
+from lslam.formats.text_tables import text_table
 from lslam.formats.time_columns import find_clock
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -37,33 +37,22 @@ def read_stamped_csv(
     units in brackets, case and what stands before the last points or slashes (`field.linear_acceleration.x`) do not count.
     The time is one column or two (`time_columns`). Raises InputError naming file, line and what is missing.
     """
-    rows, comments = read_rows(path)
-    table = text_table(path, rows, comments) if rows else None
-    if table is None or not table.rows:
-        names = table.names if table is not None else _named_alone(comments)
-        table = TextTable(path, tuple(names), [], [], ",")
-    header = [_spellings(name) for name in table.names]
-    where = [_find(header, names) for names in (*columns, *optional)]
-    shown = ", ".join(table.names)
+    table = text_table(path, *read_rows(path))
+    spellings = [_spellings(name) for name in table.names]
+    where = [_find(spellings, names) for names in (*columns, *optional)]
+    header = ", ".join(table.names)
     table.check_widths(len(table.names), "the header")
     clock = find_clock(table, [k for k in where if k is not None])
     if clock is None:
-        raise InputError(f"{path}, line 1: no time column ({TIME_COLUMNS}) in {shown!r}")
+        raise InputError(f"{path}, line 1: no time column ({TIME_COLUMNS}) in {header!r}")
     missing = [names[0] for names, k in zip(columns, where, strict=False) if k is None]
     if missing:
-        raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {shown}")
+        raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {header}")
     values = np.full((len(table.rows), len(where)), np.nan)
-    known = [k for k in where if k is not None]
-    values[:, [i for i, k in enumerate(where) if k is not None]] = table.values(known)
-    if clock.others:
-        chosen = " and ".join(table.names[k] for k in clock.columns)
-        log.info("%s: the time is %s; left out: %s", path, chosen, ", ".join(clock.others))
+    values[:, [k is not None for k in where]] = table.values([k for k in where if k is not None])
+    if clock.note:
+        log.info("%s: %s", path, clock.note)
     return clock.stamps_ns, values
-
-
-def _named_alone(comments: list[str]) -> list[str]:
-    """The names of a file that has a header in a comment and no data."""
-    return comments[0].lstrip("#% ").split(",") if comments else []
 
 
 def write_stamped_csv(
@@ -86,8 +75,8 @@ def _spellings(name: str) -> list[str]:
     return ["_".join(words[k:]).strip() for k in reversed(range(len(words)))]
 
 
-def _find(header: list[list[str]], names: Sequence[str]) -> int | None:
-    return next((k for name in names for k, spellings in enumerate(header) if name in spellings), None)
+def _find(spellings: list[list[str]], names: Sequence[str]) -> int | None:
+    return next((k for name in names for k, spelt in enumerate(spellings) if name in spelt), None)
 
 
 def read_imu_csv(path: Path) -> ImuStream:

@@ -88,10 +88,11 @@ def split_cells(text: str, separator: str | None) -> list[str]:
 def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
     """The table of the data lines and comments of a file; the names are those of the first line or of a comment as wide."""
     header = ""
-    if looks_like_header(rows[0].text):
+    if rows and looks_like_header(rows[0].text):
         header, rows = rows[0].text, rows[1:]
     if not rows:
-        return TextTable(path, tuple(split_cells(header, separator_of(header))), [], [], None)
+        header = header or (comments[0].lstrip("#% ") if comments else "")
+        return TextTable(path, tuple(split_cells(header, separator_of(header))) if header else (), [], [], None)
     separator = separator_of(rows[0].text)
     cells = [split_cells(row.text, separator) for row in rows]
     names = split_cells(header, separator_of(header)) if header else _names_in(comments, len(cells[0]))

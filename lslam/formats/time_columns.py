@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,11 @@ _LONGEST_STEP_S = 60.0
 _STAMPED, _TIMED, _ENDING = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class TimeColumns:
-    """stamps_ns : (N,); columns : that hold them, one or two; others : names of the columns that might have been the time"""
+class Clock(NamedTuple):
+    """stamps_ns : (N,); note : which columns hold them and which might have, empty without others"""
 
     stamps_ns: NDArray[np.int64]
-    columns: tuple[int, ...]
-    others: tuple[str, ...] = ()
+    note: str
 
 
 def tokens_of(name: str) -> list[str]:
@@ -49,7 +47,7 @@ def tokens_of(name: str) -> list[str]:
     return [word for word in re.split(r"[^a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower())) if word]
 
 
-def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> TimeColumns | None:
+def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> Clock | None:
     """The time of the rows, by names or, where there are none, by the first columns; None when no column is a time.
 
     taken : columns that are something else; default_ns : ns in a unit where the name states none, by size and step when None
@@ -63,8 +61,11 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     if chosen is None:
         return None
     others = {c for candidate in candidates for c in candidate} - set(chosen)
-    names = tuple(table.names[c] for c in sorted(others)) if table.names else ()
-    return TimeColumns(_stamps(table, chosen, default_ns), chosen, names)
+    note = ""
+    if table.names and others:
+        note = f"the time is {' and '.join(table.names[c] for c in chosen)}; "
+        note += f"left out: {', '.join(table.names[c] for c in sorted(others))}"
+    return Clock(_stamps(table, chosen, default_ns), note)
 
 
 def is_index(values: Floats) -> bool:

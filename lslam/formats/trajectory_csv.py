@@ -98,10 +98,7 @@ def parse(
         raise InputError(f"{path}: no column is a time in the header {', '.join(table.names)}; name it t, or stamp_ns")
     check_increasing(clock.stamps_ns, table.rows, path)
     poses, has_rotations, rotation_notes = poses_of(values, table.rows, path)
-    notes = [*columns.notes, *rotation_notes]
-    if clock.others:
-        chosen = " and ".join(table.names[k] for k in clock.columns)
-        notes.append(f"the time is {chosen}; left out: {', '.join(clock.others)}")
+    notes = [*columns.notes, *rotation_notes, *filter(None, [clock.note])]
     if lost.any():
         notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")
     return Trajectory(

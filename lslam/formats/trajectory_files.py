@@ -16,7 +16,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lslam.errors import InputError
-from lslam.formats.pose_rows import Row, read_rows
+from lslam.formats.pose_rows import read_rows
 from lslam.formats.stamp_files import read_times
 from lslam.formats.trajectory_csv import write_euroc
 from lslam.formats.trajectory_formats import FORMATS, format_named
@@ -24,7 +24,7 @@ from lslam.formats.trajectory_lines import find_times, write_kitti, write_tum
 from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
 
-__all__ = ["detect_format", "find_times", "read_times", "read_trajectory", "write_euroc", "write_kitti", "write_tum"]
+__all__ = ["find_times", "read_times", "read_trajectory", "write_euroc", "write_kitti", "write_tum"]
 
 
 def read_trajectory(path: str | Path, format: str | None = None, times: str | Path | None = None) -> Trajectory:  # noqa: A002
@@ -44,21 +44,12 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
     """
     path = as_path(path)
     if path.is_dir():
-        path = _in_run_folder(path)
+        if not (path / "trajectory.tum").is_file():
+            raise InputError(f"{path} is a folder without trajectory.tum: name a run folder or a trajectory file")
+        path = path / "trajectory.tum"
     rows, comments = read_rows(path)
     forced = None if format is None else format_named(format)
     if not rows:
         raise InputError(f"{path} holds no poses: the file is empty or all comments")
-    return (forced or FORMATS[detect_format(rows)]).read(path, rows, comments, None if times is None else Path(times))
-
-
-def detect_format(rows: list[Row]) -> str:
-    """Name of the format that the first of `rows` is read by, the lines of a file without comments."""
-    return next(name for name, one in FORMATS.items() if one.fits(rows[0].text))
-
-
-def _in_run_folder(folder: Path) -> Path:
-    inside = folder / "trajectory.tum"
-    if not inside.is_file():
-        raise InputError(f"{folder} is a folder without trajectory.tum: name a run folder or a trajectory file")
-    return inside
+    kind = forced or next(kind for kind in FORMATS.values() if kind.fits(rows[0].text))
+    return kind.read(path, rows, comments, None if times is None else Path(times))

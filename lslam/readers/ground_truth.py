@@ -125,12 +125,10 @@ def to_lidar(
     Positions alone cannot be carried: a lever arm turns with the body.
     """
     if not truth.has_rotations:
-        arm = (
-            ""
-            if T_body_lidar is None
-            else f"; the lever arm of {np.linalg.norm(T_body_lidar[:3, 3]):.2f} m stays in them"
-        )
-        voice.notes.append(f"ground truth {truth.source} has positions without rotations: taken as the LiDAR's{arm}")
+        sentence = f"ground truth {truth.source} has positions without rotations: taken as the LiDAR's"
+        if T_body_lidar is not None:
+            sentence += f"; the lever arm of {np.linalg.norm(T_body_lidar[:3, 3]):.2f} m stays in them"
+        voice.notes.append(sentence)
         return replace(truth, frame="lidar")
     if frame == "cam0":
         T = calibration.T_cam0_lidar
