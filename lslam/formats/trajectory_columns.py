@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,22 +30,15 @@ _MOST, _UNIT = 0.95, 0.05
 _XYZW = {"last": [0, 1, 2, 3], "first": [1, 2, 3, 0]}
 
 
-@dataclass(frozen=True)
-class PoseColumns:
-    """position : three columns; rotation : four in the order xyzw, or none; time : the number of columns before, by place
+class PoseColumns(NamedTuple):
+    """columns : of x, y, z and, where there are rotations, qx, qy, qz, qw; leading : the number of columns before, by place
 
     notes : what was chosen and left out
     """
 
-    position: tuple[int, ...]
-    rotation: tuple[int, ...] = ()
-    leading: int = 0
-    notes: tuple[str, ...] = ()
-
-    @property
-    def all(self) -> tuple[int, ...]:
-        """Position and rotation."""
-        return self.position + self.rotation
+    columns: list[int]
+    leading: int
+    notes: list[str]
 
 
 def named_columns(table: TextTable) -> PoseColumns | None:
@@ -85,11 +78,8 @@ def named_columns(table: TextTable) -> PoseColumns | None:
     angles = [name for name in names if not rotation and {*tokens_of(name)} & {*_ANGLES}]
     if angles:
         notes.append(f"left out: {', '.join(angles)}; rotations are read as quaternions (qx, qy, qz, qw)")
-    return PoseColumns(
-        tuple(position[axis] for axis in "xyz"),
-        tuple(rotation[axis] for axis in "xyzw" if rotation),
-        notes=tuple(notes),
-    )
+    columns = [position[axis] for axis in "xyz"] + [rotation[axis] for axis in "xyzw" if rotation]
+    return PoseColumns(columns, 0, notes)
 
 
 def _kind(words: list[str]) -> tuple[bool, Prefix, str] | None:
@@ -134,7 +124,7 @@ def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
     if len(fits) > 1:
         raise InputError(f"{line}: {width} columns may be read in {len(fits)} ways: {_WAY_OUT} in a first line")
     if not fits and width - 3 in leading:
-        return PoseColumns((width - 3, width - 2, width - 1), leading=width - 3)
+        return PoseColumns([width - 3, width - 2, width - 1], width - 3, [])
     if not fits and width != 8:
         raise InputError(
             f"{line}: {width} columns are no trajectory format lslam knows (12 or 16 numbers: KITTI; 8: TUM; 4: time and "
@@ -156,8 +146,7 @@ def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
         )
     if width > n + 7:
         notes.append(f"{width} columns, of which those from column {n + 8} on are left out")
-    rotation = tuple(n + 3 + k for k in _XYZW[order])
-    return PoseColumns((n, n + 1, n + 2), rotation, n, tuple(notes))
+    return PoseColumns([n, n + 1, n + 2, *(n + 3 + k for k in _XYZW[order])], n, notes)
 
 
 def _leading_times(values: Floats) -> list[int]:

@@ -75,8 +75,8 @@ def parse(
     table = text_table(path, rows, comments)
     if not table.rows:
         raise InputError(f"{path} has a header but no poses")
-    columns = named_columns(table) if table.names else None
-    if columns is None:
+    chosen = named_columns(table) if table.names else None
+    if chosen is None:
         if looks_like_header(rows[0].text):
             raise InputError(
                 f"{path}: no column for x, y, z in the header {', '.join(table.names)}; "
@@ -85,20 +85,20 @@ def parse(
         table = replace(table, names=())
     width = len(table.names) or len(table.cells[0])
     table.check_widths(width, "the header" if table.names else "the first line", is_least=table.separator is not None)
-    columns = columns or placed_columns(table, scalar)
-    values = table.values(list(columns.all))
+    columns, leading, notes = chosen or placed_columns(table, scalar)
+    values = table.values(columns)
     lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
     if lost.all():
         raise InputError(f"{path}: every row holds NaN or no numbers: there is no pose")
     table, values = table.select(~lost), values[~lost]
     check_finite(values, table.rows, path)
-    taken = columns.all if table.names else range(columns.leading, len(table.cells[0]))
+    taken = columns if table.names else range(leading, len(table.cells[0]))
     clock = find_clock(table, taken, default_ns)
     if clock is None:
         raise InputError(f"{path}: no column is a time in the header {', '.join(table.names)}; name it t, or stamp_ns")
     check_increasing(clock.stamps_ns, table.rows, path)
     poses, has_rotations, rotation_notes = poses_of(values, table.rows, path)
-    notes = [*columns.notes, *rotation_notes, *filter(None, [clock.note])]
+    notes += [*rotation_notes, *filter(None, [clock.note])]
     if lost.any():
         notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")
     return Trajectory(

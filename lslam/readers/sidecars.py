@@ -64,17 +64,16 @@ def vertical_correction(info: SequenceInfo, files: list[Path], record: PointReco
             f"vertical correction {degrees:g} deg, as stated" if degrees else "no vertical correction, as stated"
         )
         return degrees
-    if info.sensor is not None and not re.match(
-        r"hdl64", re.sub(r"[^a-z0-9]", "", info.sensor.lower()).replace("velodyne", "")
-    ):
-        notes.append(f"no vertical correction: the sensor is {info.sensor}")
-        return 0.0
-    if record not in (None, KITTI):
-        notes.append("no vertical correction: the points are no records of KITTI's HDL-64E")
-        return 0.0
-    top = _top_elevation_deg(files, record)
-    if top is not None and top > _HDL64_TOP_DEG:
-        notes.append(f"no vertical correction: points up to {top:.1f} deg of elevation are no HDL-64E's")
+    why = ""
+    sensor = re.sub(r"[^a-z0-9]", "", (info.sensor or "HDL-64E").lower()).replace("velodyne", "")
+    if not sensor.startswith("hdl64"):
+        why = f"the sensor is {info.sensor}"
+    elif record not in (None, KITTI):
+        why = "the points are no records of KITTI's HDL-64E"
+    elif (top_deg := _top_elevation_deg(files, record)) is not None and top_deg > _HDL64_TOP_DEG:
+        why = f"points up to {top_deg:.1f} deg of elevation are no HDL-64E's"
+    if why:
+        notes.append(f"no vertical correction: {why}")
         return 0.0
     notes.append(f"vertical correction of {HDL64_CORRECTION_DEG} deg for KITTI's HDL-64E, applied in the reader")
     return HDL64_CORRECTION_DEG
@@ -131,8 +130,7 @@ def _load(folder: Path, named: str | None, usual: str, read: Callable[[Path], T]
             problems.append(f"{path}, named by {FILE_NAME}, does not exist")
         return None
     try:
-        stream = read(path)
+        return read(path)
     except InputError as error:
         problems.append(f"not used: {error}")
         return None
-    return stream
