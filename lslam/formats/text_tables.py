@@ -100,13 +100,12 @@ def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
 
 
 def _names_in(comments: list[str], width: int) -> list[str]:
-    """Names of the columns in the first comment that lists as many as there are, or times between commas; empty without."""
+    """Names of the columns in the first comment that lists as many as there are; empty without."""
     for comment in comments:
         text = comment.lstrip("#%/ ")
-        for separator in dict.fromkeys((separator_of(text), None)):
+        for separator in (separator_of(text), None):
             names = split_cells(text, separator)
-            is_list = separator is not None and len(names) > 3 and re.search(r"time|stamp|sec\b", text, re.IGNORECASE)
-            if (len(names) == width > 1 or is_list) and looks_like_header(text):
+            if len(names) == width > 1 and looks_like_header(text):
                 return names
     return []
 
