@@ -61,9 +61,8 @@ class TextTable:
 def looks_like_header(line: str) -> bool:
     """Whether the first field of `line` is a name and no number, or is empty before a name (the index of pandas)."""
     fields = [field.strip("\"' ") for field in re.split(r"[,;\s]\s*", line.strip())[:2]]
-    return any(re.match(r"[A-Za-z_/]|\.[A-Za-z]", field) for field in fields[: 1 if fields[0] else 2]) and (
-        fields[0].lower() not in ("nan", "inf", "infinity")
-    )
+    name = next(filter(None, fields), "")
+    return re.match(r"[A-Za-z_/]|\.[A-Za-z]", name) is not None and name.lower() not in ("nan", "inf", "infinity")
 
 
 def separator_of(text: str) -> str | None:

@@ -31,7 +31,7 @@ _LONGEST_STEP_S = 60.0
 _STAMPED, _TIMED, _ENDING = 0, 1, 2
 
 
-class Clock(NamedTuple):
+class RowTimes(NamedTuple):
     """stamps_ns : (N,); note : which columns hold them and which might have, empty without others"""
 
     stamps_ns: NDArray[np.int64]
@@ -47,7 +47,7 @@ def tokens_of(name: str) -> list[str]:
     return [word for word in re.split(r"[^a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower())) if word]
 
 
-def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> Clock | None:
+def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> RowTimes | None:
     """The time of the rows, by names or, where there are none, by the first columns; None when no column is a time.
 
     taken : columns that are something else; default_ns : ns in a unit where the name states none, by size and step when None
@@ -65,7 +65,7 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     if table.names and others:
         note = f"the time is {' and '.join(table.names[c] for c in chosen)}; "
         note += f"left out: {', '.join(table.names[c] for c in sorted(others))}"
-    return Clock(_stamps(table, chosen, default_ns), note)
+    return RowTimes(_stamps(table, chosen, default_ns), note)
 
 
 def is_index(values: Floats) -> bool:
