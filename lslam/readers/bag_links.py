@@ -20,7 +20,7 @@ from lslam.readers.ground_truth import Voice
 Floats = NDArray[np.float64]
 
 # What moves by less over a whole recording is rigid: the rounding of a driver, the play of a joint.
-_STILL_M, _STILL_RAD = 1e-3, 1e-3
+_STILL = 1e-3  # m, rad
 
 
 @dataclass
@@ -104,26 +104,25 @@ def places_of(
     Raises InputError for a LiDAR whose place nothing says: clouds of one frame may be in it already, or their drivers do not
     know better.
     """
-    known = {} if stated is None else stated
-    named = [next((known[key] for key in (one.name, one.topic.name) if key in known), None) for one in lidars]
-    if known and sum(T is None for T in named) == 1:
+    named = [(stated or {}).get(one.name, (stated or {}).get(one.topic.name)) for one in lidars]
+    if stated and sum(T is None for T in named) == 1:
         named = [np.eye(4) if T is None else T for T in named]
     leading, T_lidar_leading = lidars[0], named[0]
     places = []
     for other, T_lidar_other in zip(lidars[1:], named[1:], strict=True):
-        is_same = other.frame == leading.frame
-        place = None if is_same else links.find(leading.frame, other.frame)
         if T_lidar_other is not None:
             T = T_lidar_other if T_lidar_leading is None else se3.inverse(T_lidar_leading) @ T_lidar_other
-            place = T, "as stated"
+            places.append((T, "as stated"))
+            continue
+        is_same = other.frame == leading.frame
+        place = None if is_same else links.find(leading.frame, other.frame)
         if place is None:
-            why = (
-                f"both are of frame {other.frame or UNNAMED}" if is_same else links.why_not(leading.frame, other.frame)
-            )
+            key, why = other.name, links.why_not(leading.frame, other.frame)
+            if is_same:
+                key, why = other.topic.name, f"both are of frame {other.frame or UNNAMED}"
             raise InputError(
                 f"{links.bag.path}: {other} cannot be merged with {leading}, {why}: state T_lidar_other, 12 numbers, in "
-                f'sequence.toml, [lidars] "{other.topic.name if is_same else other.name}" = [1, 0, 0, x, ...], or take one '
-                "LiDAR with --lidar-topic or --lidar-frame"
+                f'sequence.toml, [lidars] "{key}" = [1, 0, 0, x, ...], or take one LiDAR with --lidar-topic or --lidar-frame'
             )
         places.append(place)
     return places
@@ -132,14 +131,12 @@ def places_of(
 def _spread(poses: Floats) -> tuple[float, float]:
     """By how much poses (N, 4, 4) differ from the first at most: m, rad."""
     off = se3.inverse(poses[0]) @ poses
-    return float(np.linalg.norm(off[:, :3, 3], axis=1).max()), float(
-        np.linalg.norm(so3.log(off[:, :3, :3]), axis=1).max()
-    )
+    metres, turns = (np.linalg.norm(part, axis=1) for part in (off[:, :3, 3], so3.log(off[:, :3, :3])))
+    return float(metres.max()), float(turns.max())
 
 
 def _is_still(poses: Floats) -> bool:
-    metres, turn = _spread(poses)
-    return metres <= _STILL_M and turn <= _STILL_RAD
+    return max(_spread(poses)) <= _STILL
 
 
 def _spread_text(poses: Floats) -> str:

@@ -151,9 +151,8 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     Only headers are read, where stamps do not repeat. Raises InputError when not a single one can be, UsageError for a LiDAR
     that is not there.
     """
-    kept, stamps, broken = [], [], []
-    frames: list[str] = []
-    ids: list[int | None] = []
+    kept, frames, ids, stamps, broken = [], list[str](), list[int | None](), [], []
+    is_livox = topic.type.endswith("CustomMsg")
     bag.expect(topic, is_head=True)
     for k in range(len(topic)):
         try:
@@ -165,7 +164,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
         kept.append(k)
         stamps.append(header.stamp_ns)
         frames.append(header.frame)
-        ids.append(livox_id(data, header.end, topic.encoding == "ros1") if topic.type.endswith("CustomMsg") else None)
+        ids.append(livox_id(data, header.end, topic.encoding == "ros1") if is_livox else None)
     say_broken(broken, topic.name, voice)
     if not kept:
         way_out = "; where its index is wrong `rosbag reindex` mends it" if topic.encoding == "ros1" else ""
@@ -218,11 +217,9 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
     as repeated stamps are.
     """
     if stands_still(stamps, recorded):
-        fact = f"stamps in their headers that stand still at {seconds_text(int(stamps[0]))} s"
-        voice.problems.append(
-            f"{what} have {fact if stamps.any() else 'no stamps in their headers'}: the times of recording are used, late as "
-            "they are"
-        )
+        still = f" that stand still at {seconds_text(int(stamps[0]))} s" if stamps.any() else ""
+        fact = f"{'' if still else 'no '}stamps in their headers{still}"
+        voice.problems.append(f"{what} have {fact}: the times of recording are used, late as they are")
         stamps = recorded
     late, again = _lateness(stamps)
     agreement = agree(stamps, np.where(again, 0, late), Clock("the times of recording", recorded), what)
@@ -244,12 +241,10 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
         voice.problems.append(
             f"{what} are out of order in {jitter} places, by up to {late[index].max() * 1e-9:.3f} s: sorted"
         )
-    index = index[np.argsort(stamps[index], kind="stable")]
-    repeats = np.concatenate([[False], np.diff(stamps[index]) == 0]) if len(index) else np.zeros(0, bool)
-    if repeats.any():
-        voice.problems.append(f"{what} repeat a stamp {int(repeats.sum())} times: the first one of each counts")
-    index = index[~repeats]
-    return index, stamps[index]
+    ordered, firsts = np.unique(stamps[index], return_index=True)
+    if len(firsts) < len(index):
+        voice.problems.append(f"{what} repeat a stamp {len(index) - len(firsts)} times: the first one of each counts")
+    return index[firsts], ordered
 
 
 def _lateness(stamps: Stamps) -> tuple[Stamps, NDArray[np.bool_]]:
