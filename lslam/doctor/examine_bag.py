@@ -57,7 +57,7 @@ def bag_at(name_or_path: str, data_root: Path | None) -> Facts | None:
 
 
 def _span(bag: Bag, topic: BagTopic) -> tuple[int, int] | None:
-    stamps = bag.recorded_ns(topic)
+    stamps = topic.stamps_ns.tolist()
     return (min(stamps), max(stamps)) if stamps else None
 
 

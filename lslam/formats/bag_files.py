@@ -91,12 +91,11 @@ class BagTopic:
     @cached_property
     def stamps_ns(self) -> NDArray[np.int64]:
         """(N,) when each message was recorded."""
-        stamps = np.concatenate([topic.stamps_ns for _, topic in self.parts])
-        return stamps if self._order is None else stamps[self._order]
+        return np.concatenate([topic.stamps_ns for _, topic in self.parts])[self._order]
 
     def place(self, k: int) -> tuple[Recording, Topic, int]:
         """Where message `k` lies, and its number there. Raises IndexError beyond the last."""
-        k = k if self._order is None else int(self._order[k])
+        k = int(self._order[k])
         for recording, topic in self.parts:
             if k < len(topic):
                 return recording, topic, k
@@ -104,10 +103,9 @@ class BagTopic:
         raise IndexError(k)
 
     @cached_property
-    def _order(self) -> NDArray[np.int64] | None:
-        """The messages, counted one part after the other, by their times; None where they are in order."""
-        stamps = np.concatenate([topic.stamps_ns for _, topic in self.parts])
-        return None if (np.diff(stamps) >= 0).all() else np.argsort(stamps, kind="stable")
+    def _order(self) -> NDArray[np.int64]:
+        """(N,) the messages, counted one part after the other, by their times."""
+        return np.argsort(np.concatenate([topic.stamps_ns for _, topic in self.parts]), kind="stable")
 
 
 class Header(NamedTuple):
@@ -152,10 +150,6 @@ class Bag:
     def of_type(self, *names: str) -> list[BagTopic]:
         """Topics with messages that lslam can decode, of the types whose names (`Imu`, `PointCloud2`) are given."""
         return [t for t in self.topics if len(t) and t.encoding in _ENCODINGS and t.type.rsplit("/", 1)[-1] in names]
-
-    def recorded_ns(self, topic: BagTopic) -> list[int]:
-        """When each message of `topic` was recorded, ns."""
-        return [int(stamp) for stamp in topic.stamps_ns]
 
     def expect(self, topic: BagTopic, is_head: bool = False) -> None:
         """Say that all messages of `topic` will be read next, or no more than their beginnings."""

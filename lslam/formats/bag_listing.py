@@ -46,21 +46,21 @@ def left_out(path: Path, files: list[Path]) -> list[str]:
     if not path.is_dir():
         return []
     names = {p.name for p in files}
-    said = []
+    sentences = []
     for name in sorted(p.name for p in path.iterdir() if p.name[0] != "."):
         if name in names or name.endswith(_COMPANIONS):
             continue
         if _unpacked(name) in names:
-            said.append(f"{name} is left out: {_unpacked(name)} is the same part, not compressed")
+            sentences.append(f"{name} is left out: {_unpacked(name)} is the same part, not compressed")
         elif inner := next((s for s in SUFFIXES if f"{s}." in name.lower()), None):
             ending = name.lower().rpartition(f"{inner}.")[2]
-            said.append(f"{name} is not read: .{ending} is no ending of a bag nor of a compression that is known")
-    return said
+            sentences.append(f"{name} is not read: .{ending} is no ending of a bag nor of a compression that is known")
+    return sentences
 
 
 def missing_parts(path: Path, files: list[Path]) -> list[str]:
     """Sentences about parts that are not there, by the numbers in the names and by `metadata.yaml`."""
-    said = []
+    sentences = []
     series: dict[str, dict[int, Path]] = {}
     for file in files:
         if (own := _numbered(file)) is not None:
@@ -71,15 +71,15 @@ def missing_parts(path: Path, files: list[Path]) -> list[str]:
         # More numbers missing than there are: they count something else, days or minutes.
         if 0 < len(missing) <= 10 * len(have):
             which = f"part {missing[0]} is" if len(missing) == 1 else f"parts {shown(missing)} are"
-            said.append(
+            sentences.append(
                 f"{which} missing: the parts in {path} are numbered from {have[0]} ({numbers[have[0]].name}) to "
                 f"{have[-1]} ({numbers[have[-1]].name})"
             )
         # ROS 2 counts from 0 and calls the parts as their folder.
         first = 0 if name == path.name else 1
         if have[0] > first and (len(have) > 1 or first == 0):
-            said.append(f"the first part in {path} is {numbers[have[0]].name}: those before it are missing")
-    return said + _unlisted(path, files)
+            sentences.append(f"the first part in {path} is {numbers[have[0]].name}: those before it are missing")
+    return sentences + _unlisted(path, files)
 
 
 def parts_beside(path: Path) -> list[Path]:

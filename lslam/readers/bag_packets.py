@@ -85,7 +85,7 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
     for n, topic in enumerate(topics):
         broken: list[str] = []
         bag.expect(topic)
-        for k, recorded in enumerate(bag.recorded_ns(topic)):
+        for k, recorded in enumerate(topic.stamps_ns.tolist()):
             try:
                 own, packets, of = read_packets(topic, bag.message(topic, k))
             except InputError as error:

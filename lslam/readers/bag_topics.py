@@ -169,7 +169,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     if not kept:
         way_out = "; where its index is wrong `rosbag reindex` mends it" if topic.encoding == "ros1" else ""
         raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read{way_out}")
-    recorded = np.array(bag.recorded_ns(topic), np.int64)[kept]
+    recorded = topic.stamps_ns[kept]
     messages, headers = np.array(kept, np.int64), np.array(stamps, np.int64)
     names = name_lidars(frames, ids)
     chosen = choose_lidars(topic, names, wanted, voice)
