@@ -106,12 +106,11 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} cannot be read as TOML: {error}") from None
     extrinsics, lidars = tree.pop("extrinsics", {}), tree.pop("lidars", {})
-    if not isinstance(extrinsics, dict):
-        raise InputError(f"{path}: extrinsics is a table, write [extrinsics] and below it T_lidar_imu = [...]")
-    if not isinstance(lidars, dict):
-        raise InputError(
-            f'{path}: lidars is a table, write [lidars] and below it "FOLDER" = [T_lidar_other, 12 numbers]'
-        )
+    for key, table, row in (
+        ("extrinsics", extrinsics, "T_lidar_imu = [...]"), ("lidars", lidars, '"FOLDER" = [T_lidar_other, 12 numbers]'),
+    ):  # fmt: skip
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {key} is a table, write [{key}] and below it {row}")
     values: dict[str, Any] = {}
     for key, value in tree.items():
         if key not in _CHECKS:
@@ -136,14 +135,11 @@ def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
 def sequence_toml_text(info: SequenceInfo) -> str:
     """`info` as TOML, without what is None."""
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, "lidars")}
-    tree = {key: value for key, value in tree.items() if value is not None}
-    known = {key: getattr(info, key) for key in EXTRINSICS}
-    matrices = {key: np.asarray(T, np.float64).tolist() for key, T in known.items() if T is not None}
-    if matrices:
-        tree["extrinsics"] = matrices
-    if info.lidars:
-        tree["lidars"] = {name: np.asarray(T, np.float64).tolist() for name, T in info.lidars.items()}
-    return toml_text(tree)
+    tables = {"extrinsics": {key: getattr(info, key) for key in EXTRINSICS}, "lidars": info.lidars or {}}
+    for key, matrices in tables.items():
+        rows = {name: np.asarray(T, np.float64).tolist() for name, T in matrices.items() if T is not None}
+        tree[key] = rows or None
+    return toml_text({key: value for key, value in tree.items() if value is not None})
 
 
 def is_rate(rate_hz: float) -> bool:
@@ -179,14 +175,9 @@ _CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "bin_record": (is_record, 'columns like "x y z intensity ring:u2 time:f8", float32 where no type is named'),
     "point_unit": (lambda v: v in (*LENGTHS,), "one of " + ", ".join(LENGTHS)),
     "point_times": (lambda v: v in POINT_TIMES, "one of " + ", ".join(POINT_TIMES)),
-    "stamps": (_is_text, "a file"),
-    "imu": (_is_text, "a file"),
-    "gnss": (_is_text, "a file"),
-    "ground_truth": (_is_text, "a file"),
-    "lidar_topic": (_is_text, "a topic"),
+    **dict.fromkeys(("stamps", "imu", "gnss", "ground_truth"), (_is_text, "a file")),
+    **dict.fromkeys(("lidar_topic", "imu_topic", "gnss_topic"), (_is_text, "a topic")),
     "lidar_frame": (_is_text, "a frame, or all"),
-    "imu_topic": (_is_text, "a topic"),
-    "gnss_topic": (_is_text, "a topic"),
     "ground_truth_frame": (lambda v: v in FRAMES, "one of " + ", ".join(FRAMES)),
 }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
-from math import inf, log
+from math import inf, isnan, log, nan
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -79,43 +79,48 @@ def find_unit(scans: list[NDArray[np.float64]]) -> tuple[str | None, str]:
     height = _median([_ground(points) for points in scans])
     noise = _median([_noise(points) for points in scans])
     step = max(_step(points) for points in scans)
+    evidence = [
+        (reach, _RANGE_M, _RANGE_WEIGHT, f"half of the points lie beyond {reach:.4g}"),
+        (height, _HEIGHT_M, 1.0, f"the ground {height:.4g} below the sensor"),
+        (noise, _NOISE_M, 1.0, f"surfaces are {noise:.2g} thick"),
+    ]
+    evidence = [row for row in evidence if not isnan(row[0])]
     costs = {}
     for name, length in LENGTHS.items():
-        cost = _RANGE_WEIGHT * abs(log(reach * length / _RANGE_M))
-        cost += 0.0 if height is None else abs(log(height * length / _HEIGHT_M))
-        cost += 0.0 if noise is None else abs(log(max(noise * length, _THINNEST_M) / _NOISE_M))
-        is_possible = step * length <= _COARSEST_M and (noise is None or _THINNEST_M < noise * length < _THICKEST_M)
-        costs[name] = cost if is_possible else inf
+        is_possible = step * length <= _COARSEST_M and not (
+            noise * length <= _THINNEST_M or noise * length >= _THICKEST_M
+        )
+        apart = sum(
+            weight * abs(log(max(value * length, _THINNEST_M) / usual_m)) for value, usual_m, weight, _ in evidence
+        )
+        costs[name] = apart if is_possible else inf
     best, second, *_ = sorted(costs, key=lambda name: costs[name])
-    evidence = [f"half of the points lie beyond {reach:.4g}"]
-    evidence += [] if height is None else [f"the ground {height:.4g} below the sensor"]
-    evidence += [] if noise is None else [f"surfaces are {noise:.2g} thick"]
-    evidence += [f"coordinates lie in steps of {step:g}"] if step else []
-    why = f"{', '.join(evidence)}; point_unit in sequence.toml states another unit"
-    is_clear = costs[best] < inf and costs[second] - costs[best] >= _MARGIN and (noise is not None or step >= 1)
-    return (
-        (best, f"points in {best}, found: {why}") if is_clear else (None, f"points are taken to be in m, though {why}")
-    )
+    sentences = [row[-1] for row in evidence] + ([f"coordinates lie in steps of {step:g}"] if step else [])
+    why = f"{', '.join(sentences)}; point_unit in sequence.toml states another unit"
+    if costs[best] < inf and costs[second] - costs[best] >= _MARGIN and (not isnan(noise) or step >= 1):
+        return best, f"points in {best}, found: {why}"
+    return None, f"points are taken to be in m, though {why}"
 
 
-def _median(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
+def _median(values: list[float]) -> float:
+    """Without NaN; NaN where nothing is left."""
+    numbers = [value for value in values if not isnan(value)]
+    return float(np.median(numbers)) if numbers else nan
 
 
-def _ground(points: NDArray[np.float64]) -> float | None:
-    """How far below the sensor most of the points are that lie below it; None where few do."""
+def _ground(points: NDArray[np.float64]) -> float:
+    """How far below the sensor most of the points are that lie below it; NaN where few do."""
     level = np.hypot(points[:, 0], points[:, 1])
     below = -points[points[:, 2] < -0.05 * level, 2]
     if len(below) < _MIN_POINTS:
-        return None
+        return nan
     counts, edges = np.histogram(below, 40, (0.0, float(np.percentile(below, 99))))
     k = int(np.argmax(counts))
     return float(edges[k] + edges[k + 1]) / 2
 
 
-def _noise(points: NDArray[np.float64]) -> float | None:
-    """Thickness of surfaces: of the flattest patches of a tenth of their range; None where there are too few."""
+def _noise(points: NDArray[np.float64]) -> float:
+    """Thickness of surfaces: of the flattest patches of a tenth of their range; NaN where there are too few."""
     from scipy.spatial import cKDTree
 
     points = points[:_MOST_POINTS]
@@ -128,7 +133,7 @@ def _noise(points: NDArray[np.float64]) -> float | None:
             spread = np.linalg.svd(patch - patch.mean(0), compute_uv=False) / len(patch) ** 0.5
             if spread[1] > 0.2 * spread[0]:
                 thickness.append(float(spread[2]))
-    return float(np.percentile(thickness, 25)) if len(thickness) >= _PATCHES // 10 else None
+    return float(np.percentile(thickness, 25)) if len(thickness) >= _PATCHES // 10 else nan
 
 
 def _step(points: NDArray[np.float64]) -> float:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.point_files import read_array, read_bytes, record_of
@@ -24,50 +27,33 @@ def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRec
     suffix = files[0].suffix.lower()
     if suffix not in (".bin", ".npy"):
         return None
+    some = [files[k] for k in np.unique(np.linspace(0, len(files) - 1, min(len(files), _LOOKED_AT)).astype(int))]
+    raw = _readable(some, read_bytes if suffix == ".bin" else read_array)
+    tables = [table for table in raw.values() if len(table) and not table.dtype.names]
+    if suffix == ".npy" and not tables:
+        return None
     if info.bin_record is not None:
         record = parse_record(info.bin_record)
-        if suffix == ".bin" or not _is_structured(files[0]):
-            voice.notes.append(f"points of {len(record.names)} columns, {record}, as stated")
-            return record
-        return None
-    some = [files[k] for k in np.unique(np.linspace(0, len(files) - 1, min(len(files), _LOOKED_AT)).astype(int))]
-    return _of_bins(some, voice) if suffix == ".bin" else _of_arrays(some, voice)
+        voice.notes.append(f"points of {len(record.names)} columns, {record}, as stated")
+        return record
+    if suffix == ".bin":
+        record, reason = record_of(raw)
+        sentence = f"points of {record.size} bytes, {record}, by their values: {reason}"
+    else:
+        if len({table.shape[1] for table in tables}) > 1 or tables[0].shape[1] < 4:
+            return None
+        names = name_columns(tables)
+        record = PointRecord(names, (tables[0].dtype.str,) * len(names))
+        sentence = f"points of {len(names)} columns, {' '.join(names)}, by their values"
+    if record.names != KITTI.names or (suffix == ".bin" and record != KITTI):
+        unread = record.unread()
+        voice.notes.append(sentence + (f"; {unread}, nothing says what they are" if unread else ""))
+    return record
 
 
-def _of_bins(files: list[Path], voice: Voice) -> PointRecord:
+def _readable(files: list[Path], read: Callable[[Path], NDArray[Any]]) -> dict[Path, NDArray[Any]]:
     raw = {}
     for path in files:
         with suppress(InputError):
-            raw[path] = read_bytes(path)
-    record, reason = record_of(raw)
-    if record != KITTI:
-        _say(f"points of {record.size} bytes, {record}, by their values: {reason}", record, voice)
-    return record
-
-
-def _of_arrays(files: list[Path], voice: Voice) -> PointRecord | None:
-    tables = []
-    for path in files:
-        with suppress(InputError):
-            table = read_array(path)
-            if not table.dtype.names and len(table):
-                tables.append(table)
-    if not tables or len({table.shape[1] for table in tables}) > 1 or tables[0].shape[1] < 4:
-        return None
-    names = name_columns(tables)
-    record = PointRecord(names, (tables[0].dtype.str,) * len(names))
-    if names != KITTI.names:
-        _say(f"points of {len(names)} columns, {' '.join(names)}, by their values", record, voice)
-    return record
-
-
-def _say(sentence: str, record: PointRecord, voice: Voice) -> None:
-    unread = record.unread()
-    voice.notes.append(sentence + (f"; {unread}, nothing says what they are" if unread else ""))
-
-
-def _is_structured(path: Path) -> bool:
-    try:
-        return read_array(path).dtype.names is not None
-    except InputError:
-        return False
+            raw[path] = read(path)
+    return raw
