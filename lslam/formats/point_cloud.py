@@ -34,13 +34,12 @@ TIME_NAMES = (
 )  # fmt: skip
 # FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
 _DOUBTFUL_TIMES = {"curvature": "ms"}
-_UNITS = {
-    "s": ("s", "sec", "secs", "seconds"),
-    "ms": ("ms", "msec", "millis"),
-    "us": ("us", "usec", "micros", "microsec"),
-    "ns": ("ns", "nsec", "nsecs", "nanosec", "nanos", "nanoseconds"),
+_UNIT_OF = {
+    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millis"), "ms"),
+    **dict.fromkeys(("us", "usec", "micros", "microsec"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanos", "nanoseconds"), "ns"),
 }
-_UNIT_OF = {word: unit for unit, words in _UNITS.items() for word in words}
 _FINE_PER_S = {"ns": 10**9, "us": 10**6, "ms": 10**3}
 # Before `_sec` and `_nsec`, where it is none of `TIME_NAMES`.
 _CLOCKS = ("", "lidar", "sensor", "point", "utc", "gps", "header", "epoch")

@@ -100,6 +100,7 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
             "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
             "leaves scans as they are)"
         )
+    imu, gnss = _streams(oxts)
     return folder_sequence(
         folder,
         KIND,
@@ -111,8 +112,8 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         motion_compensated=compensated,
         calibration=calibration,
         ground_truth=_ground_truth(folder, info, files, stamps, oxts, calibration, voice),
-        imu=load_imu(folder, info, voice.problems) or _imu(oxts),
-        gnss=load_gnss(folder, info, voice.problems) or _gnss(oxts),
+        imu=load_imu(folder, info, voice.problems) or imu,
+        gnss=load_gnss(folder, info, voice.problems) or gnss,
         correction_deg=vertical_correction(info, files, record, voice.notes),
         sweep_s=sweep,
         sensor=info.sensor or (None if has_toml else "HDL-64E"),
@@ -223,16 +224,11 @@ def _calibration(day: Path, voice: Voice) -> Calibration:
     return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu)
 
 
-def _imu(oxts: Oxts | None) -> ImuStream | None:
+def _streams(oxts: Oxts | None) -> tuple[ImuStream | None, GnssStream | None]:
     if oxts is None or oxts.stamps_ns is None:
-        return None
-    return ImuStream(oxts.stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
-
-
-def _gnss(oxts: Oxts | None) -> GnssStream | None:
-    if oxts is None or oxts.stamps_ns is None:
-        return None
-    return GnssStream(oxts.stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
+        return None, None
+    imu = ImuStream(oxts.stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
+    return imu, GnssStream(oxts.stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
 
 
 def _ground_truth(

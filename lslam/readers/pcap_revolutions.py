@@ -117,7 +117,7 @@ def in_order(times_ns: Integers, what: str, voice: Voice) -> Integers:
     if late:
         voice.problems.append(f"{what} are out of order in {late} places: sorted by their own times")
     ordered = times_ns[order]
-    repeated = np.concatenate([[False], np.diff(ordered) == 0]) if len(ordered) else np.zeros(0, bool)
+    repeated = np.diff(ordered, prepend=ordered[:1] - 1) == 0
     if repeated.any():
         voice.problems.append(f"{what} repeat a time {int(repeated.sum())} times: the first one of each counts")
     return np.asarray(order[~repeated], np.int64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from lslam.formats.velodyne_packets import (
     RETURNS,
     SIZE,
     TURN,
+    Blocks,
     VelodyneModel,
     points_of,
     split_blocks,
@@ -35,7 +37,7 @@ class VelodyneRevolutions:
 
     began : azimuth of the first block, 0.01 deg
     packets : (P,) datagrams in order; azimuth : (P,) of their first blocks from `began`, unwrapped; times_ns : (P,)
-    turns : (N,) which revolutions have points; stamps_ns : (N,)
+    turns : (N,) which revolutions have points
     """
 
     datagrams: Packets
@@ -45,17 +47,32 @@ class VelodyneRevolutions:
     azimuth: Integers
     times_ns: Integers
     turns: Integers
-    stamps_ns: Integers
+
+    @cached_property
+    def stamps_ns(self) -> Integers:
+        """(N,) when the first block of each revolution was measured."""
+        return np.array([self._stamp(turn) for turn in self.turns.tolist()], np.int64)
 
     def read(self, index: int) -> tuple[PointCloud, Integers]:
         """Points of revolution `index` in the order they were measured, and when each was, ns."""
         turn = int(self.turns[index])
-        begin = max(int(np.searchsorted(self.azimuth, turn * TURN, "right")) - 1, 0)
         # One packet more: the azimuth of the next block tells how far the last one turns.
-        end = int(np.searchsorted(self.azimuth, (turn + 1) * TURN)) + 1
-        packets = self.datagrams.payloads(self.packets[begin:end])
-        blocks = split_blocks(packets, self.azimuth[begin:end], self.times_ns[begin:end], self.model)
+        blocks = self._blocks(self._begin(turn), int(np.searchsorted(self.azimuth, (turn + 1) * TURN)) + 1)
         return points_of(blocks, blocks.azimuth // TURN == turn, self.began, self.model)
+
+    def _stamp(self, turn: int) -> int:
+        begin = self._begin(turn)
+        blocks = self._blocks(begin, begin + 2)
+        times_ns = blocks.times_ns[blocks.azimuth >= turn * TURN]
+        return int(times_ns[0] if len(times_ns) else self.times_ns[begin:][:2][-1])
+
+    def _begin(self, turn: int) -> int:
+        """The packet within which the revolution begins."""
+        return max(int(np.searchsorted(self.azimuth, turn * TURN, "right")) - 1, 0)
+
+    def _blocks(self, begin: int, end: int) -> Blocks:
+        packets = self.datagrams.payloads(self.packets[begin:end])
+        return split_blocks(packets, self.azimuth[begin:end], self.times_ns[begin:end], self.model)
 
 
 def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
@@ -85,10 +102,7 @@ def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
     elif end % TURN > TURN // 100:
         voice.notes.append(f"the last {end % TURN / TURN:.2f} of a revolution are no scan")
     turns = turns[is_whole][no_slivers(counts[is_whole] * (rate * model.block_ns * per_packet / TURN), voice)]
-    revolutions = VelodyneRevolutions(
-        datagrams, model, int(angle[0]), which, azimuth, times, turns,
-        _stamps(datagrams, which, azimuth, times, turns, model),
-    )  # fmt: skip
+    revolutions = VelodyneRevolutions(datagrams, model, int(angle[0]), which, azimuth, times, turns)
     voice.notes.append(
         f"{len(which)} packets of a {model.name}, {RETURNS[mode]} return{' read: the last' if mode == DUAL else ''}; scans are "
         f"cut at the azimuth of {angle[0] * 0.01:.2f} deg"
@@ -136,17 +150,3 @@ def _unwrapped(path: Path, angle: Integers, times_ns: Integers) -> tuple[Integer
     azimuth = np.concatenate([[0], np.cumsum(np.maximum(steps + TURN * turned, 0))])
     # Over the whole of the capture the rounding of azimuths does not count.
     return azimuth, float(azimuth[-1] / (times_ns[-1] - times_ns[0]))
-
-
-def _stamps(
-    datagrams: Packets, which: Integers, azimuth: Integers, times_ns: Integers, turns: Integers, model: VelodyneModel
-) -> Integers:
-    """When the first block of each revolution is measured."""
-    stamps = np.zeros(len(turns), np.int64)
-    for k, turn in enumerate(turns.tolist()):
-        begin = max(int(np.searchsorted(azimuth, turn * TURN, "right")) - 1, 0)
-        packets = datagrams.payloads(which[begin : begin + 2])
-        blocks = split_blocks(packets, azimuth[begin : begin + 2], times_ns[begin : begin + 2], model)
-        inside = np.flatnonzero(blocks.azimuth >= turn * TURN)
-        stamps[k] = blocks.times_ns[inside[0]] if len(inside) else times_ns[min(begin + 1, len(times_ns) - 1)]
-    return stamps

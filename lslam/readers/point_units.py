@@ -87,13 +87,12 @@ def find_unit(scans: list[NDArray[np.float64]]) -> tuple[str | None, str]:
     evidence = [row for row in evidence if not isnan(row[0])]
     costs = {}
     for name, length in LENGTHS.items():
-        is_possible = step * length <= _COARSEST_M and not (
-            noise * length <= _THINNEST_M or noise * length >= _THICKEST_M
-        )
-        apart = sum(
+        thickness_m = noise * length
+        is_impossible = step * length > _COARSEST_M or thickness_m <= _THINNEST_M or thickness_m >= _THICKEST_M
+        apart = [
             weight * abs(log(max(value * length, _THINNEST_M) / usual_m)) for value, usual_m, weight, _ in evidence
-        )
-        costs[name] = apart if is_possible else inf
+        ]
+        costs[name] = inf if is_impossible else sum(apart)
     best, second, *_ = sorted(costs, key=lambda name: costs[name])
     sentences = [row[-1] for row in evidence] + ([f"coordinates lie in steps of {step:g}"] if step else [])
     why = f"{', '.join(sentences)}; point_unit in sequence.toml states another unit"
