@@ -124,7 +124,7 @@ def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
 
     KITTI's is taken unless the sizes of most files or the values contradict it. Few points decide nothing.
     """
-    files = [raw for raw in files if len(raw)]
+    files = [raw for raw in files if len(raw) >= KITTI.size]
     if not files:
         return Recognition(KITTI)
     grave, slight = _faults(KITTI, files) or ("", "")
@@ -204,8 +204,9 @@ def _impossible(record: PointRecord, scans: list[Floats]) -> str:
     floats = rows[:, ["f" in code for code in record.types]]
     is_tiny = ((np.abs(floats) < _SMALLEST_M) & (floats != 0)).any(1)
     is_large = (np.abs(rows[:, :3]) > _LARGEST_M).any(1)
-    # NaN in one coordinate alone marks a point of some drivers; bytes that are no numbers are too large or too small as well.
-    if max(is_large.mean(), is_tiny.mean()) > _RARE:
+    # NaN in one coordinate alone marks a point of some drivers. Bytes that are no numbers are of all sizes; where nearly all
+    # points lie too far, the record is right and the scan is of no use.
+    if _RARE < is_large.mean() < 1 - _RARE or is_tiny.mean() > _RARE:
         return "the values are no coordinates"
     if "intensity" in columns:
         k = columns["intensity"]

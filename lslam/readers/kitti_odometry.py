@@ -69,23 +69,14 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if info.motion_compensated is None and compensated:
         voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
     return folder_sequence(
-        folder,
-        KIND,
-        replace(info, name=info.name or f"seq{folder.name}") if folder.name.isdigit() else info,
-        voice,
-        files=files,
-        stamps_ns=stamps,
-        rate_hz=rate,
-        motion_compensated=compensated,
-        calibration=calibration,
+        folder, KIND, replace(info, name=info.name or f"seq{folder.name}") if folder.name.isdigit() else info, voice,
+        files=files, stamps_ns=stamps, rate_hz=rate, motion_compensated=compensated, calibration=calibration,
         ground_truth=_ground_truth(folder, info, files, stamps, calibration, voice),
-        imu=load_imu(folder, info, voice.problems),
-        gnss=load_gnss(folder, info, voice.problems),
+        imu=load_imu(folder, info, voice.problems), gnss=load_gnss(folder, info, voice.problems),
         correction_deg=vertical_correction(info, files, record, voice.notes),
-        sensor=info.sensor or (None if has_toml or record != KITTI else "HDL-64E"),
-        record=record,
+        sensor=info.sensor or (None if has_toml or record != KITTI else "HDL-64E"), record=record,
         clock=clock_of_files(files, record, stamps, rate, info, voice) if has_times and not compensated else None,
-    )
+    )  # fmt: skip
 
 
 def _stamps(
@@ -105,21 +96,20 @@ def _tr(folder: Path, voice: Voice) -> NDArray[np.float64] | None:
     if not path.is_file():
         voice.notes.append(f"{path} is missing: the camera's place is unknown")
         return None
-    problems = len(voice.problems)
-    T_cam0_lidar = calibration_in(path, read_odometry_calib, voice)
-    if T_cam0_lidar is None and len(voice.problems) == problems:
-        voice.problems.append(f"{path} has no Tr (T_cam0_lidar): poses cannot be carried between camera and LiDAR")
+    return calibration_in(path, _read_tr, voice)
+
+
+def _read_tr(path: Path) -> NDArray[np.float64]:
+    T_cam0_lidar = read_odometry_calib(path)
+    if T_cam0_lidar is None:
+        raise InputError(f"{path} has no Tr (T_cam0_lidar): poses cannot be carried between camera and LiDAR")
     return T_cam0_lidar
 
 
 def _ground_truth(
-    folder: Path,
-    info: SequenceInfo,
-    files: list[Path],
-    stamps: NDArray[np.int64],
-    calibration: Calibration,
+    folder: Path, info: SequenceInfo, files: list[Path], stamps: NDArray[np.int64], calibration: Calibration,
     voice: Voice,
-) -> Trajectory | None:
+) -> Trajectory | None:  # fmt: skip
     number = sequence_number(folder.name) or folder.name
     usual = [above / "poses" / f"{number}.txt" for above in (folder.parent.parent, folder.parent)]
     path = next((p for p in usual if p.is_file()), None)

@@ -102,23 +102,13 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
         )
     imu, gnss = _streams(oxts)
     return folder_sequence(
-        folder,
-        KIND,
-        info,
-        voice,
-        files=files,
-        stamps_ns=stamps,
-        rate_hz=rate,
-        motion_compensated=compensated,
-        calibration=calibration,
+        folder, KIND, info, voice,
+        files=files, stamps_ns=stamps, rate_hz=rate, motion_compensated=compensated, calibration=calibration,
         ground_truth=_ground_truth(folder, info, files, stamps, oxts, calibration, voice),
-        imu=load_imu(folder, info, voice.problems) or imu,
-        gnss=load_gnss(folder, info, voice.problems) or gnss,
-        correction_deg=vertical_correction(info, files, record, voice.notes),
-        sweep_s=sweep,
-        sensor=info.sensor or (None if has_toml else "HDL-64E"),
-        record=record,
-    )
+        imu=load_imu(folder, info, voice.problems) or imu, gnss=load_gnss(folder, info, voice.problems) or gnss,
+        correction_deg=vertical_correction(info, files, record, voice.notes), sweep_s=sweep,
+        sensor=info.sensor or (None if has_toml else "HDL-64E"), record=record,
+    )  # fmt: skip
 
 
 def _oxts(folder: Path, voice: Voice) -> Oxts | None:
@@ -232,14 +222,9 @@ def _streams(oxts: Oxts | None) -> tuple[ImuStream | None, GnssStream | None]:
 
 
 def _ground_truth(
-    folder: Path,
-    info: SequenceInfo,
-    files: list[Path],
-    stamps: NDArray[np.int64],
-    oxts: Oxts | None,
-    calibration: Calibration,
-    voice: Voice,
-) -> Trajectory | None:
+    folder: Path, info: SequenceInfo, files: list[Path], stamps: NDArray[np.int64], oxts: Oxts | None,
+    calibration: Calibration, voice: Voice,
+) -> Trajectory | None:  # fmt: skip
     if info.ground_truth is not None:
         path = find_ground_truth(folder, info, voice)
         truth = load_poses(path, stamps, files, voice) if path else None

@@ -87,41 +87,22 @@ def open_folder(folder: Path, overrides: SequenceInfo, why: str) -> FolderSequen
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     return folder_sequence(
-        folder,
-        KIND,
-        info,
-        voice,
-        files=files,
-        stamps_ns=stamps,
-        rate_hz=rate,
-        motion_compensated=info.motion_compensated,
-        calibration=calibration,
-        ground_truth=truth,
-        imu=_with_scans(imu, scans_of, "IMU", voice),
-        gnss=_with_scans(gnss, scans_of, "GNSS", voice),
-        correction_deg=info.vertical_correction_deg or 0.0,
-        clock=clock,
-        sensor=info.sensor,
-        record=record,
-    )
+        folder, KIND, info, voice,
+        files=files, stamps_ns=stamps, rate_hz=rate, motion_compensated=info.motion_compensated,
+        calibration=calibration, ground_truth=truth,
+        imu=_with_scans(imu, scans_of, "IMU", voice), gnss=_with_scans(gnss, scans_of, "GNSS", voice),
+        correction_deg=info.vertical_correction_deg or 0.0, clock=clock, sensor=info.sensor, record=record,
+    )  # fmt: skip
 
 
 def folder_sequence(folder: Path, kind: str, info: SequenceInfo, voice: Voice, **parts: Any) -> FolderSequence:
     """The sequence of `parts`, see `FolderSequence`, with what `info` says of every kind of folder, its points in m."""
     sequence = FolderSequence(
-        name=info.name or printable(folder.name),
-        path=folder,
-        kind=kind,
-        rows=info.rows,
-        cols=info.cols,
-        per_point=per_point_folder(folder, info),
-        rings=info.rings or info.rows,
-        unit_m=LENGTHS.get(info.point_unit or ""),
-        notes=voice.notes,
-        problems=voice.problems,
-        stated_times=stated_times(info),
-        **parts,
-    )
+        name=info.name or printable(folder.name), path=folder, kind=kind, rows=info.rows, cols=info.cols,
+        per_point=per_point_folder(folder, info), rings=info.rings or info.rows,
+        unit_m=LENGTHS.get(info.point_unit or ""), notes=voice.notes, problems=voice.problems,
+        stated_times=stated_times(info), **parts,
+    )  # fmt: skip
     return settle_unit(sequence)
 
 
@@ -152,22 +133,20 @@ def _scans_in(folder: Path) -> tuple[Path, list[Path], list[str]] | None:
 
 
 def _stamps_and_truth(
-    folder: Path,
-    info: SequenceInfo,
-    files: list[Path],
-    read: Read,
-    beside: list[NDArray[np.int64]],
-    calibration: Calibration,
-    voice: Voice,
-) -> tuple[StampedScans, Trajectory | None]:
+    folder: Path, info: SequenceInfo, files: list[Path], read: Read, beside: list[NDArray[np.int64]],
+    calibration: Calibration, voice: Voice,
+) -> tuple[StampedScans, Trajectory | None]:  # fmt: skip
     """Stamps from their file, the file names, or the ground truth that goes with the scans by index; else nominal."""
-    found = _own_stamps(folder, info, files, read, beside, voice)
-    truth_file = find_ground_truth(folder, info, voice)
-    if found is not None:
-        return found, _truth(truth_file, folder, info, found.files, found.stamps_ns, calibration, voice)
+    own = _own_stamps(folder, info, files, read, beside, voice)
     rate = info.rate_hz or DEFAULT_RATE_HZ
     nominal = nominal_stamps(len(files), rate)
-    truth = _truth(truth_file, folder, info, files, nominal, calibration, voice)
+    scans = own or StampedScans(files, nominal, rate, nominal)
+    truth_file = find_ground_truth(folder, info, voice)
+    truth = None
+    if truth_file is not None:
+        truth = _truth(truth_file, folder, info, scans.files, scans.stamps_ns, calibration, voice)
+    if own is not None:
+        return own, truth
     if truth is not None and truth_file is not None and not np.isin(truth.stamps_ns, nominal).all():
         numbered = pair_by_number(truth, files)
         if numbered is not None or len(truth) == len(files):
@@ -192,7 +171,7 @@ def _stamps_and_truth(
     voice.notes.append(
         f"no stamps of the scans (looked for {', '.join(STAMP_NAMES[:3])} and stamps in file names): stamped at {rate:g} Hz"
     )
-    return StampedScans(files, nominal, rate, nominal), truth
+    return scans, truth
 
 
 def _with_scans(stream: Stream | None, scans: StampedScans, what: str, voice: Voice) -> Stream | None:
@@ -215,16 +194,9 @@ def _own_stamps(
 
 
 def _truth(
-    path: Path | None,
-    folder: Path,
-    info: SequenceInfo,
-    files: list[Path],
-    stamps: NDArray[np.int64],
-    calibration: Calibration,
-    voice: Voice,
-) -> Trajectory | None:
-    if path is None:
-        return None
+    path: Path, folder: Path, info: SequenceInfo, files: list[Path], stamps: NDArray[np.int64],
+    calibration: Calibration, voice: Voice,
+) -> Trajectory | None:  # fmt: skip
     truth = load_poses(path, stamps, files, voice)
     if truth is None:
         return None
@@ -247,13 +219,9 @@ def _mcd_extrinsics(folder: Path, voice: Voice) -> Matrix | None:
 
 
 def clock_of_files(
-    files: list[Path],
-    record: PointRecord | None,
-    stamps: NDArray[np.int64],
-    rate: float,
-    info: SequenceInfo,
+    files: list[Path], record: PointRecord | None, stamps: NDArray[np.int64], rate: float, info: SequenceInfo,
     voice: Voice,
-) -> PointClock | None:
+) -> PointClock | None:  # fmt: skip
     """How per-point times of the files are read, learnt on a few scans."""
     if record == KITTI:
         return None
