@@ -241,8 +241,8 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
         bag, index.topic, index.messages, index.stamps_ns, sequence.rate_hz, lambda k: sequence.cloud(k)[0]
     )
     if by_points is not None:
-        sequence.headers_ns = sequence.stamps_ns = by_points.stamps_ns
-        voice.notes.extend(by_points.notes)
+        sequence.headers_ns = sequence.stamps_ns = by_points[0]
+        voice.notes.append(by_points[1])
     _open_clock(sequence, info)
     return sequence
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from lslam.formats.bag_files import Bag, BagTopic, read_header
 from lslam.formats.point_cloud import PointCloud
 from lslam.readers.bag_topics import HEADER
-from lslam.readers.clocks import OneClock
 from lslam.readers.point_clock import PointClock
 from lslam.readers.point_stamps import point_stamps
 from lslam.readers.point_times import Sample
@@ -26,8 +25,8 @@ def stamps_by_points(
     recorded: Stamps,
     rate_hz: float,
     cloud: Callable[[int], PointCloud],
-) -> OneClock | None:
-    """Stamps (N,) by the absolute times of the points, better than the times of recording where the headers stand still.
+) -> tuple[Stamps, str] | None:
+    """Stamps (N,) by the absolute times of the points, better than the times of recording where the headers stand still; a note.
 
     cloud : the points of a scan by its place among the messages (N,); None where headers go on or points have no such times
     """
@@ -42,7 +41,7 @@ def stamps_by_points(
     is_other = abs(ahead) > _OTHER_EPOCH_NS
     how = f", {-ahead * 1e-9:+.3f} s to the clock of the recording" if is_other else ""
     note = f"scan stamps from the absolute times of the points, field {points.field!r}{how}"
-    return OneClock(points.stamps_ns - (ahead if is_other else 0), notes=(note,))
+    return points.stamps_ns - (ahead if is_other else 0), note
 
 
 def step_against(clock: PointClock, samples: Iterable[Sample]) -> float:
@@ -67,7 +66,7 @@ def points_off(
         return 0
     period = 1e9 / clock.rate_hz
     late = begin_ns - int(stamps[index])
-    at_end = late + float(times.max()) * 1e9 - clock.rule.sweep * clock.rule.ns_per_unit
+    at_end = late + float(times.max()) * 1e9 - clock.rule.sweep_s * 1e9
     steps = np.diff(headers[max(index - 1, 0) : index + 2])
     is_uneven = bool(np.any(np.abs(steps - period) > 0.5 * period))
     return 0 if min(abs(late), abs(at_end)) <= 0.5 * period or is_uneven else late

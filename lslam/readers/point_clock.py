@@ -80,8 +80,11 @@ class PointClock:
     def first_whole(self, samples: dict[int, Sample]) -> int:
         """Number of the first sample with a sound sweep of the usual length, or else of the first."""
         timed = ((index, self.read(s.cloud, s.stamp_ns)) for index, s in samples.items())
-        sweep_s = self.rule.sweep * self.rule.ns_per_unit * 1e-9
-        whole = (index for index, t in timed if t.times is not None and not t.fault and 2 * np.ptp(t.times) >= sweep_s)
+        whole = (
+            index
+            for index, t in timed
+            if t.times is not None and not t.fault and 2 * np.ptp(t.times) >= self.rule.sweep_s
+        )
         return next(whole, next(iter(samples)))
 
     def _mended(self, cloud: PointCloud, values: NDArray[Any], stamp_ns: int) -> TimedCloud:
@@ -97,17 +100,19 @@ class PointClock:
         times, shift = apply_rule(rule, np.where(good, values, values[good].min()), stamp_ns)
         wrong = is_measured(cloud.points) & ~good
         count = np.count_nonzero(wrong)
-        faults = [
-            f"the times of {over} points ran over the bits of field {rule.field!r} and are read beyond them"
-            if over
-            else "",
-            "the clock of the points was set within the sweep and is read on as before" if step is not None else "",
-            f"{count} of {len(cloud)} points have times outside the sweep and are left out" if count else "",
-        ]
+        faults = []
+        if over:
+            faults.append(
+                f"the times of {over} points ran over the bits of field {rule.field!r} and are read beyond them"
+            )
+        if step is not None:
+            faults.append("the clock of the points was set within the sweep and is read on as before")
+        if count:
+            faults.append(f"{count} of {len(cloud)} points have times outside the sweep and are left out")
         unmeasured = len(cloud) - int(np.count_nonzero(good | wrong))
         if count:
             cloud, times = cloud.select(~wrong), times[~wrong]
-        return TimedCloud(cloud, times, shift, "; ".join(filter(None, faults)), unmeasured)
+        return TimedCloud(cloud, times, shift, "; ".join(faults), unmeasured)
 
     def _is_sound(self, values: NDArray[Any], count: int) -> bool:
         """Whether all times of a scan of `count` points can belong to one sweep; not where one of them is NaN."""

@@ -40,11 +40,10 @@ def point_stamps(count: int, read: Callable[[int], PointCloud], rate_hz: float |
             begin = clock.begin_ns(read(index))
             if begin is not None:
                 begins[index] = begin
-    sweep_ns = clock.rule.sweep * clock.rule.ns_per_unit
     at, stamps = np.array(list(begins), np.int64), np.array(list(begins.values()), np.int64)
-    if not len(at) or 2 * len(at) < count or (np.diff(stamps) < 0.5 * sweep_ns).any():
+    if not len(at) or 2 * len(at) < count or (np.diff(stamps) < 0.5e9 * clock.rule.sweep_s).any():
         return None
-    return PointStamps(_filled(count, at, stamps), sweep_ns * 1e-9, clock.rule.field)
+    return PointStamps(_filled(count, at, stamps), clock.rule.sweep_s, clock.rule.field)
 
 
 def _clock(count: int, read: Callable[[int], PointCloud], rate_hz: float | None) -> PointClock | None:

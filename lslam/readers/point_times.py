@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,11 @@ class TimeRule:
     reach: float = np.inf
     points: float = 0.0
 
+    @property
+    def sweep_s(self) -> float:
+        """Usual length of a sweep, s."""
+        return self.sweep * self.ns_per_unit * 1e-9
+
 
 class Sample(NamedTuple):
     """A scan by which a rule is learnt: its points, or every `step`-th of them, and the stamp of its header, ns."""
@@ -53,9 +59,7 @@ class Sample(NamedTuple):
     def thinned(self, most: int) -> Sample:
         """The same with `most` points, or a few more where it has fewer than twice as many."""
         step = max(len(self.cloud) // most, 1)
-        return (
-            self if step == 1 else Sample(self.cloud.select(np.arange(0, len(self.cloud), step)), self.stamp_ns, step)
-        )
+        return Sample(self.cloud.select(np.arange(0, len(self.cloud), step)), self.stamp_ns, step)
 
 
 class _TimeReading(NamedTuple):
@@ -114,31 +118,27 @@ def _agree(
     """The rule that most of the scans obey."""
     usual = Counter(r.unit for r in readings).most_common(1)[0][0]
     readings = [r for r in readings if r.unit == usual]
-    lows = np.array([r.low for r in readings])
     # A clock that started with the recording looks like an offset in the first scans.
-    is_absolute = 2 * sum(r.is_absolute for r in readings) > len(readings) or (
-        readings[-1].is_absolute and bool((np.diff(lows) > 0).all())
-    )
+    is_rising = readings[-1].is_absolute and all(b.low > a.low for a, b in pairwise(readings))
+    is_absolute = is_rising or 2 * sum(r.is_absolute for r in readings) > len(readings)
     instant = Counter(r.instant for r in readings if r.is_absolute == is_absolute).most_common(1)[0][0]
-    is_before_stamp = not is_absolute and instant == "scan_end"
     if reference is not None:
-        is_absolute, is_before_stamp = reference == "absolute", reference == "end"
-    words = (
-        "absolute" if is_absolute else "relative to the scan's end" if is_before_stamp else
-        "relative to the scan's middle" if instant == "scan_middle" and reference is None else "since scan start"
-    )  # fmt: skip
+        is_absolute = reference == "absolute"
+        instant = "scan_end" if reference == "end" else "scan_start"
+    words = "since scan start" if instant == "scan_start" else f"relative to the scan's {instant.removeprefix('scan_')}"
+    words = "absolute" if is_absolute else words
     how = ", as stated" if unit or reference else ""
     ns = _UNITS_NS[usual]
     farthest = max(max(abs(r.low), abs(r.high)) for r in readings)
     return TimeRule(
         ns,
         is_absolute,
-        is_before_stamp,
-        f"per-point times from field {name!r} ({readings[0].dtype}), {usual}, {words}{how}",
-        name,
-        float(np.median([r.high - r.low for r in readings])),
-        np.inf if is_absolute else max(_LONGEST * 1e9 / rate_hz / ns, 1.5 * farthest),
-        float(np.median([sample.step * len(sample.cloud) for sample in having])),
+        is_before_stamp=not is_absolute and instant == "scan_end",
+        sentence=f"per-point times from field {name!r} ({readings[0].dtype}), {usual}, {words}{how}",
+        field=name,
+        sweep=float(np.median([r.high - r.low for r in readings])),
+        reach=np.inf if is_absolute else max(_LONGEST * 1e9 / rate_hz / ns, 1.5 * farthest),
+        points=float(np.median([sample.step * len(sample.cloud) for sample in having])),
     )
 
 
@@ -181,15 +181,11 @@ def is_usable(cloud: PointCloud, values: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _limits(values: NDArray[Any], width: float) -> tuple[float, float]:
-    """Smallest and largest value, or those of the densest part not wider than `width` when it holds more than half; else 0, 0."""
-    if not len(values):
+    """Smallest and largest value of the densest part not wider than `width` when it holds more than half; else 0, 0."""
+    dense = values[densest(values, np.ones(len(values), np.bool_), width)]
+    if 2 * len(dense) <= len(values):
         return 0.0, 0.0
-    low, high = values.min(), values.max()
-    if not float(high) - float(low) <= width:
-        dense = densest(values, np.ones(len(values), np.bool_), width)
-        if 2 * np.count_nonzero(dense) <= len(values):
-            return 0.0, 0.0
-        low, high = values[dense].min(), values[dense].max()
+    low, high = dense.min(), dense.max()
     return float(low), float(low) + float(high - low)
 
 
@@ -214,25 +210,22 @@ def _is_swept(points: NDArray[np.float32], values: NDArray[Any], low: float, hig
 
 
 def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:
-    """Times (N,) float32 s, and what to add to the stamp (ns) so that they count from it.
+    """Times (N,) float32 s of finite values (N > 0,), and what to add to the stamp (ns) so that they count from it.
 
     It becomes the scan's start, unless the offsets lie about it: then it stays in the middle.
     """
-    if not len(values):
-        return np.zeros(0, np.float32), 0
+    scale_s = rule.ns_per_unit * 1e-9
     if not rule.is_absolute and not rule.is_before_stamp:
-        return (values * (rule.ns_per_unit * 1e-9)).astype(np.float32), 0
-    first = values[np.isfinite(values)].min() if values.dtype.kind == "f" else values.min()
+        return (values * scale_s).astype(np.float32), 0
+    first = values.min()
     # The difference is taken in the field's own type first: absolute ns do not fit a float.
-    times = ((values - first).astype(np.float64) * (rule.ns_per_unit * 1e-9)).astype(np.float32)
+    times = ((values - first).astype(np.float64) * scale_s).astype(np.float32)
     if rule.is_before_stamp:
         # Offsets that count up to a stamp at the end, where that is stated, begin at 0.
-        offset = float(first) if first < 0 else -float(values[np.isfinite(values)].max() - first)
+        offset = float(first) if first < 0 else -float(values.max() - first)
         return times, round(offset * rule.ns_per_unit)
-    start_ns = (
-        int(first) if values.dtype.kind in "iu" and rule.ns_per_unit == 1 else round(float(first) * rule.ns_per_unit)
-    )
-    return times, start_ns - stamp_ns
+    is_exact = values.dtype.kind in "iu" and rule.ns_per_unit == 1
+    return times, (int(first) if is_exact else round(float(first) * rule.ns_per_unit)) - stamp_ns
 
 
 def azimuth_times(points: NDArray[np.float32], sweep: Span) -> NDArray[np.float32]:
