@@ -107,7 +107,8 @@ def _by_name(table: TextTable, taken: Collection[int]) -> list[tuple[int, ...]]:
         if rank is not None:
             rest = _fraction_of(table, words, k, free)
             ranked.append((rank, rest is None, (k,) if rest is None else (k, rest)))
-    return [columns for _, _, columns in sorted(ranked)]
+    fractions = {columns[1] for _, _, columns in ranked if len(columns) == 2}
+    return [columns for _, _, columns in sorted(ranked) if columns[0] not in fractions]
 
 
 def _rank(words: list[str]) -> int | None:

@@ -92,6 +92,13 @@ def test_a_row_without_its_fraction_is_named(tmp_path: Path) -> None:
         read_stamps(tmp_path / "stamps.csv")
 
 
+def test_fractions_alone_are_no_time(tmp_path: Path) -> None:
+    """They increase within a second; a cell of the seconds that is no number leaves the other clock."""
+    rows = [f"{7 + k * 0.1:.1f},{'x' if k == 4 else 7},{k * 100_000_000}" for k in range(9)]
+    (tmp_path / "stamps.csv").write_text("\n".join(["%time,header.stamp.sec,header.stamp.nanosec", *rows]))
+    assert read_stamps(tmp_path / "stamps.csv").tolist() == [7 * 10**9 + k * 100_000_000 for k in range(9)]
+
+
 def test_a_cell_that_is_no_time_is_named(tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text(f"sec,nsec,{IMU}\n1,0,0,0,9.8,0,0,0\n1,later,0,0,9.8,0,0,0\n")
     with pytest.raises(InputError, match=r"imu\.csv, line 3: .*'later'|imu\.csv, line 3: '1,later"):
