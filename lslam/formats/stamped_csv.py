@@ -39,7 +39,10 @@ def read_stamped_csv(
     """
     table = text_table(path, *read_rows(path))
     spellings = [_spellings(name) for name in table.names]
-    where = [_find(spellings, names) for names in (*columns, *optional)]
+    where = [
+        next((k for name in names for k, spelt in enumerate(spellings) if name in spelt), None)
+        for names in (*columns, *optional)
+    ]
     header = ", ".join(table.names)
     table.check_widths(len(table.names), "the header")
     clock = find_clock(table, [k for k in where if k is not None])
@@ -73,10 +76,6 @@ def _spellings(name: str) -> list[str]:
     """
     words = [word for word in re.split(r"[./]", re.sub(r"[\[(].*?[\])]", "", name).strip(" #%\"'").lower()) if word]
     return ["_".join(words[k:]).strip() for k in reversed(range(len(words)))]
-
-
-def _find(spellings: list[list[str]], names: Sequence[str]) -> int | None:
-    return next((k for name in names for k, spelt in enumerate(spellings) if name in spelt), None)
 
 
 def read_imu_csv(path: Path) -> ImuStream:

@@ -22,19 +22,14 @@ Floats = NDArray[np.float64]
 BENT = 0.01
 
 
-def is_table(first: str) -> bool:
+def fits_csv(first: str) -> bool:
     """Whether the first line is of a table and not of numbers between blanks."""
     return any(separator in first for separator in ",;") or looks_like_header(first)
 
 
 def fits_euroc(first: str) -> bool:
     """A bare table that starts with integer nanoseconds."""
-    return is_table(first) and re.fullmatch(r"\d{15,}", re.split(r"[,;]", first)[0].strip()) is not None
-
-
-def fits_csv(first: str) -> bool:
-    """Any other table."""
-    return is_table(first)
+    return fits_csv(first) and re.fullmatch(r"\d{15,}", re.split(r"[,;]", first)[0].strip()) is not None
 
 
 def read_euroc(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
@@ -130,11 +125,8 @@ def poses_of(values: Floats, rows: list[Row], path: Path) -> tuple[Floats, bool,
         raise InputError(
             f"{path}, line {rows[i].number}: quaternion of length {length[i]:.3g}, a rotation has length 1"
         )
-    if len(q) > 2 and (q == q[0]).all() and np.count_nonzero(q[0]) == 1 and _bends(p):
-        return alone, False, ["the quaternion is the same everywhere on a path that bends: positions alone"]
+    if len(q) > 2 and (q == q[0]).all() and np.count_nonzero(q[0]) == 1:
+        spread_m = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
+        if spread_m[1] > BENT * max(spread_m[0], np.sqrt(len(p))):
+            return alone, False, ["the quaternion is the same everywhere on a path that bends: positions alone"]
     return se3.make(so3.from_quaternion(q), p), True, []
-
-
-def _bends(positions: Floats) -> bool:
-    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    return bool(spread[1] > BENT * spread[0] and spread[1] > BENT * np.sqrt(len(positions)))

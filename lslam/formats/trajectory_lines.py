@@ -28,7 +28,7 @@ WIDTHS = (12, 13, 16, 17)
 
 def fits_kitti(first: str) -> bool:
     """The upper 3x4 of a pose or the whole 4x4, with an index or a time before it or not: 12, 13, 16 or 17 numbers."""
-    return not trajectory_csv.is_table(first) and len(first.split()) in WIDTHS
+    return not trajectory_csv.fits_csv(first) and len(first.split()) in WIDTHS
 
 
 def read_kitti(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
@@ -104,7 +104,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 
 def fits_tum(first: str) -> bool:
     """Other numbers between blanks: eight, or a time and a position, with an index or a second column of time or not."""
-    return not trajectory_csv.is_table(first) and not fits_kitti(first)
+    return not trajectory_csv.fits_csv(first) and not fits_kitti(first)
 
 
 def read_tum(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:

@@ -79,8 +79,7 @@ def _sequences(root: Path, text: str) -> list[Path]:
     number = sequence_number(text)
     if not number:
         return []
-    folders = [root / part / "sequences" / number for part in _ROOTS]
-    folders += [root / part / name for part in _ROOTS for name in (f"seq{number}", number)]
+    folders = [root / part / name for name in (f"sequences/{number}", f"seq{number}", number) for part in _ROOTS]
     return [p for p in folders if p.is_dir()][:1]
 
 

@@ -113,11 +113,13 @@ def _samples(
     Raises InputError that names `what` is missing, the `file` that would have it, and the `flags` that ask for it.
     """
     date, number, first = DRIVES[sequence_number(sequence.path.name)]
+    roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
+    places = dict.fromkeys([*roots, *list(sequence.path.parents)[: 1 + _UPWARDS], Path.cwd()])
     folders = [
         place / above / day / f"{date}_drive_{number:04d}_{kind}"
         for kind in ("extract", "sync")
         for above, day in (("raw", date), ("", date), ("raw", ""), ("", ""), ("kitti_raw", date))
-        for place in _places(sequence.path, data_root)
+        for place in places
     ]
     drive = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
     if drive is None:
@@ -152,10 +154,3 @@ def _begin(drive: Path, first: int) -> tuple[int, str]:
     raise InputError(
         f"{drive} does not say when its frame {first} was taken: image_00/timestamps.txt of {sync} is needed"
     )
-
-
-def _places(sequence: Path, data_root: Path | None) -> list[Path]:
-    """Folders that may hold the drive, or its `raw` folder, the most likely first."""
-    roots = [p for p in (data_root, os.environ.get("LSLAM_DATA")) if p]
-    places = [Path(p).expanduser() for p in roots] + list(sequence.parents)[: 1 + _UPWARDS] + [Path.cwd()]
-    return list(dict.fromkeys(places))
