@@ -159,31 +159,23 @@ def _numbered(path: Path) -> tuple[str, int] | None:
 
 
 def _unlisted(path: Path, files: list[Path]) -> list[str]:
-    """What `metadata.yaml` lists and is not there."""
-    listed = _listed(path / METADATA) if path.is_dir() else None
-    if listed is None:
+    """What ROS 2's `metadata.yaml`, of every version, lists and is not there; nothing where it cannot be read."""
+    if not path.is_dir() or not (path / METADATA).is_file():
         return []
-    names = {_unpacked(p.name) for p in files}
-    absent = [name for name in listed if _unpacked(name) not in names]
-    if not absent:
-        return []
-    verb = "is" if len(absent) == 1 else "are"
-    return [f"{path / METADATA} lists {len(listed)} files, of which {shown(absent)} {verb} not there"]
-
-
-def _listed(path: Path) -> list[str] | None:
-    """Names of the parts by ROS 2's `metadata.yaml`, of every version; None where there is none that can be read."""
-    if not path.is_file():
-        return None
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        tree: Any = YAML(typ="safe", pure=True).load(path.read_text(errors="replace"))
-        names = tree["rosbag2_bagfile_information"]["relative_file_paths"]
-        return [str(name).rpartition("/")[2] for name in names]
+        tree: Any = YAML(typ="safe", pure=True).load((path / METADATA).read_text(errors="replace"))
+        listed = [str(name) for name in tree["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (YAMLError, LookupError, TypeError, ValueError, RecursionError, OSError):
-        return None
+        return []
+    names = {_unpacked(p.name) for p in files}
+    absent = [name for name in (one.rpartition("/")[2] for one in listed) if _unpacked(name) not in names]
+    if not absent:
+        return []
+    are = "is" if len(absent) == 1 else "are"
+    return [f"{path / METADATA} lists {len(listed)} files, of which {shown(absent)} {are} not there"]
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -56,7 +56,10 @@ def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, fra
 
     On many stamps not all are looked at: what is no part of a scan after all is left out when the scan is read.
     """
-    groups = _groups(messages, stamps, frames)
+    by_stamp: dict[tuple[int, str], list[int]] = {}
+    for message, stamp, frame in zip(messages.tolist(), stamps.tolist(), frames, strict=True):
+        by_stamp.setdefault((stamp, frame), []).append(message)
+    groups = [tuple(group) for (stamp, _), group in by_stamp.items() if stamp and 1 < len(group) <= _MOST]
     if not groups:
         return {}
     parts: dict[int, tuple[int, ...]] = {}
@@ -102,15 +105,6 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
             if clock.name in of_last
         ),
     )
-
-
-def _groups(messages: Stamps, stamps: Stamps, frames: list[str]) -> list[tuple[int, ...]]:
-    """Messages of one stamp and frame, where they are several and no clock stands still."""
-    by_stamp: dict[tuple[int, str], list[int]] = {}
-    for message, stamp, frame in zip(messages.tolist(), stamps.tolist(), frames, strict=True):
-        if stamp:
-            by_stamp.setdefault((stamp, frame), []).append(message)
-    return [tuple(group) for group in by_stamp.values() if 1 < len(group) <= _MOST]
 
 
 def _put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[PointCloud, int, tuple[int, ...]]:
