@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats import bag_streams
-from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag
+from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
 from lslam.formats.bag_listing import list_bag_files, parts_beside, shown, stem_of
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
@@ -18,13 +18,13 @@ from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import se3
 from lslam.printable import printable
-from lslam.readers.bag_clocks import points_off, stamps_by_points, step_against
 from lslam.readers.bag_halves import Halves, read_whole
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
 from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
 from lslam.readers.bag_topics import (
     GNSS,
+    HEADER,
     IMU,
     check_parts,
     choose_clouds,
@@ -38,6 +38,7 @@ from lslam.readers.listing import measured_rate
 from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_clock import PointClock, open_clock, read_samples
+from lslam.readers.point_stamps import onto_recording, point_stamps, points_off, step_against
 from lslam.readers.point_times import Sample, TimeRule
 from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.sidecars import compensation_note, stated_times
@@ -237,12 +238,16 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
             uses=dict(opened.uses),
         )
     settle_unit(sequence)
-    by_points = stamps_by_points(
-        bag, index.topic, index.messages, index.stamps_ns, sequence.rate_hz, lambda k: sequence.cloud(k)[0]
-    )
-    if by_points is not None:
-        sequence.headers_ns = sequence.stamps_ns = by_points[0]
-        voice.notes.append(by_points[1])
+    ends = {
+        read_header(index.topic, bag.message(index.topic, int(k), HEADER)).stamp_ns for k in index.messages[[0, -1]]
+    }
+    if len(sequence) > 1 and len(ends) == 1:
+        # Better than the times of recording, where the headers stand still.
+        points = point_stamps(len(sequence), lambda k: sequence.cloud(k)[0], sequence.rate_hz)
+        if points is not None:
+            sequence.stamps_ns, note = onto_recording(points, index.stamps_ns)
+            sequence.headers_ns = sequence.stamps_ns
+            voice.notes.append(note)
     _open_clock(sequence, info)
     return sequence
 

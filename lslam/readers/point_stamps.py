@@ -1,8 +1,8 @@
-"""Stamps of scans by the absolute times of their points, where nothing better exists."""
+"""Stamps of scans by the absolute times of their points, where nothing better exists, and these times against the headers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -15,6 +15,8 @@ from lslam.readers.listing import DEFAULT_RATE_HZ
 from lslam.readers.point_clock import PointClock, read_samples
 from lslam.readers.point_times import Sample, learn_rule
 
+Stamps = NDArray[np.int64]
+_OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 _SLOW_HZ = 1.0  # tried where no rate is stated and no sweep is as short as usual
 
 
@@ -65,3 +67,43 @@ def _filled(count: int, at: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDA
     filled: NDArray[np.int64] = stamps[0] + np.rint(since).astype(np.int64)
     filled[at] = stamps
     return filled
+
+
+def onto_recording(points: PointStamps, recorded: Stamps) -> tuple[Stamps, str]:
+    """Stamps (N,) by the points, on the clock of the recording where theirs is of another epoch, and a sentence.
+
+    The scan that was recorded with the least delay tells how far apart the clocks are.
+    """
+    ahead = int((points.stamps_ns - recorded).max())
+    note = f"scan stamps from the absolute times of the points, field {points.field!r}"
+    if abs(ahead) <= _OTHER_EPOCH_NS:
+        return points.stamps_ns, note
+    return points.stamps_ns - ahead, f"{note}, {-ahead * 1e-9:+.3f} s to the clock of the recording"
+
+
+def step_against(clock: PointClock, samples: Iterable[Sample]) -> float:
+    """By how much, s, absolute times of points step against the headers of a few scans; 0 below a period."""
+    if not clock.rule.is_absolute:
+        return 0.0
+    begins = [(clock.begin_ns(sample.cloud), sample.stamp_ns) for sample in samples]
+    ahead = [begin - stamp for begin, stamp in begins if begin is not None]
+    step_s = (max(ahead) - min(ahead)) * 1e-9 if ahead else 0.0
+    return step_s if step_s > 1 / clock.rate_hz else 0.0
+
+
+def points_off(
+    clock: PointClock, headers: Stamps, stamps: Stamps, index: int, begin_ns: int, times: NDArray[np.float32] | None
+) -> int:
+    """By how much the absolute times of a scan's points contradict its header, ns; 0 where they do not, or it is uneven itself.
+
+    headers : (N,) of all scans; stamps : (N,) their begins as they follow from these; begin_ns, times : when the points of the
+    scan were measured. A part of a sweep begins or ends with a whole one.
+    """
+    if not clock.rule.is_absolute or times is None or not len(times):
+        return 0
+    period = 1e9 / clock.rate_hz
+    late = begin_ns - int(stamps[index])
+    at_end = late + float(times.max()) * 1e9 - clock.rule.sweep_s * 1e9
+    steps = np.diff(headers[max(index - 1, 0) : index + 2])
+    is_uneven = bool(np.any(np.abs(steps - period) > 0.5 * period))
+    return 0 if min(abs(late), abs(at_end)) <= 0.5 * period or is_uneven else late
