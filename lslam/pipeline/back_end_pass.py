@@ -32,6 +32,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.loops.find_loops import find_loops, verify_known
 from lslam.osm.hold import hold_by_buildings
 from lslam.osm.source import OsmSource
+from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
@@ -93,8 +94,9 @@ def optimise_poses(
     }
     record.odometry = record.trajectory
     if done.is_optimised:
-        record.results = done.results
-        record.trajectory = to_trajectory(done.results, record.method)
+        causes = "the pose graph" if done.osm is None else "the pose graph and buildings"
+        record.results = mark_lost_finally(done.results, record.checks, manifest, causes)
+        record.trajectory = to_trajectory(record.results, record.method)
     record.loops, record.keyframe_scans = done.candidates, np.array([k.scan for k in store.keyframes], np.int64)
     record.georeference, record.T_final_odometry = done.georeference, done.T_final_odometry
     record.osm, record.buildings = done.osm, done.buildings

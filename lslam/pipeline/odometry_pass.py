@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.motion_models import smoother_noise
 from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
 from lslam.inertial.smoothing import SmootherMotion
-from lslam.integrity.alerts import Alert, alerts
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
@@ -32,6 +30,7 @@ from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import prior
 from lslam.osm.source import OsmSource
+from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import helped
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
@@ -47,7 +46,6 @@ log = logging.getLogger("lslam")
 
 _FAULTS_NAMED = 10  # scans
 # Sentences of one run; the scans beyond are marked all the same.
-MOST_SAID = 6
 # Sections that choose no kernel; of buildings it is enough whether there are any.
 _WITHOUT_KERNELS = {"input", "keyframes", "graph", "gnss", "osm", "eval", "report"}
 _warmed: set[tuple[object, ...]] = set()
@@ -100,7 +98,7 @@ def estimate_poses(
     _report_faults(results, manifest)
     manifest.judge(results, len(sequence), is_diverged(results, limit))
     if monitor is not None:
-        results = mark_lost(results, monitor, manifest)
+        results = mark_lost(results, monitor.checks, manifest)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,
@@ -108,6 +106,7 @@ def estimate_poses(
         results=results,
         trajectory=to_trajectory(results, config.odometry.method),
         ground_truth=truth,
+        checks=[] if monitor is None else monitor.checks,
         real_time_limit=config.input.skip_frames / sequence.rate_hz,
         pose_time=manifest.pose_time,
         turns=_turns(inertial, store, config),
@@ -213,34 +212,6 @@ def _begin_imu(
     if getattr(odometry, "ignores_prior", False):
         inertial.problems.append(f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail")
     return inertial
-
-
-def mark_lost(results: list[ScanResult], monitor: IntegrityMonitor, manifest: Manifest) -> list[ScanResult]:
-    """The results, those that an alert speaks of marked so; the manifest has a problem for each stretch of them."""
-    positions = np.stack([r.T_world_lidar[:3, 3] for r in results])
-    found = alerts(monitor.checks, positions, np.array([r.stamp_ns for r in results]))
-    said = [_sentence(results, alert) for alert in found]
-    if len(said) > MOST_SAID:
-        said = [
-            *said[:MOST_SAID],
-            f"and {len(said) - MOST_SAID} more stretches of scans that may be lost: see scans.csv",
-        ]
-    for sentence in said:
-        log.warning("%s", sentence)
-    manifest.problems += said
-    manifest.integrity = {
-        "checks": len(monitor.checks),
-        "conclusive": sum(check.is_conclusive for check in monitor.checks),
-        "alerts": len(found),
-    }
-    lost = {k for alert in found for k in range(alert.first, alert.last + 1)}
-    return [replace(r, is_lost=True) if k in lost else r for k, r in enumerate(results)]
-
-
-def _sentence(results: list[ScanResult], alert: Alert) -> str:
-    first, last = results[alert.first].index, results[alert.last].index
-    scans = f"scan {first}" if first == last else f"scans {first} to {last}"
-    return f"{scans} may be lost: {alert.why}"
 
 
 def _report_faults(results: list[ScanResult], manifest: Manifest) -> None:

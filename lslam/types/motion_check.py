@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
+from lslam.geometry import portable, so3
 
 # What explains less than this part of what is usual, or less than a share of the points, is rejected, as is what
 # leaves the turn open, rad.
@@ -44,5 +44,10 @@ class MotionCheck:
     @property
     def apart(self) -> NDArray[np.float64]:
         """(6,) by how much the scans say the motion was more than claimed."""
-        turn = so3.log(self.found[:3, :3] @ self.claimed[:3, :3].T)
-        return np.concatenate([self.found[:3, 3] - self.claimed[:3, 3], turn])
+        return motion_apart(self.claimed, self.found)
+
+
+def motion_apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6,) by how much a motion `b` (4, 4) is more than another, `a`: m, then rad, in the axes of where both begin."""
+    turn = so3.log(portable.product(b[:3, :3], a[:3, :3].T))
+    return np.concatenate([b[:3, 3] - a[:3, 3], turn])

@@ -16,6 +16,7 @@ from lslam.types.gnss import Georeference
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialChain
 from lslam.types.map_fix import MapFix
+from lslam.types.motion_check import MotionCheck
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
@@ -130,6 +131,7 @@ class RunRecord:
     map_image : (H, W) float32 density of the merged map seen from above, row 0 at the largest y, or None
     map_heights : (H, W) mean z of what lies in each pixel, m, NaN where nothing does; map_sample : some of its points
     map_extent : (x_min, x_max, y_min, y_max), m; crispness : of the merged map, None without one
+    checks : of the integrity monitor, between scans of `results`
     real_time_limit : seconds one scan may take: skip_frames / rate
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates of trajectory and map begin and whether z is up, in words
@@ -156,6 +158,7 @@ class RunRecord:
     trajectory: Trajectory
     ground_truth: Trajectory | None
     real_time_limit: float
+    checks: list[MotionCheck] = field(default_factory=list)
     manifest: dict[str, Any] = field(default_factory=dict)
     map_file: str = ""
     map_image: NDArray[np.float32] | None = None

@@ -18,8 +18,8 @@ from lslam.config import Config, load_config
 from lslam.errors import GateError, RunFailedError
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.pipeline import job
+from lslam.pipeline.lost_scans import MOST_SAID, mark_lost, mark_lost_finally
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.odometry_pass import MOST_SAID, mark_lost
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
@@ -170,13 +170,37 @@ def test_the_first_alerts_are_listed_and_the_others_counted(more: int) -> None:
     count = 30 * stretches + 1
     results = [ScanResult(100 + k, 100_000_000 * k, np.eye(4)) for k in range(count)]
     manifest = Manifest("run", drive("street"), cfg)
-    marked = mark_lost(results, monitor, manifest)
+    marked = mark_lost(results, monitor.checks, manifest)
     assert [k for k in range(count) if marked[k].is_lost] == [k for k in range(1, count) if (k - 1) % 30 >= 25]
     assert manifest.integrity == {"checks": 6 * stretches, "conclusive": 6 * stretches, "alerts": stretches}
     told = [problem.split(" may be")[0] for problem in manifest.problems[:MOST_SAID]]
     assert told == [f"scans {126 + 30 * k} to {130 + 30 * k}" for k in range(MOST_SAID)]
     said = [f"and {more} more stretches of scans that may be lost: see scans.csv"] if more else []
     assert manifest.problems[MOST_SAID:] == said
+
+
+@pytest.mark.parametrize("ahead_m", [0.0, 0.02, 1.2])
+def test_final_poses_are_held_against_the_same_checks(ahead_m: float) -> None:
+    """Odometry agrees with every check; what the graph is given afterwards pulls scans 50 and later ahead."""
+    motion = np.eye(4)
+    motion[0, 3] = 2.5
+    checks = [MotionCheck(5 * k, 5 * k + 5, 0.5, motion, motion, np.full(6, 1e-3), 0.9, 0.9, 0.9) for k in range(20)]
+    odometry, final = [], []
+    for k in range(101):
+        T = np.eye(4)
+        T[0, 3] = 0.5 * k
+        odometry.append(ScanResult(200 + k, 100_000_000 * k, T))
+        T = T.copy()
+        T[0, 3] += ahead_m * np.clip((k - 45) / 5, 0, 1)
+        final.append(ScanResult(200 + k, 100_000_000 * k, T))
+    manifest = Manifest("run", drive("street"), config())
+    assert not any(r.is_lost for r in mark_lost(odometry, checks, manifest))
+    marked = mark_lost_finally(final, checks, manifest, "the pose graph")
+    is_wrong = ahead_m > 1
+    assert [k for k in range(101) if marked[k].is_lost] == (list(range(46, 51)) if is_wrong else [])
+    assert manifest.integrity == {"checks": 20, "conclusive": 20, "alerts": 0, "final_alerts": int(is_wrong)}
+    assert manifest.problems == ["after the pose graph, scans 246 to 250 may be lost: beside the scan 0.5 s before, it moved by "
+                                 "-1.20 m ahead more than its pose says"] * is_wrong  # fmt: skip
 
 
 @pytest.mark.parametrize("method", ["icp", "kiss-icp", "loam"])

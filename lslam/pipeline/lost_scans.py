@@ -1,0 +1,72 @@
+"""Marks the scans that the integrity monitor holds to be lost: by the poses of odometry, and again by the final ones."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from lslam.geometry import se3
+from lslam.integrity.alerts import LARGE, Alert, alerts
+from lslam.pipeline.manifest import Manifest
+from lslam.types.motion_check import MotionCheck, motion_apart
+from lslam.types.scan_result import ScanResult
+
+log = logging.getLogger("lslam")
+
+MOST_SAID = 6
+
+
+def mark_lost(results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest) -> list[ScanResult]:
+    """The results, those that an alert speaks of marked so; the manifest has a problem for each stretch of them."""
+    raised = _alerts(results, checks)
+    manifest.integrity = {
+        "checks": len(checks),
+        "conclusive": sum(check.is_conclusive for check in checks),
+        "alerts": len(raised),
+    }
+    return _marked(results, raised, manifest, "")
+
+
+def mark_lost_finally(
+    results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest, cause: str
+) -> list[ScanResult]:
+    """The results after `cause`, those marked that the checks of odometry contradict only now.
+
+    What the monitor measured between two scans stays; the motion that it is held against is that of the final poses.
+    """
+    raised = _alerts(results, [_of_final_poses(check, results) for check in checks])
+    new = [alert for alert in raised if not all(results[k].is_lost for k in range(alert.first, alert.last + 1))]
+    manifest.integrity["final_alerts"] = len(new)
+    return _marked(results, new, manifest, f"after {cause}, ")
+
+
+def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionCheck:
+    motion = se3.relative(results[check.first].T_world_lidar, results[check.last].T_world_lidar)
+    # How many points lie on surfaces at a pose that was moved far was not counted: as good as none.
+    is_moved = bool(np.any(np.abs(motion_apart(check.claimed, motion)) > LARGE))
+    return replace(check, claimed=motion, claimed_agreement=0.0 if is_moved else check.claimed_agreement)
+
+
+def _alerts(results: list[ScanResult], checks: list[MotionCheck]) -> list[Alert]:
+    positions = np.stack([r.T_world_lidar[:3, 3] for r in results])
+    return alerts(checks, positions, np.array([r.stamp_ns for r in results]))
+
+
+def _marked(results: list[ScanResult], raised: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:
+    sentences = [after + _sentence(results, alert) for alert in raised]
+    if len(sentences) > MOST_SAID:
+        more = len(sentences) - MOST_SAID
+        sentences = [*sentences[:MOST_SAID], f"and {more} more stretches of scans that may be lost: see scans.csv"]
+    for sentence in sentences:
+        log.warning("%s", sentence)
+    manifest.problems += sentences
+    lost = {k for alert in raised for k in range(alert.first, alert.last + 1)}
+    return [replace(r, is_lost=True) if k in lost else r for k, r in enumerate(results)]
+
+
+def _sentence(results: list[ScanResult], alert: Alert) -> str:
+    first, last = results[alert.first].index, results[alert.last].index
+    scans = f"scan {first}" if first == last else f"scans {first} to {last}"
+    return f"{scans} may be lost: {alert.why}"
