@@ -17,6 +17,8 @@ from lslam.formats.pose_rows import date_to_ns, seconds_to_ns
 from lslam.formats.text_tables import TextTable
 
 Floats = NDArray[np.float64]
+# The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
+Units = dict[int, int | None]
 UNITS_NS = {
     "ns": 1, "nsec": 1, "nsecs": 1, "nanosec": 1, "nanosecs": 1, "nanosecond": 1, "nanoseconds": 1, "nanos": 1,
     "us": 1_000, "usec": 1_000, "usecs": 1_000, "microsec": 1_000, "microsecs": 1_000, "microseconds": 1_000,
@@ -54,17 +56,17 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     Raises InputError with the line of a cell that is no time.
     """
     candidates = _by_name(table, taken) if table.names else _by_place(table, taken)
-    good = [c for c in candidates if _increases(_seconds(table, c))]
+    good = [c for c in candidates if _increases(np.sum([table.numbers(k) * (c[k] or 1) for k in c], axis=0))]
     # An index increases as well: it is the time only where nothing else is.
-    good.sort(key=lambda c: len(c) == 1 and is_index(table.numbers(c[0])))
+    good.sort(key=lambda c: len(c) == 1 and is_index(table.numbers(*c)))
     chosen = next(iter(good or candidates), None)
     if chosen is None:
         return None
-    others = {c for candidate in candidates for c in candidate} - set(chosen)
+    others = {k for candidate in candidates for k in candidate if k not in chosen}
     note = ""
     if table.names and others:
-        note = f"the time is {' and '.join(table.names[c] for c in chosen)}; "
-        note += f"left out: {', '.join(table.names[c] for c in sorted(others))}"
+        note = f"the time is {' and '.join(table.names[k] for k in chosen)}; "
+        note += f"left out: {', '.join(table.names[k] for k in sorted(others))}"
     return RowTimes(_stamps(table, chosen, default_ns), note)
 
 
@@ -96,19 +98,19 @@ def unit_ns_of(name: str) -> int | None:
     return UNITS_NS.get(words[-1]) if words else None
 
 
-def _by_name(table: TextTable, taken: Collection[int]) -> list[tuple[int, ...]]:
+def _by_name(table: TextTable, taken: Collection[int]) -> list[Units]:
     words = [tokens_of(name) for name in table.names]
     width = len(table.cells[0]) if table.cells else len(words)
     free = [k for k in range(min(len(words), width)) if k not in taken]
-    ranked: list[tuple[int, bool, tuple[int, ...]]] = []
+    ranked: list[tuple[int, bool, int, Units]] = []
     for k in free:
         # pandas writes its index without a name.
         rank = _rank(words[k]) if words[k] else (_ENDING if k == 0 else None)
         if rank is not None:
-            rest = _fraction_of(table, words, k, free)
-            ranked.append((rank, rest is None, (k,) if rest is None else (k, rest)))
-    fractions = {columns[1] for _, _, columns in ranked if len(columns) == 2}
-    return [columns for _, _, columns in sorted(ranked) if columns[0] not in fractions]
+            units = _with_fraction(table, words, k, free)
+            ranked.append((rank, len(units) == 1, k, units))
+    fractions = {j for _, _, k, units in ranked for j in units if j != k}
+    return [units for _, _, k, units in sorted(ranked, key=lambda row: row[:3]) if k not in fractions]
 
 
 def _rank(words: list[str]) -> int | None:
@@ -123,41 +125,37 @@ def _rank(words: list[str]) -> int | None:
     return _ENDING if core[-1] == "t" or core[-1].endswith(("time", "timestamp")) else None
 
 
-def _fraction_of(table: TextTable, words: list[list[str]], k: int, free: list[int]) -> int | None:
-    """The column of the fractions of the seconds in column `k`: of the same name but the unit, else the next column."""
-    if unit_ns_of(table.names[k]) not in (None, SECOND_NS):
-        return None
+def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[int]) -> Units:
+    """Column `k` and, if it has seconds, that of their fractions: of the same name but the unit, else the next column."""
+    stated_ns = unit_ns_of(table.names[k])
+    if stated_ns not in (None, SECOND_NS):
+        return {k: stated_ns}
     stem = words[k][:-1] if words[k] and words[k][-1] in UNITS_NS else words[k]
-    units_ns: dict[int, int | None] = {
+    parts: Units = {
         j: UNITS_NS[words[j][-1]]
         for j in free
         if words[j] and UNITS_NS.get(words[j][-1], SECOND_NS) < SECOND_NS and words[j][:-1] == stem
     }
     if k + 1 in free and words[k + 1] and _rank(words[k + 1]) is None:
-        units_ns[k + 1] = None
+        parts[k + 1] = None
     whole = table.numbers(k)
-    return next((j for j, unit_ns in units_ns.items() if is_fraction(whole, table.numbers(j), unit_ns)), None)
+    for j, unit_ns in parts.items():
+        if is_fraction(whole, table.numbers(j), unit_ns):
+            return {k: SECOND_NS, j: unit_ns or 1}
+    return {k: stated_ns}
 
 
-def _by_place(table: TextTable, taken: Collection[int]) -> list[tuple[int, ...]]:
+def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
     """First columns without names: a time, seconds and nanoseconds, and either behind an index."""
     width = min([3, *taken, *(len(cells) for cells in table.cells)]) if table.cells else 0
     numbers = [table.numbers(k) for k in range(width)]
-    out: list[tuple[int, ...]] = []
+    out: list[Units] = []
     for k in range(width):
         if k and not is_index(numbers[k - 1]):
             break
         is_pair = k + 1 < width and is_fraction(numbers[k], numbers[k + 1])
-        out.append((k, k + 1) if is_pair else (k,))
+        out.append({k: SECOND_NS, k + 1: 1} if is_pair else {k: None})
     return out
-
-
-def _seconds(table: TextTable, columns: tuple[int, ...]) -> Floats:
-    """(N,) of one column as it is, or of two in seconds, for comparing rows."""
-    whole = table.numbers(columns[0])
-    if len(columns) == 1:
-        return whole
-    return whole + table.numbers(columns[1]) * _units_ns(table, columns, None)[1] * 1e-9
 
 
 def _increases(values: Floats) -> bool:
@@ -167,18 +165,10 @@ def _increases(values: Floats) -> bool:
     return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > 0.9
 
 
-def _units_ns(table: TextTable, columns: tuple[int, ...], default_ns: int | None) -> list[int]:
-    """Nanoseconds in the unit of each of the columns."""
-    stated_ns = [unit_ns_of(table.names[c]) if table.names else None for c in columns]
-    if len(columns) == 2:
-        return [SECOND_NS, stated_ns[1] or 1]
-    return [stated_ns[0] or default_ns or unit_by_size(table.numbers(columns[0]))]
-
-
-def _stamps(table: TextTable, columns: tuple[int, ...], default_ns: int | None) -> NDArray[np.int64]:
+def _stamps(table: TextTable, units: Units, default_ns: int | None) -> NDArray[np.int64]:
     out = np.zeros(len(table.rows), np.int64)
-    for column, unit_ns in zip(columns, _units_ns(table, columns, default_ns), strict=True):
-        must_be_whole = bool(table.names) and unit_ns_of(table.names[column]) == 1
+    for column, stated_ns in units.items():
+        unit_ns = stated_ns or default_ns or unit_by_size(table.numbers(column))
         for i, (row, cells) in enumerate(zip(table.rows, table.cells, strict=True)):
             text = cells[column] if column < len(cells) else ""
             try:
@@ -186,7 +176,7 @@ def _stamps(table: TextTable, columns: tuple[int, ...], default_ns: int | None) 
             except ValueError as error:
                 raise InputError(f"{table.path}, line {row.number}: {text!r} is no time: {error}") from None
             out[i] += seconds_to_ns(text, table.path, row.number, unit_ns) if date_ns is None else date_ns
-            if must_be_whole and date_ns is None and re.fullmatch(r"[-+]?\d*\.\d*[1-9]\d*", text):
+            if stated_ns == 1 and date_ns is None and re.fullmatch(r"[-+]?\d*\.\d*[1-9]\d*", text):
                 raise InputError(f"{table.path}, line {row.number}: {text!r} is no whole number of nanoseconds")
     return out
 
