@@ -191,16 +191,11 @@ _COLUMNS = {".pcd": pcd_columns, ".ply": ply_columns, ".txt": _text_columns}
 
 
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
-    """Write a cloud, m, atomically and without holding it in memory.
+    """Write a cloud, m, atomically and without holding it in memory: .ply and .pcd hold float32, .las and .laz millimetres.
 
-    Parameters
-    ----------
-    path : its suffix chooses: .ply and .pcd hold float32, .las and .laz millimetres about an offset
     comment : goes into PLY headers; wkt : coordinate reference system of the points, for LAS and LAZ
 
-    Raises
-    ------
-    UsageError : another suffix. OutputError : the file cannot be written
+    Raises UsageError on another suffix, OutputError when the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix in (".las", ".laz"):

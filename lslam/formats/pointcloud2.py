@@ -84,24 +84,19 @@ def _livox_body(start: int, is_ros1: bool) -> int:
 
 def _dtype(message: Any, where: Path) -> np.dtype[Any]:
     order = ">" if message.is_bigendian else "<"
-    known = [f for f in message.fields if f.datatype in _TYPES]
     step = int(message.point_step)
-    formats = {}
-    for f in known:
+    fields: dict[str, tuple[Any, int]] = {}
+    for f in message.fields:
+        if f.datatype not in _TYPES:
+            continue
         kind = np.dtype(order + _TYPES[f.datatype])
         if f.offset + kind.itemsize > step:
             raise InputError(f"{where}: field {f.name!r} of the cloud lies beyond its {step} bytes per point")
         # A count that reaches beyond the point is not believed.
         is_repeated = f.count > 1 and f.offset + f.count * kind.itemsize <= step
-        formats[f.name] = (np.dtype((kind, (f.count,))) if is_repeated else kind, int(f.offset))
-    return np.dtype(
-        {
-            "names": list(formats),
-            "formats": [kind for kind, _ in formats.values()],
-            "offsets": [offset for _, offset in formats.values()],
-            "itemsize": step,
-        }
-    )
+        fields[f.name] = ((kind, (f.count,)) if is_repeated else kind, int(f.offset))
+    kinds, offsets = zip(*fields.values(), strict=True) if fields else ((), ())
+    return np.dtype({"names": list(fields), "formats": list(kinds), "offsets": list(offsets), "itemsize": step})
 
 
 def _native(values: NDArray[Any]) -> NDArray[Any]:

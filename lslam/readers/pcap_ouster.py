@@ -84,14 +84,8 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
     voice.notes.append(f"{len(which)} packets of an {sensor.name} with {sensor.beams} beams, metadata from {metadata}")
     revolutions = OusterRevolutions(datagrams, sensor, which, first, count, times[first] + shift, shift)
     imu = _imu(datagrams, shift, voice)
-    return Opened(
-        revolutions,
-        sensor.rate_hz,
-        sensor.beams,
-        sensor.name,
-        imu,
-        None if imu is None else se3.normalise(sensor.T_sensor_imu),
-    )
+    T_lidar_imu = None if imu is None else se3.normalise(sensor.T_sensor_imu)
+    return Opened(revolutions, sensor.rate_hz, sensor.beams, sensor.name, imu, T_lidar_imu)
 
 
 def _heads(datagrams: Packets, which: Integers, sensor: OusterSensor) -> tuple[Integers, Integers]:

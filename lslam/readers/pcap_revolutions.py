@@ -113,8 +113,7 @@ def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> NDArray[np.bo
 def in_order(times_ns: Integers, what: str, voice: Voice) -> Integers:
     """Order of packets by their own times, each time once; said where it is not that of the capture."""
     order = np.argsort(times_ns, kind="stable")
-    late = int((np.diff(times_ns) < 0).sum())
-    if late:
+    if late := int((np.diff(times_ns) < 0).sum()):
         voice.problems.append(f"{what} are out of order in {late} places: sorted by their own times")
     ordered = times_ns[order]
     repeated = np.diff(ordered, prepend=ordered[:1] - 1) == 0

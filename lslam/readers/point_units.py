@@ -22,7 +22,6 @@ _HEIGHT_M, _NOISE_M, _RANGE_M, _RANGE_WEIGHT = 1.5, 0.01, 8.0, 0.5
 # By how much the best unit has to be nearer to what is usual than the next one, as a logarithm.
 _MARGIN = 2.0
 _MIN_POINTS = 100
-_LOOKED_AT = 3
 _PATCHES, _PATCH_POINTS, _MOST_POINTS = 200, 12, 60_000
 # What no LiDAR and no recording has: steps of coordinates, and surfaces thinner or thicker.
 _COARSEST_M, _THINNEST_M, _THICKEST_M = 0.1, 0.002, 0.3
@@ -59,7 +58,7 @@ def settle_unit(sequence: T) -> T:
         sequence.notes.append(f"points in {name}, as stated")
         return sequence
     some: list[NDArray[np.float64]] = []
-    for index in dict.fromkeys([0, len(sequence) // 2, len(sequence) - 1]) if len(sequence) else []:
+    for index in sorted({0, len(sequence) // 2, len(sequence) - 1}) if len(sequence) else []:
         with suppress(InputError):
             points = sequence.scan(index).points.astype(np.float64)
             points = points[np.isfinite(points).all(1) & (points != 0).any(1)]
