@@ -262,3 +262,13 @@ def test_raw_bytes_in_a_column_of_text_leave_the_others(tmp_path: Path) -> None:
     path.write_bytes(head.encode() + rows.replace(b"-1.25e+01", b"-1.2x", 1))
     with pytest.raises(InputError, match=r"a\.pcd: PCD ascii data"):
         read_points(path)
+
+
+@pytest.mark.parametrize(("count", "words"), [("3000000000", "numbers a point: too many"), ("0", "has no FIELDS")])
+@pytest.mark.parametrize("data", ["ascii", "binary"])
+def test_counts_that_no_point_has_are_refused(count: str, words: str, data: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.pcd"
+    head = f"FIELDS x\nSIZE 4\nTYPE F\nCOUNT {count}\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA {data}\n"
+    path.write_text(f"{head}1 2 3\n1 2 3\n")
+    with pytest.raises(InputError, match=words):
+        read_points(path)
