@@ -168,7 +168,8 @@ def _increases(values: Floats) -> bool:
 def _stamps(table: TextTable, units: Units, default_ns: int | None) -> NDArray[np.int64]:
     out = np.zeros(len(table.rows), np.int64)
     for column, stated_ns in units.items():
-        unit_ns = stated_ns or default_ns or unit_by_size(table.numbers(column))
+        is_decimal = any("." in cells[column] for cells in table.cells if column < len(cells))
+        unit_ns = stated_ns or default_ns or unit_by_size(table.numbers(column), is_decimal)
         for i, (row, cells) in enumerate(zip(table.rows, table.cells, strict=True)):
             text = cells[column] if column < len(cells) else ""
             try:
@@ -181,11 +182,11 @@ def _stamps(table: TextTable, units: Units, default_ns: int | None) -> NDArray[n
     return out
 
 
-def unit_by_size(values: Floats) -> int:
+def unit_by_size(values: Floats, is_decimal: bool = False) -> int:
     """Nanoseconds in one unit of a column of times (N,).
 
     Times since 1970 have 10 digits in s, 13 in ms, 16 in us, 19 in ns. Other whole numbers that lie more than a minute apart
-    as seconds are in the unit in which they lie about 30 ms apart.
+    as seconds are in the unit in which they lie about 30 ms apart, unless they are written with a decimal point.
     """
     values = values[np.isfinite(values)]
     size = float(np.abs(values).max()) if len(values) else 0.0
@@ -196,6 +197,6 @@ def unit_by_size(values: Floats) -> int:
             return ns
     if size >= 1e14:
         return 1
-    if size < 1e11 and (step < _LONGEST_STEP_S or np.any(values != np.rint(values))):
+    if size < 1e11 and (is_decimal or step < _LONGEST_STEP_S or np.any(values != np.rint(values))):
         return SECOND_NS
     return min((1, 1_000, 1_000_000), key=lambda ns: abs(np.log10(max(step, 1.0) * ns / 3e7)))

@@ -130,7 +130,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
     Raises InputError when the counts differ and nothing tells.
     """
     count = len(files)
-    counts = f"{path} has {len(stamps)} stamps for {count} scans"
+    counts = f"{path} has {len(stamps)} {'times' if path.stem == 'times' else 'stamps'} for {count} scans"
     rows = _labelled(path, files, len(stamps))
     if rows is not None:
         without = np.count_nonzero(rows < 0)

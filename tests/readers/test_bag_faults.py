@@ -236,9 +236,8 @@ def test_missing_type_definitions_are_a_clear_sentence(tmp_path: Path, store: An
 
 def test_raw_packets_are_a_clear_sentence(tmp_path: Path, store: Any) -> None:
     path = mcap(tmp_path / "a.mcap", names("hesai_ros_driver/msg/UdpFrame", "/packets"), *messages(store, 2))
-    with pytest.raises(
-        InputError, match=r"raw packets of a Hesai LiDAR on /packets \(hesai_ros_driver/msg/UdpFrame, 2 m.*driver"
-    ):
+    sentence = r"raw packets of a Hesai LiDAR on /packets \(hesai_ros_driver/msg/UdpFrame, 2 m.*driver"
+    with pytest.raises(InputError, match=sentence):
         open_sequence(path)
 
 

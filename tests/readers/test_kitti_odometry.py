@@ -154,7 +154,7 @@ def test_files_of_different_length_use_the_common_part_with_a_note(tmp_path: Pat
     assert (len(s), len(s.stamps_ns)) == (5, 5)
     assert s.ground_truth is not None
     assert s.ground_truth.stamps_ns.tolist() == s.stamps_ns[:4].tolist()
-    assert said(s.problems, "5 stamps for 6 scans")
+    assert said(s.problems, "5 times for 6 scans")
     assert said(s.problems, "4 poses for 5 scans")
 
 
