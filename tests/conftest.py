@@ -14,6 +14,7 @@ from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from types import ModuleType
 
+import blas_kernels  # noqa: F401
 import pytest
 from hypothesis import settings
 from shared_towns import Towns
@@ -33,8 +34,6 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Workers inherit both from the process that starts them.
 GIVEN = os.environ.setdefault("PYTHONPATH_GIVEN", os.environ.get("PYTHONPATH", ""))
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, (str(Path(__file__).resolve().parents[1]), GIVEN)))
-# Workers fill the cores already; threads of BLAS on small matrices wait for each other.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 # Collecting makes millions of objects that stay: a quarter of its time went into looking for those that do not.

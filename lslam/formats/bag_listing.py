@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from lslam.formats.bag_chunks import Topic
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
@@ -115,6 +115,8 @@ def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
 
 def _has_all(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> bool:
     """Where one begins or ends outside, no more is compared."""
+    import numpy as np  # late: a name is looked up without it
+
     return (
         len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1] and bool(np.isin(wanted, stamps).all())
     )
