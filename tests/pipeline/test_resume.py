@@ -202,7 +202,7 @@ def test_the_map_goes_on_where_it_was_killed(
     lslam.run(again, config, out=out, resume=True)
     left = COUNT - again_from
     assert again.reads[-left:] == [*range(again_from, COUNT)]
-    assert max(again.reads[:-left]) < 3, "only to see what the scans are like"
+    assert max(again.reads[:-left]) < 5, "only to see what the scans are like"
     assert result_of(out) == whole(made, *words)
 
 
