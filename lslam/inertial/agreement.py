@@ -83,7 +83,7 @@ def check_agreement(
             raise _beyond(felt, seen, float(offsets[best]), at_zero, correlation)
         # In long even bends the clock offset is unobservable.
         best = len(offsets) // 2
-    _refuse_axes(felt, seen, offsets, float(offsets[best]))
+    _refuse_axes(felt, seen, offsets)
     bias = _mean_excess(felt.rates(float(offsets[best])), seen, T_lidar_imu)
     if offset_s is not None:
         return Agreement(True, correlation, offset_s, gyro_bias=bias)
@@ -200,10 +200,10 @@ def _refuse_scale(ratio: float) -> None:
         )
 
 
-def _refuse_axes(felt: _Felt, seen: Floats, offsets: Floats, offset_s: float) -> None:
+def _refuse_axes(felt: _Felt, seen: Floats, offsets: Floats) -> None:
     """Refuse turns that are those of the scans about other axes: where one axis turns most, they correlate all the same.
 
-    offset_s : of `offsets`, the best about the given axes; about others it may be another
+    About any axes the best of the `offsets` counts: what a clock mends says nothing about axes.
     """
 
     def left(axes: Floats, t: float) -> float:
@@ -212,7 +212,7 @@ def _refuse_axes(felt: _Felt, seen: Floats, offsets: Floats, offset_s: float) ->
 
     best = min(offsets, key=lambda t: left(_best_axes(*_centred(seen, felt.rates(t)))[1], t))
     R, M = _best_axes(*_centred(seen, felt.rates(float(best))))
-    given, turned, mirrored = left(np.eye(3), offset_s), left(R, best), left(M, best)
+    given, turned, mirrored = min(left(np.eye(3), t) for t in offsets), left(R, best), left(M, best)
     if MUCH_WORSE * mirrored < min(given, turned):
         raise ImuRefusedError(
             "its turns fit those of the scans when mirrored: one of its axes has the wrong sign, or two of them are swapped, "

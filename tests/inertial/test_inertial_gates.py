@@ -172,13 +172,18 @@ def test_the_first_velocity_is_that_of_the_first_scans_alone(scan_ns: int, used:
         assert (sigma < 1e-6) == is_right
 
 
-def test_a_flat_correlation_gives_no_time_offset() -> None:
-    """A turn that grows evenly, all but, felt 0.3 s too late: the best of a quarter of a second is none."""
+@pytest.mark.parametrize("seed", range(8))
+def test_a_flat_correlation_gives_no_time_offset(seed: int) -> None:
+    """A turn that grows evenly, all but, felt 0.3 s too late: the best of a quarter of a second is none.
+
+    About its one axis any rotation fits, which one is a matter of rounding: it says nothing about the mounting.
+    """
     stamps = np.arange(0, 13_000_000_000, IMU_NS)
     t, scans = 1e-9 * stamps, SCAN_NS * np.arange(5, 125)
     growth, bias = np.array([0.0, 0.05, 0.2]), np.array([0.01, -0.02, 0.005])
     imu = ImuStream(stamps + 300_000_000, np.zeros((len(t), 3)), np.outer(t + 0.02 * t**2, growth) + bias)
     angles = np.outer(0.5 * (1e-9 * scans) ** 2 + 0.02 / 3 * (1e-9 * scans) ** 3, growth)
+    angles += np.random.default_rng(seed).normal(0, 1e-12, angles.shape)
     found = check_agreement(imu, np.eye(4), scans, se3.make(so3.exp(angles), np.zeros((120, 3))), None)
     assert found.is_judged
     assert found.correlation > 0.999
