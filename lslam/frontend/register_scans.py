@@ -95,17 +95,18 @@ def sweep_of(sequence: Sequence) -> Span | None:
     """When sweeps begin and end, None when points have no times: the longest of the first scans with points speaks for all.
 
     One that lasts half a period is long enough; a scan that lacks times, or has the end of a sweep alone, does not decide.
-    Of motion compensated scans the first decides.
+    Motion compensated scans of which the first has none have none.
     """
     spans: list[Span | None] = []
-    most = 1 if sequence.motion_compensated else _LOOKED_AT
     for i in range(min(len(sequence), 10)):
         with suppress(InputError):
             scan = sequence.scan(i)
             if len(scan):
                 spans.append(None if scan.times is None else scan.span)
+        if spans and spans[0] is None and sequence.motion_compensated:
+            break
         last = spans[-1] if spans else None
-        if len(spans) == most or (last is not None and last.seconds * sequence.rate_hz >= 0.5):
+        if len(spans) == _LOOKED_AT or (last is not None and last.seconds * sequence.rate_hz >= 0.5):
             break
     return max((span for span in spans if span is not None), key=lambda span: span.seconds, default=None)
 
