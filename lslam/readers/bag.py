@@ -16,7 +16,7 @@ from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
-from lslam.geometry import se3
+from lslam.geometry import portable, se3
 from lslam.printable import printable
 from lslam.readers.bag_halves import Halves, read_whole
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
@@ -359,7 +359,7 @@ def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory |
         )
     elif body != lidar:
         T_body_lidar, source = rigid
-        poses = se3.normalise(poses @ T_body_lidar)
+        poses = se3.normalise(portable.product(poses, T_body_lidar))
         voice.notes.append(
             f"ground truth {topic.name}: poses of {body}, carried to {lidar} with {source.removeprefix('from ')}"
         )

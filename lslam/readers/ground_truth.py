@@ -16,7 +16,7 @@ from lslam.formats.pose_rows import read_rows
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
-from lslam.geometry import geodesy, se3, so3
+from lslam.geometry import geodesy, portable, se3, so3
 from lslam.geometry.interpolate import poses_at
 from lslam.readers.listing import file_numbers, rows_of
 from lslam.remote import RemotePath, as_path
@@ -138,11 +138,11 @@ def to_lidar(
                 f"cannot be compared: add calib.txt with Tr, or [extrinsics] T_cam0_lidar to {FILE_NAME}"
             )
             return None
-        return replace(truth, poses=se3.normalise(se3.inverse(T) @ truth.poses @ T), frame="lidar")
+        return replace(truth, poses=se3.normalise(portable.product(se3.relative(T, truth.poses), T)), frame="lidar")
     if frame == "imu" and T_body_lidar is None and calibration.T_lidar_imu is not None:
         T_body_lidar = se3.inverse(calibration.T_lidar_imu)
     if T_body_lidar is not None:
-        return replace(truth, poses=se3.normalise(truth.poses @ T_body_lidar), frame="lidar")
+        return replace(truth, poses=se3.normalise(portable.product(truth.poses, T_body_lidar)), frame="lidar")
     if frame == "imu":
         voice.problems.append(
             f"ground truth {truth.source} holds poses of the IMU and T_lidar_imu is unknown: they are taken as LiDAR poses; "
@@ -201,14 +201,14 @@ def oxts_truth(
         return None
     positions = geodesy.to_local(values[:, :3], values[0, :3])
     T_enu_imu = se3.make(so3.from_euler_rpy(values[:, ROLL : YAW + 1]), positions)
-    T_enu_lidar = T_enu_imu @ se3.inverse(T_lidar_imu)
+    T_enu_lidar = portable.product(T_enu_imu, se3.inverse(T_lidar_imu))
     at = stamps
     if not np.isin(scan_stamps_ns, stamps).all():
         # LiDAR and OXTS have their own clocks' ticks: 5 ms apart are 7 cm at 15 m/s.
         at = scan_stamps_ns[(scan_stamps_ns >= stamps[0] - _BEYOND_NS) & (scan_stamps_ns <= stamps[-1] + _BEYOND_NS)]
         T_enu_lidar = poses_at(stamps, T_enu_lidar, at)
         voice.notes.append("OXTS poses are interpolated to the stamps of the scans")
-    poses = se3.normalise(se3.inverse(T_enu_lidar[0]) @ T_enu_lidar)
+    poses = se3.normalise(se3.relative(T_enu_lidar[0], T_enu_lidar))
     accuracy = float(np.median(values[:, POS_ACC]))
     voice.notes.append(
         "ground truth from OXTS (attitude and position, transverse Mercator at the first fix) as LiDAR poses; its own "
