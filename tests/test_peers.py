@@ -167,7 +167,8 @@ def test_a_peer_finds_what_its_own_interface_finds(
     # It moved, or they would agree on nothing.
     assert np.linalg.norm(poses[-1, :3, 3]) > 1.0
     assert seconds.shape == (COUNT, 2)
-    assert (seconds[1:] > 0).all()
+    # A clock of the CPU may stand still for a whole tick of the machine, and so for one scan.
+    assert (seconds >= 0).all() and (seconds[1:].sum(axis=0) > 0).all()
 
 
 class Clock:
