@@ -23,6 +23,8 @@ from lslam.errors import InputError
 from lslam.foreign import importing_open3d
 from lslam.locks import one_at_a_time
 
+pytest_plugins = ["perturbed_scans"]
+
 # How long an example takes is the machine's affair.
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")

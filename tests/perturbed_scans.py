@@ -1,0 +1,58 @@
+"""Simulated drives as another machine or another day would give them, on request: a test that hangs on a rounding shows.
+
+`--scan-noise-mm A` moves every point of a simulated scan by a normal error of A mm along each axis; `--noise-seed K` draws
+another such error and, when no A is given, other noise of every sensor and other traffic in the same towns on the same paths.
+Drives that tests simulate in other processes, and rays that they trace themselves, stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+SHIFT = 2**31  # keeps these seeds apart from the numbers of visits
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("simulated drives")
+    group.addoption("--scan-noise-mm", type=float, default=0.0, help="move every simulated point by about as much")
+    group.addoption("--noise-seed", type=int, default=0, help="other noise: of --scan-noise-mm, else of all sensors")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Drives change for the whole session: what tests share is made before any of them asks."""
+    noise_m, seed = config.getoption("scan_noise_mm") / 1000, config.getoption("noise_seed")
+    if noise_m:
+        move_points(noise_m, seed)
+    elif seed:
+        draw_other_noise(seed)
+
+
+def move_points(noise_m: float, seed: int) -> None:
+    """Let the points of every simulated scan be off by `noise_m`, m, the same in every process."""
+    from lslam.simulation.scenarios import SimulatedDrive
+
+    scan_of = SimulatedDrive.scan
+
+    def scan(drive: SimulatedDrive, index: int) -> Any:
+        exact = scan_of(drive, index)
+        rng = np.random.default_rng([*drive._seeds, index, SHIFT + seed])
+        off = rng.normal(0, noise_m, exact.points.shape)
+        return replace(exact, points=(exact.points + off).astype(np.float32))
+
+    SimulatedDrive.scan = scan  # type: ignore[method-assign]
+
+
+def draw_other_noise(seed: int) -> None:
+    """Let all that differs from visit to visit of a town be drawn anew."""
+    from lslam.simulation.routes import Visit
+
+    seeds_of = Visit.seeds
+
+    def seeds(visit: Visit, town: int) -> tuple[int, ...]:
+        return (*seeds_of(visit, town), SHIFT + seed)
+
+    Visit.seeds = seeds  # type: ignore[method-assign]
