@@ -6,13 +6,13 @@ import time
 
 from lslam.config.config import Config
 from lslam.odometry.base import Registered
+from lslam.odometry.elastic import ElasticResult, SweepPoints, register_elastic
+from lslam.odometry.elastic_constraints import ElasticConstraints, LastSweep
 from lslam.odometry.icp import Icp
 from lslam.odometry.scan_outcome import of_registration
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.recovery.policies import policies_of
-from lslam.registration.elastic import ElasticResult, SweepPoints, register_elastic
-from lslam.registration.elastic_constraints import ElasticConstraints, LastSweep
 from lslam.registration.registration import MIN_SOURCE_POINTS, NEAR_KERNEL, Registration
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of

@@ -16,12 +16,12 @@ from lslam.kernels.transform import transform
 from lslam.odometry.base import Registered
 from lslam.odometry.plane_association import associate
 from lslam.odometry.plane_factors import sighting_residuals
+from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
 from lslam.odometry.plane_values import SHARED
 from lslam.odometry.plane_window import PlaneWindow
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.acceptance import correction
-from lslam.registration.planes import PlaneExtractor, Planes, turned
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.preintegration import SweepLink
 from lslam.types.scan import Scan

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.odometry import closest_point
 from lslam.odometry.plane_factors import Sightings, sighting_residuals
+from lslam.odometry.plane_segmentation import Planes, turned
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE
 from lslam.odometry.plane_window import PlaneWindow
-from lslam.registration import closest_point
-from lslam.registration.planes import Planes, turned
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lslam.geometry import so3
 from lslam.geometry.normal_equations import Normal
+from lslam.odometry import closest_point
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-from lslam.registration import closest_point
 from lslam.types.preintegration import PreintegratedStep
 
 Floats = NDArray[np.float64]

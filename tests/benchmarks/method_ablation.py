@@ -24,10 +24,9 @@ from lslam.geometry import se3
 from lslam.inertial import imu_cleaning, saturation
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
-from lslam.odometry import lips, loam_livox, plane_association, plane_factors
+from lslam.odometry import elastic_constraints, lips, loam_livox, plane_association, plane_factors, planes
+from lslam.odometry.elastic_constraints import NOTHING, LastSweep
 from lslam.odometry.lio_mapping import LioMapping
-from lslam.registration import elastic_constraints, planes
-from lslam.registration.elastic_constraints import NOTHING, LastSweep
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.trajectory import Trajectory

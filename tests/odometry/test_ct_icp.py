@@ -21,10 +21,8 @@ from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
-from lslam.preprocessing.deskew import deskew_points, knots_over
-from lslam.preprocessing.prepare import prepare_points
-from lslam.registration.elastic import PARTS, SweepPoints, register_elastic
-from lslam.registration.elastic_constraints import (
+from lslam.odometry.elastic import PARTS, SweepPoints, register_elastic
+from lslam.odometry.elastic_constraints import (
     FORGETTING,
     LAG,
     LEAST_CHANGE,
@@ -33,7 +31,9 @@ from lslam.registration.elastic_constraints import (
     ElasticConstraints,
     LastSweep,
 )
-from lslam.registration.elastic_sweep import ElasticSweep
+from lslam.odometry.elastic_sweep import ElasticSweep
+from lslam.preprocessing.deskew import deskew_points, knots_over
+from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.robust import Annealing
 from lslam.simulation.scenarios import simulate

@@ -9,13 +9,12 @@ import pytest
 from analytic_scenes import random_pose
 
 from lslam.geometry import se3
-from lslam.odometry import plane_window
+from lslam.odometry import closest_point, plane_window
 from lslam.odometry.plane_association import associate
 from lslam.odometry.plane_factors import sighting_residuals, step_residual
+from lslam.odometry.plane_segmentation import Planes
 from lslam.odometry.plane_values import SHARED, STATE_SIZE
 from lslam.odometry.plane_window import PlaneWindow
-from lslam.registration import closest_point
-from lslam.registration.planes import Planes
 from lslam.types.preintegration import MotionState, PreintegratedStep
 
 # A room round the way, in the world.

@@ -6,8 +6,8 @@ import numpy as np
 from analytic_scenes import bushes, pose_at, random_pose, room, seen_from
 
 from lslam.geometry import se3
-from lslam.registration import closest_point
-from lslam.registration.planes import PlaneExtractor, turned
+from lslam.odometry import closest_point
+from lslam.odometry.plane_segmentation import PlaneExtractor, turned
 
 # Floor and walls of the room.
 WALLS = np.array([[0, 0, -1.7], [10, 0, 0], [-10, 0, 0], [0, 8, 0], [0, -8, 0]], float)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from lslam.kernels import gaussians
 from lslam.kernels.voxel import MASK, OFFSET
-from lslam.registration import closest_point
+from lslam.odometry import closest_point
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH
 

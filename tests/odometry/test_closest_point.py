@@ -6,7 +6,7 @@ import numpy as np
 from analytic_scenes import random_pose
 
 from lslam.geometry import se3, so3
-from lslam.registration import closest_point
+from lslam.odometry import closest_point
 
 RNG = np.random.default_rng(0)
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from lslam.geometry import so3
 from lslam.kernels import facts as at
 from lslam.kernels.gauss_newton import UNSEEN
+from lslam.odometry.elastic_constraints import ElasticConstraints
+from lslam.odometry.elastic_sweep import ElasticSweep
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, subset
-from lslam.registration.elastic_constraints import ElasticConstraints
-from lslam.registration.elastic_sweep import ElasticSweep
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import (
     LEAST_MATCHED,
