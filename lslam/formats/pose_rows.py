@@ -33,7 +33,7 @@ class Row(NamedTuple):
 
 
 def read_rows(path: Path) -> tuple[list[Row], list[str]]:
-    """Data lines and comment lines (with `#` or `%`) of a text file; InputError when it cannot be read as text."""
+    """Data lines and comment lines (with `#`, `%` or `//`) of a text file; InputError when it cannot be read as text."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -45,7 +45,7 @@ def read_rows(path: Path) -> tuple[list[Row], list[str]]:
     rows, comments = [], []
     for number, line in enumerate(text.splitlines(), start=1):
         stripped = line.strip()
-        if stripped.startswith(("#", "%")):
+        if stripped.startswith(("#", "%", "//")):
             comments.append(stripped)
         elif stripped:
             rows.append(Row(number, stripped))

@@ -34,10 +34,11 @@ _STAMPED, _TIMED, _ENDING = 0, 1, 2
 
 
 class RowTimes(NamedTuple):
-    """stamps_ns : (N,); note : which columns hold them and which might have, empty without others"""
+    """stamps_ns : (N,); note : which columns hold them and which might have, empty without others; columns : all of these"""
 
     stamps_ns: NDArray[np.int64]
     note: str
+    columns: set[int]
 
 
 def tokens_of(name: str) -> list[str]:
@@ -67,7 +68,7 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     if table.names and others:
         note = f"the time is {' and '.join(table.names[k] for k in chosen)}; "
         note += f"left out: {', '.join(table.names[k] for k in sorted(others))}"
-    return RowTimes(_stamps(table, chosen, default_ns), note)
+    return RowTimes(_stamps(table, chosen, default_ns), note, others.union(chosen))
 
 
 def is_index(values: Floats) -> bool:

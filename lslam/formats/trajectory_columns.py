@@ -15,14 +15,16 @@ from lslam.geometry import so3
 Floats = NDArray[np.float64]
 Prefix = tuple[str, ...]
 _POSITIONS = ("position", "positions", "pos", "translation", "trans", "point", "p", "t", "xyz")
-_ROTATIONS = ("orientation", "rotation", "quaternion", "quat", "rot", "q")
+_ROTATIONS = ("orientation", "ori", "rotation", "quaternion", "quat", "rot", "q")
 # Words before a bare x, y or z that leave it a position.
 _BODIES = frozenset((
     "field", "pose", "poses", "gt", "est", "ref", "true", "truth", "ground", "groundtruth", "reference", "utm", "enu", "world",
     "map", "odom", "lidar", "base", "imu", "body", "cam", "camera", "local", "global", "prism", "leica", "rtk", "gps", "gnss",
 ))  # fmt: skip
-_EARTH = {"east": "x", "easting": "x", "e": "x", "north": "y", "northing": "y", "n": "y", "up": "z", "u": "z"}
-_ANGLES = ("roll", "pitch", "yaw", "heading")
+_EARTH = {
+    **dict.fromkeys(("east", "easting", "e"), "x"), **dict.fromkeys(("north", "northing", "n"), "y"),
+    **dict.fromkeys(("up", "u", "height", "h", "altitude", "alt"), "z"),
+}  # fmt: skip
 _WAY_OUT = "name the columns t, x, y, z, qx, qy, qz, qw"
 # Share of a table's quaternions that must have length 1, and how far from it they may be.
 _MOST, _UNIT = 0.95, 0.05
@@ -33,7 +35,7 @@ _XYZW = {"last": [0, 1, 2, 3], "first": [1, 2, 3, 0]}
 class PoseColumns(NamedTuple):
     """columns : of x, y, z and, where there are rotations, qx, qy, qz, qw; leading : the number of columns before, by place
 
-    notes : what was chosen and left out
+    notes : what was chosen
     """
 
     columns: list[int]
@@ -54,6 +56,8 @@ def named_columns(table: TextTable) -> PoseColumns | None:
         if kind is not None:
             is_rotation, prefix, axis = kind
             (rotations if is_rotation else positions).setdefault(prefix, {}).setdefault(axis, k)
+    # Beside degrees a height is no position.
+    positions = {prefix: axes for prefix, axes in positions.items() if [*axes] != ["z"] or "on Earth" not in prefix}
     if not positions:
         return None
     bodies = {prefix: axes for prefix, axes in positions.items() if len(axes) == 3} or positions
@@ -74,10 +78,7 @@ def named_columns(table: TextTable) -> PoseColumns | None:
     missing += [f"q{axis}" for axis in "xyzw" if rotation and axis not in rotation]
     if missing:
         raise InputError(f"{path}: no column for {', '.join(missing)} in the header {', '.join(names)}; {_WAY_OUT}")
-    notes = [f"the position is {chosen}; left out: {', '.join(others)}"] if others else []
-    angles = [name for name in names if not rotation and {*tokens_of(name)} & {*_ANGLES}]
-    if angles:
-        notes.append(f"left out: {', '.join(angles)}; rotations are read as quaternions (qx, qy, qz, qw)")
+    notes = [f"the position is {chosen}"] if others else []
     columns = [position[axis] for axis in "xyz"] + [rotation[axis] for axis in "xyzw" if rotation]
     return PoseColumns(columns, 0, notes)
 
@@ -92,7 +93,7 @@ def _kind(words: list[str]) -> tuple[bool, Prefix, str] | None:
     if not words:
         return None
     *before, last = words
-    if last in _EARTH:
+    if last in _EARTH and _BODIES.union(_POSITIONS).issuperset(before):
         # A body of its own: beside x, y, z a column `n` is a count.
         return False, (*before, "on Earth"), _EARTH[last]
     if len(last) > 1:

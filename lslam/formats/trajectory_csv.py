@@ -71,6 +71,8 @@ def parse(
     if not table.rows:
         raise InputError(f"{path} has a header but no poses")
     chosen = named_columns(table) if table.names else None
+    if chosen is not None and not any("_rs_" in name.lower() for name in table.names):
+        frame = "unknown"
     if chosen is None:
         if looks_like_header(rows[0].text):
             raise InputError(
@@ -93,6 +95,11 @@ def parse(
         raise InputError(f"{path}: no column is a time in the header {', '.join(table.names)}; name it t, or stamp_ns")
     check_increasing(clock.stamps_ns, table.rows, path)
     poses, has_rotations, rotation_notes = poses_of(values, table.rows, path)
+    left_out = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns)]
+    if left_out:
+        more = f" and {len(left_out) - 6} more" if len(left_out) > 6 else ""
+        hint = "" if len(columns) > 3 else "; rotations are read as quaternions (qx, qy, qz, qw)"
+        notes.append(f"left out: {', '.join(left_out[:6])}{more}{hint}")
     notes += [*rotation_notes, *filter(None, [clock.note])]
     if lost.any():
         notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")

@@ -13,7 +13,7 @@ from lslam.errors import InputError
 from lslam.formats import trajectory_csv
 from lslam.formats.pose_rows import Row, check_finite, check_increasing, pose_texts, seconds_text, write_lines
 from lslam.formats.stamp_files import read_times
-from lslam.formats.text_tables import TextTable
+from lslam.formats.text_tables import looks_like_header, separator_of, split_cells, text_table
 from lslam.formats.time_columns import find_clock
 from lslam.geometry import so3
 from lslam.remote import as_path
@@ -28,7 +28,21 @@ WIDTHS = (12, 13, 16, 17)
 
 def fits_kitti(first: str) -> bool:
     """The upper 3x4 of a pose or the whole 4x4, with an index or a time before it or not: 12, 13, 16 or 17 numbers."""
-    return not trajectory_csv.fits_csv(first) and len(first.split()) in WIDTHS
+    separator = separator_of(first)
+    cells = split_cells(first, separator)
+    if len(cells) not in WIDTHS or looks_like_header(first):
+        return False
+    # EuRoC's tables are as wide as a stamp and a 4x4.
+    return separator in (None, "\t") or _is_matrix(cells[-16:] if len(cells) > 13 else cells[-12:])
+
+
+def _is_matrix(cells: list[str]) -> bool:
+    """Whether the cells of a 3x4 or 4x4 matrix, row by row or column by column, hold a rotation."""
+    try:
+        numbers = np.array(cells, np.float64)
+    except ValueError:
+        return False
+    return bool(np.isfinite(numbers).all() and so3.is_rotation(numbers.reshape(-1, 4)[None, :3, :3], 1e-2)[0])
 
 
 def read_kitti(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
@@ -61,7 +75,7 @@ def read_matrices(path: Path, rows: list[Row]) -> Trajectory:
     Lost poses are NaN. Without times the stamps count the scans at 10 Hz.
     Raises InputError naming the line that is short, no number, infinite, or no rotation.
     """
-    table = TextTable(path, (), rows, [row.text.split() for row in rows], None)
+    table = replace(text_table(path, rows, []), names=())
     width = len(table.cells[0]) if len(table.cells[0]) in WIDTHS else 12
     size = 16 if width >= 16 else 12
     table.check_widths(width, "KITTI poses")

@@ -109,6 +109,9 @@ FILES = {
     "EuRoC without names": lines(lambda i: [str(NS[i]), *pose(i, "wxyz")], ","),
     "stamped matrices": lines(lambda i: [seconds(i), *matrix(i)]),
     "stamped 4x4": lines(lambda i: [seconds(i), *matrix(i, 16)]),
+    "stamped matrices between commas": lines(lambda i: [str(NS[i]), *matrix(i)], ","),
+    "EuRoC with biases, without names": lines(lambda i: [str(NS[i]), *pose(i, "wxyz"), *["0.1"] * 9], ","),
+    "a comment of two slashes": lines(lambda i: [seconds(i), *pose(i)], " ", f"// t {NAMES}"),
 }  # fmt: skip
 
 
@@ -133,6 +136,8 @@ def test_the_drive_comes_back(kind: str, tmp_path: Path) -> None:
         ("TUM with a ninth column", "from column 9 on are left out"),
         ("TUM in nanoseconds between commas", "quaternions are read with w last"),
         ("stamped matrices", "the time, then 3x4 matrices"),
+        ("EuRoC", "left out: v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]"),
+        ("rostopic", "left out: field.header.seq, field.header.frame_id, field.pose.covariance0, "),
     ],
 )
 def test_what_was_chosen_is_said(kind: str, note: str, tmp_path: Path) -> None:
@@ -163,6 +168,9 @@ ALONE = {
     "a point of ROS": lines(lambda i: [str(NS[i]), *pose(i)[:3]], ",", "%time,field.point.x,field.point.y,field.point.z"),
     "RTK": lines(lambda i: [*parts(i), *pose(i)[:3]], ",", "sec,nsec,easting,northing,up"),
     "ENU": lines(lambda i: [f"{np.datetime64(int(NS[i]), 'ns')}Z", *pose(i)[:3]], ",", "utc,E,N,U"),
+    "heights, and velocities": lines(
+        lambda i: [seconds(i), *pose(i)[:3], "1", "2", "3"], ",", "GPSTime,easting,northing,altitude,vel_east,vel_north,vel_up"
+    ),
     "a count beside": lines(lambda i: [str(7 - i % 3), seconds(i), *pose(i)[:3], ""], ",", "n,t,x,y,z,"),
     "blanks": lines(lambda i: [seconds(i), *pose(i)[:3]]),
     "blanks and two columns of time": lines(lambda i: [*parts(i), *pose(i)[:3]]),
@@ -182,9 +190,22 @@ def test_positions_alone(kind: str, tmp_path: Path) -> None:
     assert not trajectory.has_rotations
     assert trajectory.stamps_ns.tolist() == NS.tolist()
     np.testing.assert_allclose(trajectory.positions, P, atol=1e-8)
-    assert bool(trajectory.notes) == (kind in ("angles", "zero quaternions") or "identity" in kind)
-    if kind == "angles":
-        assert "left out: roll, pitch, yaw" in trajectory.notes[0]
+    left_out = {
+        "angles": "roll, pitch, yaw",
+        "a count beside": "n",
+        "heights, and velocities": "vel_east, vel_north, vel_up",
+    }
+    assert bool(trajectory.notes) == (kind in (*left_out, "zero quaternions") or "identity" in kind)
+    if kind in left_out:
+        hint = "; rotations are read as quaternions (qx, qy, qz, qw)"
+        assert trajectory.notes == (f"left out: {left_out[kind]}{hint}",)
+
+
+def test_only_tables_of_euroc_are_of_the_imu(tmp_path: Path) -> None:
+    """The first cell of others begins with nanoseconds too."""
+    for kind, frame in (("rostopic", "unknown"), ("EuRoC", "imu"), ("EuRoC without names", "imu")):
+        (tmp_path / "gt.csv").write_text(FILES[kind])
+        assert read_trajectory(tmp_path / "gt.csv").frame == frame
 
 
 def test_a_straight_drive_without_turns_has_rotations(tmp_path: Path) -> None:
