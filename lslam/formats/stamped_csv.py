@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.formats.pose_rows import read_rows
-from lslam.formats.text_tables import text_table
+from lslam.formats.text_tables import shortened, text_table
 from lslam.formats.time_columns import find_clock
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -21,10 +21,11 @@ from lslam.types.imu import ImuStream
 log = logging.getLogger("lslam")
 TIME_COLUMNS = "stamp_ns, timestamp, stamp, time, t, time_s, or sec and nanosec"
 IMU_COLUMNS = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z")
-_ALIASES = [
-    *((f"accel_{axis}", f"a{axis}", f"a_rs_s_{axis}", f"acc_{axis}", f"linear_acceleration_{axis}") for axis in "xyz"),
-    *((f"gyro_{axis}", f"w{axis}", f"w_rs_s_{axis}", f"g{axis}", f"angular_velocity_{axis}") for axis in "xyz"),
-]
+_STEMS = (
+    ("accel_", "a", "a_rs_s_", "acc_", "acc", "linear_acceleration_"),
+    ("gyro_", "w", "w_rs_s_", "g", "gyr_", "gyr", "gyro", "angular_velocity_"),
+)
+_ALIASES = [tuple(stem + axis for stem in stems) for stems in _STEMS for axis in "xyz"]
 GNSS_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "sigma_m")
 
 
@@ -45,16 +46,18 @@ def read_stamped_csv(
     ]
     header = ", ".join(table.names)
     table.check_widths(len(table.names), "the header")
-    clock = find_clock(table, [k for k in where if k is not None])
+    columns_read = [k for k in where if k is not None]
+    clock = find_clock(table, columns_read)
     if clock is None:
         raise InputError(f"{path}, line 1: no time column ({TIME_COLUMNS}) in {header!r}")
     missing = [names[0] for names, k in zip(columns, where, strict=False) if k is None]
     if missing:
         raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {header}")
     values = np.full((len(table.rows), len(where)), np.nan)
-    values[:, [k is not None for k in where]] = table.values([k for k in where if k is not None])
-    if clock.note:
-        log.info("%s: %s", path, clock.note)
+    values[:, [k is not None for k in where]] = table.values(columns_read)
+    rest = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns_read)]
+    for note in filter(None, [clock.note, rest and f"columns left out: {shortened(rest)}"]):
+        log.info("%s: %s", path, note)
     return clock.stamps_ns, values
 
 
@@ -100,7 +103,11 @@ def read_gnss_csv(path: Path) -> GnssStream:
     """
     stamps, values = read_stamped_csv(
         path,
-        [("lat_deg", "lat", "latitude"), ("lon_deg", "lon", "longitude"), ("alt_m", "alt", "altitude", "height")],
+        [
+            ("lat_deg", "lat", "latitude"),
+            ("lon_deg", "lon", "longitude"),
+            ("alt_m", "alt", "altitude", "height", "h", "ele"),
+        ],
         [("sigma_m", "sigma", "pos_acc")],
     )
     return GnssStream(stamps, values[:, :3], values[:, 3])

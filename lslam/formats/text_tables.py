@@ -59,10 +59,20 @@ class TextTable:
 
 
 def looks_like_header(line: str) -> bool:
-    """Whether the first field of `line` is a name and no number, or is empty before a name (the index of pandas)."""
-    fields = [field.strip("\"' ") for field in re.split(r"[,;\s]\s*", line.strip())[:2]]
-    name = next(filter(None, fields), "")
-    return re.match(r"[A-Za-z_/]|\.[A-Za-z]", name) is not None and name.lower() not in ("nan", "inf", "infinity")
+    """Whether `line` begins with a name, or is empty before one (the index of pandas), and holds no number or date."""
+    fields = [field.strip("\"' ") for field in re.split(r"[,;\s]\s*", line.strip())]
+    name = next(filter(None, fields[:2]), "")
+    is_name = re.match(r"[A-Za-z_/]|\.[A-Za-z]", name) is not None and name.lower() not in ("nan", "inf", "infinity")
+    return is_name and not np.isfinite([_number(field) for field in fields]).any()
+
+
+def shortened(names: list[str]) -> str:
+    """The names between commas, no more than six of them.
+
+    >>> shortened(list("abcdefgh"))
+    'a, b, c, d, e, f and 2 more'
+    """
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
 
 
 def separator_of(text: str) -> str | None:

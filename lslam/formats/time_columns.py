@@ -147,12 +147,12 @@ def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[
 
 
 def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
-    """First columns without names: a time, seconds and nanoseconds, and either behind an index."""
+    """First columns without names: a time, seconds and nanoseconds, and either behind an index or a text."""
     width = min([3, *taken, *(len(cells) for cells in table.cells)]) if table.cells else 0
     numbers = [table.numbers(k) for k in range(width)]
     out: list[Units] = []
     for k in range(width):
-        if k and not is_index(numbers[k - 1]):
+        if k and not (is_index(numbers[k - 1]) or np.isnan(numbers[k - 1]).all()):
             break
         is_pair = k + 1 < width and is_fraction(numbers[k], numbers[k + 1])
         out.append({k: SECOND_NS, k + 1: 1} if is_pair else {k: None})

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.pose_rows import Row, check_finite, check_increasing, frame_in, pose_texts, write_lines
-from lslam.formats.text_tables import looks_like_header, text_table
+from lslam.formats.text_tables import looks_like_header, shortened, text_table
 from lslam.formats.time_columns import find_clock
 from lslam.formats.trajectory_columns import named_columns, placed_columns
 from lslam.geometry import se3, so3
@@ -97,9 +97,8 @@ def parse(
     poses, has_rotations, rotation_notes = poses_of(values, table.rows, path)
     left_out = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns)]
     if left_out:
-        more = f" and {len(left_out) - 6} more" if len(left_out) > 6 else ""
         hint = "" if len(columns) > 3 else "; rotations are read as quaternions (qx, qy, qz, qw)"
-        notes.append(f"left out: {', '.join(left_out[:6])}{more}{hint}")
+        notes.append(f"left out: {shortened(left_out)}{hint}")
     notes += [*rotation_notes, *filter(None, [clock.note])]
     if lost.any():
         notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")

@@ -22,7 +22,7 @@ _DATE = re.compile(
 )
 # Numbers that lie so far apart count no scans; in their unit scans follow each other at 1 to 100 Hz.
 _NO_COUNT = 10_000
-_SHORTEST_NS, _LONGEST_NS = 10**7, 10**9
+_SHORTEST_NS, _LONGEST_NS, _MINUTE_NS = 10**7, 10**9, 60 * 10**9
 _CLEARLY = 0.5
 
 
@@ -72,36 +72,43 @@ def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[i
     """Seconds and the number behind them."""
     for (whole, rest), separator in zip(pairwise(groups), between, strict=True):
         lengths = {len(text) for text in rest}
-        is_alone = len(groups) == 2 and lengths == {9} and max(map(len, whole)) < 9
-        is_time = _is_time(whole, 10**9) or is_alone
-        if separator not in tuple("._-,") or max(lengths) > 9 or not is_time or _counts(rest):
+        if separator not in tuple("._-,") or max(lengths) > 9 or max(map(len, whole)) > 10 or _counts(rest):
             continue
         decimals = [int(a) * 10**9 + int(b.ljust(9, "0")) for a, b in zip(whole, rest, strict=True)]
         units = [int(a) * 10**9 + int(b) for a, b in zip(whole, rest, strict=True)]
         a, b = _unevenness(decimals), _unevenness(units)
         is_decimal = a < b if min(a, b) < _CLEARLY * max(a, b) else max(lengths) < 9
         if len(lengths) == 1:
-            yield decimals, f"seconds and {len(rest[0])} decimals"
+            stamps, words = decimals, f"seconds and {len(rest[0])} decimals"
         elif is_decimal or any(text[0] == "0" and text != "0" for text in rest):
-            yield decimals, "decimal seconds"
+            stamps, words = decimals, "decimal seconds"
         else:
-            yield units, "seconds and nanoseconds without leading zeros"
+            stamps, words = units, "seconds and nanoseconds without leading zeros"
+        if _is_time(whole, 10**9):
+            yield stamps, words
+        elif len(groups) == 2 and (
+            lengths == {9} or (separator == "." and len(set(rest)) > 1 and min(a, b) < _CLEARLY and _is_rate(stamps))
+        ):
+            yield stamps, f"{words} of a clock that began elsewhere"
 
 
-def _numbers(groups: list[list[str]]) -> Iterator[tuple[list[int], str]]:
-    for unit, scale in _UNITS.items():
-        for texts in groups:
-            if _is_time(texts, scale) and (len(texts) == 1 or len(set(texts)) > 1):
-                yield [int(text) * scale for text in texts], f"{unit} since 1970"
+def _numbers(groups: list[list[str]]) -> list[tuple[list[int], str]]:
+    since_1970 = [
+        ([int(text) * scale for text in texts], f"{unit} since 1970")
+        for unit, scale in _UNITS.items()
+        for texts in groups
+        if _is_time(texts, scale) and (len(texts) == 1 or len(set(texts)) > 1)
+    ]
     varying = [texts for texts in groups if len(set(texts)) > 1]
-    if len(varying) != 1 or len(varying[0]) < 3 or max(map(len, varying[0])) > 18:
-        return
-    values = [int(text) for text in varying[0]]
-    step = float(np.median(np.diff(np.sort(values))))
-    for unit, scale in _UNITS.items():
-        is_clock = step >= _NO_COUNT and _SHORTEST_NS <= step * scale <= _LONGEST_NS
-        if is_clock and max(values) * scale < _EARLIEST_NS:
-            yield [value * scale for value in values], f"{unit} of a clock that began elsewhere"
+    others: list[tuple[list[int], str]] = []
+    if len(varying) == 1 and len(varying[0]) > 2 and max(map(len, varying[0])) < 19:
+        values = [int(text) for text in varying[0]]
+        for unit, scale in _UNITS.items():
+            stamps = [value * scale for value in values]
+            if _step_ns(values) >= _NO_COUNT and max(stamps) < _EARLIEST_NS and _is_rate(stamps):
+                others.append((stamps, f"{unit} of a clock that began elsewhere"))
+    # Scans hardly lie more than a minute apart.
+    return sorted([*since_1970, *others], key=lambda reading: _step_ns(reading[0]) > _MINUTE_NS)
 
 
 def _is_time(texts: list[str], scale: int) -> bool:
@@ -111,6 +118,15 @@ def _is_time(texts: list[str], scale: int) -> bool:
 def _counts(texts: list[str]) -> bool:
     """Whether numbers only count the files."""
     return len(texts) > 2 and bool((np.diff([int(text) for text in texts]) == 1).all())
+
+
+def _step_ns(stamps: list[int]) -> float:
+    """The median interval, 0 of a single stamp."""
+    return float(np.median(np.diff(np.sort(np.array(stamps, np.int64))))) if len(stamps) > 1 else 0.0
+
+
+def _is_rate(stamps: list[int]) -> bool:
+    return _SHORTEST_NS <= _step_ns(stamps) <= _LONGEST_NS
 
 
 def _unevenness(stamps: list[int]) -> float:

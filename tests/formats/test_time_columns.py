@@ -36,7 +36,7 @@ CLOCKS: dict[str, Clock] = {
 @pytest.mark.parametrize("names", CLOCKS)
 def test_imu_and_fixes_have_the_time_of_the_table(names: str, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    for columns in (IMU, ROS_IMU):
+    for columns in (IMU, ROS_IMU, "accX,accY,accZ,gyrX,gyrY,gyrZ", "acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z"):
         path.write_text(
             "\n".join([f"{names},{columns}", *(f"{CLOCKS[names](k, t)},1,2,{k},4,5,6" for k, t in enumerate(STAMPS))])
         )
@@ -44,7 +44,7 @@ def test_imu_and_fixes_have_the_time_of_the_table(names: str, tmp_path: Path) ->
         assert imu.stamps_ns.tolist() == STAMPS
         assert imu.accel[7].tolist() == [1, 2, 7]
         assert imu.gyro[7].tolist() == [4, 5, 6]
-    for columns in ("lat,lon,alt", "/fix/latitude,/fix/longitude,/fix/altitude"):
+    for columns in ("lat,lon,alt", "lat,lon,h", "/fix/latitude,/fix/longitude,/fix/altitude"):
         path.write_text(
             "\n".join([f"{names},{columns}", *(f"{CLOCKS[names](k, t)},49,8.5,{k}" for k, t in enumerate(STAMPS))])
         )
@@ -68,6 +68,8 @@ def test_stamps_files_have_the_time_of_the_table(names: str, more: str, tmp_path
         lambda k, t: f"{t // 10**9} {t % 10**9} scan_{k}.pcd",
         lambda k, t: f"{k} {t // 10**9}.{t % 10**9:09d}",
         lambda k, t: f"{k},{t}",
+        lambda k, t: f"scan_{k}.pcd,{t}",
+        lambda k, t: f"scan_{k}.pcd {t // 10**9} {t % 10**9}",
         lambda k, t: f"{k} {t // 10**9} {t % 10**9}",
         lambda k, t: f"{t // 10**9}.{t % 10**9:09d} {k}",
         lambda k, t: f"{np.datetime64(t, 'ns')}Z {k}",

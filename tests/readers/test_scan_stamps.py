@@ -42,6 +42,10 @@ NAMES = {
     "ISO 8601": (lambda ns: iso(ns, "%Y-%m-%dT%H:%M:%S."), 1, "dates, UTC"),
     "ISO 8601, basic, to the millisecond": (lambda ns: iso(ns, "%Y%m%dT%H%M%S.")[:19] + "Z", 10**6, "dates, UTC"),
     "a date with hyphens for colons": (lambda ns: "pc_" + iso(ns, "%Y-%m-%d-%H-%M-%S-"), 1, "dates, UTC"),
+    "seconds and decimals since the sensor started": (
+        lambda ns: f"{(ns - START_NS) // 10**8 / 10:.1f}", 10**8, "began elsewhere",
+    ),
+    "nanoseconds that would be milliseconds since 1970": (lambda ns: f"{ns - START_NS + 10**12}", 1, "began elsewhere"),
     "microseconds since the sensor started": (lambda ns: f"{(ns - START_NS) // 1000:012d}", 1_000, "began elsewhere"),
 }  # fmt: skip
 
@@ -54,6 +58,7 @@ def test_stamps_in_file_names_of_any_form(form: str, tmp_path: Path) -> None:
         path.rename(folder / f"{name(stamp)}.bin")
     s = open_sequence(folder)
     began = START_NS if "elsewhere" in words else 0
+    began -= 10**12 if "would be" in form else 0
     np.testing.assert_array_equal(s.stamps_ns, (STAMPS - began) // resolution * resolution)
     assert [n for n in s.notes if "scan stamps from the file names" in n and words in n], s.notes
     assert not s.problems
@@ -76,6 +81,8 @@ def test_the_number_of_a_scan_is_no_stamp() -> None:
         [f"{k * 100:010d}" for k in range(20)],
         [f"1670403902_{k:06d}" for k in range(20)],
         [f"map_{k}.{k}" for k in range(20)],
+        [f"tile_{k // 4}.{k % 4}" for k in range(20)],
+        [f"scan_{k}.2022" for k in range(20)],
     ):
         found = stamps_in_names([Path(f"{name}.pcd") for name in names])
         assert found is None or found.stamps_ns is None, names
