@@ -54,7 +54,7 @@ HOMES = {
     "gpxpy": ["formats/gpx_files.py"],
     "dask": ["studies/cluster.py"],
     "distributed": ["studies/cluster.py"],
-    "pyarrow": ["formats/study_files.py"],
+    "pyarrow": ["studies/results_csv.py"],
     "numba": ["kernels/"],
     "matplotlib": ["reports/"],
 }

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from pages import Page, page
 
-from lslam.formats.imu_states_csv import imu_states_text
-from lslam.formats.manual_files import write_control
-from lslam.formats.run_tables import timing_text, write_loops, write_osm_matches
+from lslam.backend.manual_files import write_control
 from lslam.pipeline.merged_folder import COLUMNS
 from lslam.pipeline.outputs import write_localization, write_scans
 from lslam.pipeline.run_folder import OURS
+from lslam.pipeline.run_tables import imu_states_text, timing_text, write_loops, write_osm_matches
 from lslam.types.building import KeyframeMatch, OsmMatches
 
 SECTION = page("docs/conventions.md").text.split("\n## Tables of a run\n")[1].split("\n## ")[0]

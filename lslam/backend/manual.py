@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import require_crs
+from lslam.backend.manual_files import read_control_points, read_named_pairs
 from lslam.config import Config
 from lslam.errors import InputError
-from lslam.formats.manual_files import read_control_points, read_named_pairs
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.georeference import to_wgs84
 from lslam.readers.selection import Selection

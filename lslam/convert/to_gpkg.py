@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from lslam.convert.on_earth import georeference_beside
 from lslam.convert.output import staged
 from lslam.errors import InputError, OutputExistsError, UsageError
-from lslam.formats.geojson import read_corrected
 from lslam.formats.gpkg_files import GeoLayer, write_gpkg
 from lslam.formats.utc_times import utc_of
 from lslam.geometry.geodesy import from_local
 from lslam.maps.georeference import to_lat_lon
+from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
 from lslam.pipeline.run_folder import require_run
 from lslam.types.building import CorrectedMap

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import csv
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.run_tables import read_timing_rows
+from lslam.errors import InputError, cause
 from lslam.remote import as_path
+
+SAVED = "saved_s"
+NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
+# Before the names of what is done after odometry.
+AFTER = "back end: "
+
+
+@dataclass(frozen=True)
+class TimingRows:
+    """The columns of a file of N scans.
+
+    stamps_ns : (N,) int64, None when the file has none; stages : (N,) seconds by name, in the order of the file
+    total : (N,) seconds
+    back_end : (N,) seconds by name, of what was done to a scan after odometry and does not count in `total`
+    """
+
+    stamps_ns: NDArray[np.int64] | None
+    stages: dict[str, NDArray[np.float64]]
+    total: NDArray[np.float64]
+    back_end: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -64,3 +85,49 @@ def summarise(seconds: NDArray[np.float64], whole: float) -> StageTime:
     median, p95 = (float(v) for v in np.percentile(seconds, [50, 95]))
     share = float(seconds.sum()) / whole if whole > 0 else 0.0
     return StageTime(median, p95, float(seconds.max()), float(seconds.mean()), share)
+
+
+def read_timing_rows(path: Path) -> TimingRows:
+    """Read columns `index`, `stamp_ns`, seconds per stage, `total` (their sum when absent).
+
+    Raises InputError naming file and line when it is missing, empty or holds no numbers.
+    """
+    header, values = _table(path)
+    # Others number their rows `scan`; beside an index that is LOAM's stage.
+    others = NOT_STAGES if "index" in header else (*NOT_STAGES, "scan")
+    columns = {name: values[:, k] for k, name in enumerate(header) if name not in others}
+    stages = {name: column for name, column in columns.items() if not name.startswith(AFTER)}
+    later = {name.removeprefix(AFTER): column for name, column in columns.items() if name not in stages}
+    if "total" in header:
+        total = values[:, header.index("total")]
+    elif stages:
+        total = np.sum(list(stages.values()), axis=0)
+    else:
+        raise InputError(f"{path} has neither a column total nor stages: columns are {', '.join(header)}")
+    stamps = values[:, header.index("stamp_ns")].astype(np.int64) if "stamp_ns" in header else None
+    return TimingRows(stamps, stages, total, later)
+
+
+def _table(path: Path) -> tuple[list[str], NDArray[np.float64]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            lines = [
+                (n, row) for n, row in enumerate(csv.reader(stream), start=1) if row and not row[0].startswith("#")
+            ]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"timing {path} cannot be read: {cause(error)}") from None
+    if len(lines) < 2:
+        raise InputError(f"timing {path} holds no scans")
+    header = [name.strip() for name in lines[0][1]]
+    values = []
+    for number, row in lines[1:]:
+        try:
+            values.append([float(cell) if cell.strip() else 0.0 for cell in row])
+        except ValueError:
+            raise InputError(f"timing {path}, line {number}: not a number in {','.join(row)[:60]!r}") from None
+        if len(row) != len(header):
+            raise InputError(f"timing {path}, line {number}: {len(row)} columns, the header has {len(header)}")
+    table = np.array(values)
+    if not np.isfinite(table).all():
+        raise InputError(f"timing {path}: NaN or infinity")
+    return header, table

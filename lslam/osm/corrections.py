@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.osm import OsmConfig
-from lslam.formats.geojson import write_corrected
-from lslam.formats.osm_corrections import corrected_osm
 from lslam.formats.osm_files import OsmData, write_osm
 from lslam.geometry import se2
 from lslam.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
 from lslam.kernels import wall_matching
+from lslam.osm.buildings_geojson import write_corrected
+from lslam.osm.corrected_elements import corrected_osm
 from lslam.osm.overlap import Untangled, remove_overlaps
 from lslam.osm.wall_match import LIKENESS
 from lslam.osm.walls import walls_of

@@ -16,13 +16,12 @@ from lslam.backend import added_drift
 from lslam.backend.held_first import doubts, where_held
 from lslam.backend.levelling import find_level, level_results
 from lslam.backend.manual import KeyframePairs, keyframe_pairs
+from lslam.backend.manual_files import write_control
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config
 from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
-from lslam.formats.manual_files import write_control
-from lslam.formats.run_tables import write_loops, write_osm_matches
 from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
 from lslam.frontend.checkpoints import Checkpoints
@@ -34,6 +33,7 @@ from lslam.osm.hold import hold_by_buildings
 from lslam.osm.source import OsmSource
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.run_tables import write_loops, write_osm_matches
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference

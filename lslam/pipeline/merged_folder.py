@@ -16,7 +16,6 @@ from lslam.config import Config
 from lslam.errors import InputError, InterruptedRunError, LslamError, OutputError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.g2o import write_g2o
-from lslam.formats.run_tables import write_loops
 from lslam.formats.trajectory_files import write_tum
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead, to_trajectory
@@ -29,6 +28,7 @@ from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
 from lslam.pipeline.outputs import config_text
 from lslam.pipeline.rebuild import EarlierRun, open_scans
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
+from lslam.pipeline.run_tables import write_loops
 from lslam.pipeline.watch import Watch
 from lslam.reports.merge_html import SessionView, write_page
 from lslam.types.gnss import Georeference

@@ -11,9 +11,7 @@ import numpy as np
 from lslam.config import Config, to_toml
 from lslam.config.map import MapConfig
 from lslam.evaluation.evaluate import Evaluation
-from lslam.formats.imu_states_csv import imu_states_text
 from lslam.formats.ply_files import write_ply
-from lslam.formats.run_tables import timing_text
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.pipeline import map_files
@@ -21,6 +19,7 @@ from lslam.pipeline.feature_pass import FeatureCloud
 from lslam.pipeline.map_files import LOCAL, MapNote
 from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
+from lslam.pipeline.run_tables import imu_states_text, timing_text
 from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix
 from lslam.types.run_record import RunRecord

@@ -9,10 +9,10 @@ from typing import Any
 from lslam.errors import UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.atomic import atomic_write
-from lslam.formats.geojson import read_corrected
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
+from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.feature_pass import view_features
 from lslam.pipeline.job import choose_scans
 from lslam.pipeline.rebuild import is_gone, read_run, results_of, viewed_run

@@ -17,10 +17,10 @@ from lslam.errors import InputError
 from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.timing import Timing, read_timing
 from lslam.extras import install_command
-from lslam.formats.study_files import read_study_csv, write_study_csv, write_study_parquet
 from lslam.remote import RemotePath
 from lslam.reports.compare_table import HEALTH
 from lslam.studies.grid import Job
+from lslam.studies.results_csv import read_study_csv, write_study_csv, write_study_parquet
 from lslam.studies.states import FINAL, State, read_state
 from lslam.studies.variants import Variant
 from lslam.types.comparison import Group, Metric, RunScore

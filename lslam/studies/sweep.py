@@ -10,13 +10,13 @@ from pathlib import Path
 from lslam.config.finding import ExpectedFinding
 from lslam.config.study import StudyConfig, read_study
 from lslam.errors import InputError, RunFailedError
-from lslam.formats.study_files import read_study_csv
 from lslam.printable import toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
 from lslam.studies.jobs import Engine
 from lslam.studies.output import STUDY, OutputOptions
 from lslam.studies.results import RESULTS
+from lslam.studies.results_csv import read_study_csv
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
 from lslam.types.sensitivity import StudyResult

@@ -33,11 +33,11 @@ from lslam.config import Config
 from lslam.config.load import load_config
 from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.evaluation.thesis import planar
-from lslam.formats.geojson import read_corrected
+from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.run_tables import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2
+from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.studies.scenes import Scene, simulate_once

@@ -16,9 +16,9 @@ from calling import COMMAND, Done, assert_one_sentence, environment, lslam, samp
 from lslam.cli.batch import _line, command
 from lslam.config.study import BatchConfig, read_batch
 from lslam.errors import ConfigError, LslamError, OutputExistsError
-from lslam.formats.study_files import read_study_csv
 from lslam.studies.batch import expand_batch, run_words
 from lslam.studies.output import OutputOptions
+from lslam.studies.results_csv import read_study_csv
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 

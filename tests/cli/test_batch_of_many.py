@@ -12,7 +12,7 @@ import pytest
 from calling import Done, lslam, sample_copy
 
 from lslam.errors import InputError
-from lslam.formats.study_files import read_study_csv
+from lslam.studies.results_csv import read_study_csv
 from lslam.studies.subjects import unique_labels
 
 pytestmark = pytest.mark.usefixtures("forked_runs")

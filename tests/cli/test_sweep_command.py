@@ -14,7 +14,7 @@ from calling import COMMAND, assert_one_sentence, environment, lslam
 
 from lslam.cli.sweep import command
 from lslam.errors import LslamError
-from lslam.formats.study_files import read_study_csv
+from lslam.studies.results_csv import read_study_csv
 from lslam.types.study import StudyRow
 
 pytestmark = pytest.mark.usefixtures("forked_runs")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from calling import assert_one_sentence, lslam
 
-from lslam.formats.study_files import write_study_csv
+from lslam.studies.results_csv import write_study_csv
 from lslam.types.study import StudyRow
 
 STUDY = """

@@ -10,6 +10,7 @@ import numpy as np
 from formats.osm_builders import ExtractMaker
 from fuzz.cases import Files, Parser
 
+from lslam.backend.manual_files import read_control_points, read_named_pairs
 from lslam.config import load_config
 from lslam.config.load import to_toml
 from lslam.config.study import read_batch, read_study
@@ -17,17 +18,16 @@ from lslam.errors import LslamError
 from lslam.evaluation.timing import read_timing
 from lslam.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
 from lslam.formats.g2o import read_g2o
-from lslam.formats.geojson import read_corrected, read_line
-from lslam.formats.manual_files import read_control_points, read_named_pairs
+from lslam.formats.geojson import read_line
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
 from lslam.formats.sequence_toml import read_sequence_toml
 from lslam.formats.stamp_files import read_stamps
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.formats.state_files import read_state, write_state
-from lslam.formats.study_files import read_study_csv, write_study_csv
 from lslam.formats.trajectory_files import read_times, read_trajectory
 from lslam.osm.bounds import Bounds
+from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
@@ -36,6 +36,7 @@ from lslam.simulation.record import read_mark
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.waypoints import read_way_points
 from lslam.studies import states
+from lslam.studies.results_csv import read_study_csv, write_study_csv
 from lslam.types.study import StudyRow
 from lslam.version import __version__
 

@@ -16,13 +16,13 @@ import lslam
 from lslam.config import Config
 from lslam.config.load import load_config
 from lslam.evaluation.buildings import BuildingError, building_errors
-from lslam.formats.geojson import read_corrected
+from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.osm_buildings import buildings_of, read_buildings
 from lslam.formats.osm_files import read_osm
-from lslam.formats.run_tables import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2, se3
 from lslam.osm import location
+from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.types.building import CorrectedMap, KeyframeMatch

@@ -18,7 +18,7 @@ from lslam.config import Config, load_config
 from lslam.doctor.examine_turns import examine_turns
 from lslam.doctor.findings import Finding
 from lslam.errors import GateError, InputError
-from lslam.formats.run_tables import read_timing_rows
+from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend import inertial_start
 from lslam.frontend.inertial_start import _first_heard_ns, begin_inertial, close_inertial, first_poses

@@ -11,7 +11,6 @@ from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
 from lslam.config.study import BatchConfig, parse_batch
-from lslam.formats.study_files import read_study_csv
 from lslam.pipeline.storage import spool_of
 from lslam.remote import RemotePath
 from lslam.studies.batch import expand_batch, expand_lines, listed_line
@@ -19,6 +18,7 @@ from lslam.studies.cluster import connected
 from lslam.studies.expanded_study import make_runs
 from lslam.studies.jobs import finished, said_file
 from lslam.studies.output import OutputOptions
+from lslam.studies.results_csv import read_study_csv
 from lslam.studies.states import read_state
 from lslam.types.study import StudyRow
 

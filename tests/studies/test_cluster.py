@@ -17,11 +17,11 @@ from distributed import LocalCluster
 from lslam.cli.options import engine_of
 from lslam.config.study import parse_study
 from lslam.errors import InputError, RunFailedError, UsageError
-from lslam.formats.study_files import read_study_csv
 from lslam.studies import cluster
 from lslam.studies.cluster import Cluster, connected, pack, unpack
 from lslam.studies.grid import Job
 from lslam.studies.output import OutputOptions
+from lslam.studies.results_csv import read_study_csv
 from lslam.studies.runner import StudyProgress
 from lslam.studies.states import State, read_state, write_state
 from lslam.studies.sweep import Sweep, expand_study, run_sweep

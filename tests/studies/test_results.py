@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from lslam.config import Config
-from lslam.formats.study_files import read_study_csv
 from lslam.studies import results
 from lslam.studies.grid import Job
 from lslam.studies.results import Results
+from lslam.studies.results_csv import read_study_csv
 from lslam.studies.variants import Variant
 
 

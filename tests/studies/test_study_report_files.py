@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lslam.config.finding import ExpectedFinding
-from lslam.formats.study_files import read_study_csv, write_study_csv
+from lslam.studies.results_csv import read_study_csv, write_study_csv
 from lslam.studies.sweep import report_folder, write_study_report
 from lslam.types.study import StudyRow
 

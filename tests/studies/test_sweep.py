@@ -15,12 +15,12 @@ import pytest
 
 from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
-from lslam.formats.study_files import VERSION, read_study_csv
 from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded_study import ExpandedStudy
 from lslam.studies.jobs import Local
 from lslam.studies.output import OutputOptions
 from lslam.studies.results import is_comparable
+from lslam.studies.results_csv import VERSION, read_study_csv
 from lslam.studies.runner import StudyProgress
 from lslam.studies.states import State, read_state
 from lslam.studies.study_files import find_study

@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 
 from lslam.config import load_config
-from lslam.formats.study_files import read_study_csv
 from lslam.odometry.icp import Icp
 from lslam.pipeline import job as prepared
 from lslam.studies import worker
 from lslam.studies.grid import Job
 from lslam.studies.results import Results
+from lslam.studies.results_csv import read_study_csv
 from lslam.studies.runner import Task, WorkerPool, run_tasks
 from lslam.studies.states import read_state
 from lslam.studies.variants import Variant

@@ -7,7 +7,7 @@ import io
 
 import numpy as np
 
-from lslam.formats.imu_states_csv import imu_states_text
+from lslam.pipeline.run_tables import imu_states_text
 from lslam.types.imu_state import IMU_STATES, ImuState
 from lslam.types.scan_result import ScanResult
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lslam.backend.manual_files import read_control_points, read_named_pairs
 from lslam.errors import InputError
-from lslam.formats.manual_files import read_control_points, read_named_pairs
 
 PAIRS = "scan_a,scan_b,verdict\n"
 POINTS = "scan,x,y,z,sigma,crs\n"

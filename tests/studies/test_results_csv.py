@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lslam.errors import InputError
-from lslam.formats.study_files import read_study_csv, write_study_csv
+from lslam.studies.results_csv import read_study_csv, write_study_csv
 from lslam.types.study import StudyRow, Value
 
 DONE = StudyRow(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pyarrow import parquet
 
-from lslam.formats.study_files import write_study_parquet
+from lslam.studies.results_csv import write_study_parquet
 from lslam.types.study import StudyRow
 
 

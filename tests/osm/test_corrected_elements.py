@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from defusedxml import ElementTree
+from formats.osm_builders import ORIGIN, ExtractMaker, square_at
 from numpy.typing import NDArray
-from osm_builders import ORIGIN, ExtractMaker, square_at
 
 from lslam.errors import InputError
 from lslam.formats.osm_buildings import buildings_of
-from lslam.formats.osm_corrections import corrected_osm
 from lslam.formats.osm_files import ATTRIBUTION, Member, OsmData, Way, from_overpass, read_osm, write_osm
+from lslam.osm.corrected_elements import corrected_osm
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap
 
 Floats = NDArray[np.float64]
