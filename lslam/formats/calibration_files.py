@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError, cause
+from lslam.errors import InputError, LslamError, UsageError, cause
 from lslam.geometry import se3, so3
 from lslam.remote import as_path
 from lslam.untrusted import is_file
@@ -23,12 +23,7 @@ def read_odometry_calib(path: str | Path) -> Floats | None:
 
     Raises InputError when the file is missing, is no calibration, or states numbers that are no rigid transform.
     """
-    path = as_path(path)
-    entries = read_entries(path)
-    name = next((name for name in LIDAR_TO_CAMERA if name in entries), None)
-    if name is None:
-        return None
-    return _rigid(np.reshape(_entry(path, entries, name, 12), (3, 4)), path, name)
+    return _tr(as_path(path), read_entries(as_path(path)))
 
 
 def read_rigid(path: str | Path) -> Floats:
@@ -39,7 +34,7 @@ def read_rigid(path: str | Path) -> Floats:
     path = as_path(path)
     entries = read_entries(path)
     R, t = _entry(path, entries, "R", 9), _entry(path, entries, "T", 3)
-    return _rigid(np.column_stack([np.reshape(R, (3, 3)), t]), path, "R")
+    return _rigid(R.reshape(3, 3), t, path, "R")
 
 
 def read_rectification(path: str | Path) -> Floats | None:
@@ -48,15 +43,13 @@ def read_rectification(path: str | Path) -> Floats | None:
     entries = read_entries(path)
     if "R_rect_00" not in entries:
         return None
-    R = np.reshape(_entry(path, entries, "R_rect_00", 9), (3, 3))
-    return _rigid(np.column_stack([R, np.zeros(3)]), path, "R_rect_00")
+    return _rigid(_entry(path, entries, "R_rect_00", 9).reshape(3, 3), np.zeros(3), path, "R_rect_00")
 
 
 def read_raw_cam0_lidar(folder: str | Path) -> Floats:
     """`T_cam0_lidar` (4, 4) of a raw day, in the rectified camera 0 when `calib_cam_to_cam.txt` is there."""
-    folder = as_path(folder)
-    T = read_rigid(folder / "calib_velo_to_cam.txt")
-    cameras = folder / "calib_cam_to_cam.txt"
+    T = read_rigid(as_path(folder) / "calib_velo_to_cam.txt")
+    cameras = as_path(folder) / "calib_cam_to_cam.txt"
     rectification = read_rectification(cameras) if cameras.is_file() else None
     return T if rectification is None else np.asarray(rectification @ T)
 
@@ -74,7 +67,7 @@ def read_cam0_lidar(path: str | Path) -> Floats:
         if "imu" in path.name:
             raise InputError(f"{path} is the extrinsics of the IMU: --calib needs calib_velo_to_cam.txt or calib.txt")
         return read_raw_cam0_lidar(path.parent) if path.name == "calib_velo_to_cam.txt" else read_rigid(path)
-    T = read_odometry_calib(path)
+    T = _tr(path, entries)
     if T is None:
         raise InputError(f"{path} has no Tr (LiDAR to camera 0): entries are {', '.join(entries)}")
     return T
@@ -103,27 +96,33 @@ def read_entries(path: Path) -> dict[str, str]:
     return entries
 
 
-def _entry(path: Path, entries: dict[str, str], name: str, count: int) -> list[float]:
+def _tr(path: Path, entries: dict[str, str]) -> Floats | None:
+    for name in LIDAR_TO_CAMERA:
+        if name in entries:
+            rows = _entry(path, entries, name, 12).reshape(3, 4)
+            return _rigid(rows[:, :3], rows[:, 3], path, name)
+    return None
+
+
+def _entry(path: Path, entries: dict[str, str], name: str, count: int) -> Floats:
     if name not in entries:
         raise InputError(f"calibration {path} has no entry {name}: entries are {', '.join(entries)}")
-    try:
-        values = [float(v) for v in entries[name].split()]
-    except ValueError:
-        raise InputError(f"calibration {path}: {name} holds something that is no number") from None
+    values = _numbers(entries[name].split())
+    if values is None:
+        raise InputError(f"calibration {path}: {name} holds something that is no number")
     if len(values) != count or not np.isfinite(values).all():
         raise InputError(f"calibration {path}: {name} has {len(values)} numbers, {count} finite ones expected")
-    return values
+    return np.array(values)
 
 
-def _rigid(upper: Floats, path: Path, name: str) -> Floats:
+def _rigid(R: Floats, t: Floats, path: Path, name: str) -> Floats:
     """(4, 4) with the rotation put back on SO(3): seven printed digits are not enough for `R^T` to be the inverse."""
-    R = upper[:, :3]
     if not so3.is_rotation(R, 1e-2):
         raise InputError(f"calibration {path}: {name} holds no rotation")
-    return se3.normalise(se3.make(R, upper[:, 3]))
+    return se3.normalise(se3.make(R, t))
 
 
-def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> NDArray[np.float64] | None:
+def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> Floats | None:
     """(4, 4) T_body_sensor of `sensor`, None when the file does not name it.
 
     Raises InputError naming file and line when the block below the name is not a rigid 4x4 `T`.
@@ -135,15 +134,10 @@ def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> NDArray[np.flo
     begin = next((k for k, line in enumerate(lines) if line.strip() == f"{sensor}:"), None)
     if begin is None:
         return None
-    rows: list[list[float]] = []
-    if lines[begin + 1 : begin + 2] and lines[begin + 1].strip() == "T:":
-        for line in lines[begin + 2 : begin + 6]:
-            match = _ROW.search(line)
-            try:
-                rows.append([float(w) for w in match.group(1).split(",")] if match else [])
-            except ValueError:
-                rows.append([])
-    if len(rows) != 4 or any(len(row) != 4 for row in rows):
+    has_matrix = [line.strip() for line in lines[begin + 1 : begin + 2]] == ["T:"]
+    matches = [_ROW.search(line) for line in lines[begin + 2 : begin + 6]] if has_matrix else []
+    rows = [_numbers(match[1].split(",")) or [] for match in matches if match]
+    if [len(row) for row in rows] != [4] * 4:
         raise InputError(f"{path}, line {begin + 1}: {sensor} is not followed by 'T:' and four rows of four numbers")
     T = np.array(rows)
     if not so3.is_rotation(T[:3, :3], 1e-3) or not np.isfinite(T).all():
@@ -157,43 +151,44 @@ def read_transform(text: str) -> Floats:
     Numbers are separated by commas or spaces. A file may also be KITTI's `R:`/`T:` kind or one line `Tr: ...`.
     Raises UsageError for text that is neither numbers nor a file, InputError for a file that holds no transform.
     """
-    values = _numbers_in(text)
-    if values is not None:
+    source = f"transform {text!r}"
+    refusal: type[LslamError] = UsageError
+    values = _numbers(_words(text))
+    if not values:
+        path = Path(text)
+        if not is_file(path):
+            raise UsageError(f"transform {text!r} is neither numbers nor a file that exists")
         try:
-            return _transform(values)
-        except ValueError as error:
-            raise UsageError(f"transform {text!r}: {error}") from None
-    path = Path(text)
-    if not is_file(path):
-        raise UsageError(f"transform {text!r} is neither numbers nor a file that exists")
-    return _read_file(path)
-
-
-def _read_file(path: Path) -> Floats:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (UnicodeDecodeError, OSError):
-        raise InputError(f"{path} cannot be read as text: a transform of 12, 16 or 7 numbers is expected") from None
-    content = "\n".join(line for line in lines if not line.lstrip().startswith("#"))
-    values = _numbers_in(content)
-    if values is None:
-        entries = read_entries(path)
-        if "R" in entries and "T" in entries:
-            return read_rigid(path)
-        T = read_odometry_calib(path)
-        if T is None:
-            raise InputError(f"{path} holds no transform: 12, 16 or 7 numbers are expected")
-        return T
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except (UnicodeDecodeError, OSError):
+            raise InputError(f"{path} cannot be read as text: a transform of 12, 16 or 7 numbers is expected") from None
+        values = _numbers(_words("\n".join(line for line in lines if not line.lstrip().startswith("#"))))
+        if not values:
+            return _named(path)
+        source, refusal = str(path), InputError
     try:
         return _transform(values)
     except ValueError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise refusal(f"{source}: {error}") from None
 
 
-def _numbers_in(text: str) -> list[float] | None:
-    fields = [f for f in re.split(r"[,;\s\[\]]+", text) if f]
+def _named(path: Path) -> Floats:
+    """The transform of a file of named entries."""
+    entries = read_entries(path)
+    T = read_rigid(path) if "R" in entries and "T" in entries else _tr(path, entries)
+    if T is None:
+        raise InputError(f"{path} holds no transform: 12, 16 or 7 numbers are expected")
+    return T
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[^,;\s\[\]]+", text)
+
+
+def _numbers(words: list[str]) -> list[float] | None:
+    """None where one of them is no number."""
     try:
-        return [float(f) for f in fields] or None
+        return [float(word) for word in words]
     except ValueError:
         return None
 

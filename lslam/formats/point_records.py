@@ -96,15 +96,6 @@ def parse_record(text: str) -> PointRecord:
 KITTI = parse_record("x y z intensity")
 
 
-def is_record(value: Any) -> bool:
-    """Whether `value` is text that states a record."""
-    try:
-        parse_record(value)
-    except (AttributeError, TypeError, ValueError):
-        return False
-    return True
-
-
 @dataclass(frozen=True)
 class Recognition:
     """What the bytes of files are.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, nearest
 from lslam.formats.atomic import write_text
-from lslam.formats.point_records import is_record
+from lslam.formats.point_records import parse_record
 from lslam.geometry import so3
 from lslam.printable import toml_text
 from lslam.untrusted import parse_toml
@@ -28,6 +28,44 @@ FRAMES = ("lidar", "cam0", "imu")
 EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
 
 Matrix = NDArray[np.float64]
+
+
+def is_rate(rate_hz: float) -> bool:
+    """Whether it can be a sensor's: stamps are made of it."""
+    return 1e-3 < rate_hz < 1e6
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _is_record(value: Any) -> bool:
+    try:
+        return isinstance(value, str) and bool(parse_record(value))
+    except ValueError:
+        return False
+
+
+def _key(is_valid: Callable[[Any], bool], expected: str) -> Any:
+    """A key and what its values are."""
+    return field(default=None, metadata={"is_valid": is_valid, "expected": expected})
+
+
+def _text(expected: str) -> Any:
+    return _key(_is_text, expected)
+
+
+def _count() -> Any:
+    return _key(lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0, "a whole number above 0")
+
+
+def _one_of(choices: Iterable[str]) -> Any:
+    names = list(choices)
+    return _key(lambda v: v in names, f"one of {', '.join(names)}")
 
 
 @dataclass(frozen=True)
@@ -52,30 +90,34 @@ class SequenceInfo:
     lidars : further LiDARs and where they sit, T_lidar_other (4, 4) by folder, or by frame or topic of a bag
     """
 
-    name: str | None = None
-    sensor: str | None = None
-    rings: int | None = None
-    rows: int | None = None
-    cols: int | None = None
-    rate_hz: float | None = None
-    motion_compensated: bool | None = None
-    compensated_to: str | None = None
-    vertical_correction_deg: float | None = None
-    per_point: str | None = None
-    point_time_unit: str | None = None
-    point_time_reference: str | None = None
-    bin_record: str | None = None
-    point_unit: str | None = None
-    point_times: str | None = None
-    stamps: str | None = None
-    imu: str | None = None
-    gnss: str | None = None
-    ground_truth: str | None = None
-    ground_truth_frame: str | None = None
-    lidar_topic: str | None = None
-    lidar_frame: str | None = None
-    imu_topic: str | None = None
-    gnss_topic: str | None = None
+    name: str | None = _text("text")
+    sensor: str | None = _text("text, for example HDL-64E")
+    rings: int | None = _count()
+    rows: int | None = _count()
+    cols: int | None = _count()
+    rate_hz: float | None = _key(
+        lambda v: _is_number(v) and is_rate(v), "a number above 0.001 and below a million, scans per second"
+    )
+    motion_compensated: bool | None = _key(lambda v: isinstance(v, bool), "true or false")
+    compensated_to: str | None = _one_of(INSTANTS)
+    vertical_correction_deg: float | None = _key(_is_number, "a number, degrees")
+    per_point: str | None = _text("a folder")
+    point_time_unit: str | None = _one_of(UNITS)
+    point_time_reference: str | None = _one_of(REFERENCES)
+    bin_record: str | None = _key(
+        _is_record, 'columns like "x y z intensity ring:u2 time:f8", float32 where no type is named'
+    )
+    point_unit: str | None = _one_of(LENGTHS)
+    point_times: str | None = _one_of(POINT_TIMES)
+    stamps: str | None = _text("a file")
+    imu: str | None = _text("a file")
+    gnss: str | None = _text("a file")
+    ground_truth: str | None = _text("a file")
+    ground_truth_frame: str | None = _one_of(FRAMES)
+    lidar_topic: str | None = _text("a topic")
+    lidar_frame: str | None = _text("a frame, or all")
+    imu_topic: str | None = _text("a topic")
+    gnss_topic: str | None = _text("a topic")
     T_cam0_lidar: Matrix | None = None
     T_lidar_imu: Matrix | None = None
     T_lidar_gnss: Matrix | None = None
@@ -113,9 +155,11 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
             raise InputError(f"{path}: {key} is a table, write [{key}] and below it {row}")
     values: dict[str, Any] = {}
     for key, value in tree.items():
-        if key not in _CHECKS:
-            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_CHECKS, 'extrinsics', 'lidars'])}")
-        values[key] = _checked(path, key, value)
+        if key not in _KEYS:
+            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_KEYS, 'extrinsics', 'lidars'])}")
+        if not _KEYS[key]["is_valid"](value):
+            raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['expected']}")
+        values[key] = float(value) if key in ("rate_hz", "vertical_correction_deg") else value
     for key, value in extrinsics.items():
         if key not in EXTRINSICS:
             raise InputError(f"{path}: unknown key extrinsics.{key}; {nearest(key, EXTRINSICS)}")
@@ -142,51 +186,7 @@ def sequence_toml_text(info: SequenceInfo) -> str:
     return toml_text({key: value for key, value in tree.items() if value is not None})
 
 
-def is_rate(rate_hz: float) -> bool:
-    """Whether it can be a sensor's: stamps are made of it."""
-    return 1e-3 < rate_hz < 1e6
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip())
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
-_CHECKS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "name": (_is_text, "text"),
-    "sensor": (_is_text, "text, for example HDL-64E"),
-    "rings": (_is_count, "a whole number above 0"),
-    "rows": (_is_count, "a whole number above 0"),
-    "cols": (_is_count, "a whole number above 0"),
-    "rate_hz": (lambda v: _is_number(v) and is_rate(v), "a number above 0.001 and below a million, scans per second"),
-    "motion_compensated": (lambda v: isinstance(v, bool), "true or false"),
-    "compensated_to": (lambda v: v in INSTANTS, "one of " + ", ".join(INSTANTS)),
-    "vertical_correction_deg": (_is_number, "a number, degrees"),
-    "per_point": (_is_text, "a folder"),
-    "point_time_unit": (lambda v: v in UNITS, "one of " + ", ".join(UNITS)),
-    "point_time_reference": (lambda v: v in REFERENCES, "one of " + ", ".join(REFERENCES)),
-    "bin_record": (is_record, 'columns like "x y z intensity ring:u2 time:f8", float32 where no type is named'),
-    "point_unit": (lambda v: v in (*LENGTHS,), "one of " + ", ".join(LENGTHS)),
-    "point_times": (lambda v: v in POINT_TIMES, "one of " + ", ".join(POINT_TIMES)),
-    **dict.fromkeys(("stamps", "imu", "gnss", "ground_truth"), (_is_text, "a file")),
-    **dict.fromkeys(("lidar_topic", "imu_topic", "gnss_topic"), (_is_text, "a topic")),
-    "lidar_frame": (_is_text, "a frame, or all"),
-    "ground_truth_frame": (lambda v: v in FRAMES, "one of " + ", ".join(FRAMES)),
-}
-
-
-def _checked(path: Path | str, key: str, value: Any) -> Any:
-    check, expected = _CHECKS[key]
-    if not check(value):
-        raise InputError(f"{path}: {key} = {value!r}, expected {expected}")
-    return float(value) if key in ("rate_hz", "vertical_correction_deg") else value
+_KEYS = {f.name: f.metadata for f in fields(SequenceInfo) if f.metadata}
 
 
 def _transform(path: Path | str, key: str, value: Any) -> Matrix:

@@ -39,13 +39,14 @@ from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_clock import PointClock, open_clock, read_samples
 from lslam.readers.point_stamps import onto_recording, point_stamps, points_off, step_against
-from lslam.readers.point_times import Sample, TimeRule
+from lslam.readers.point_times import Sample
 from lslam.readers.point_units import in_metres, settle_unit
+from lslam.readers.sequence_on_disk import SequenceOnDisk
 from lslam.readers.sidecars import compensation_note, stated_times
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans, Sequence, StatedTimes, no_shared_time
+from lslam.types.sequence import Calibration, Sequence, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
@@ -56,58 +57,27 @@ CAMERA = "cam0"
 _TRUTH = re.compile(r"(^|[/_])(ground_?truth|gt)([/_]|$)", re.IGNORECASE)
 
 
-@dataclass
-class BagSequence(Scans):
-    """A `Sequence` over a bag. See `lslam.types.sequence` for the attributes every sequence has.
+@dataclass(kw_only=True)
+class BagSequence(SequenceOnDisk):
+    """A recording in a bag.
 
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
     clock : how per-point times are read, None when there are none or they are not to be used
-    has_assumed_extrinsics : nothing says where the IMU sits, the identity stands in
     uses : what each topic that is used is used for; halves : further messages of a scan
     revolutions : of packets, which then are read in place of messages; unit_m : of coordinates, None where nobody states it
     """
 
-    name: str
-    path: Path
     bag: Bag
     topic: BagTopic
     messages: NDArray[np.int64]
     headers_ns: NDArray[np.int64]
-    stamps_ns: NDArray[np.int64]
-    rate_hz: float
-    kind: str = KIND
-    motion_compensated: bool | None = None
-    calibration: Calibration = field(default_factory=Calibration)
-    ground_truth: Trajectory | None = None
-    imu: ImuStream | None = None
-    gnss: GnssStream | None = None
-    notes: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
     clock: PointClock | None = None
-    stated_times: StatedTimes = field(default_factory=StatedTimes)
-    rings: int | None = None
-    sensor: str | None = None
-    has_assumed_extrinsics: bool = False
     uses: dict[str, str] = field(default_factory=dict)
     halves: Halves = field(default_factory=dict)
     revolutions: Revolutions | None = None
     unit_m: float | None = None
 
-    def __len__(self) -> int:
-        return len(self.messages)
-
-    @property
-    def time_rule(self) -> TimeRule | None:
-        """How per-point times are meant; None where `clock` is."""
-        return None if self.clock is None else self.clock.rule
-
-    def scan(self, index: int) -> Scan:
-        """Read scan `index`; a cloud without points gives an empty scan.
-
-        Raises InputError naming bag, topic and message when it is damaged, IndexError beyond the end.
-        """
-        if not 0 <= index < len(self.messages):
-            raise IndexError(f"scan {index} of {len(self.messages)}")
+    def _read(self, index: int) -> Scan:
         if self.revolutions is not None:
             return read_scan(self.revolutions, index, not self.motion_compensated)
         stamp = int(self.headers_ns[index])
@@ -222,11 +192,11 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
 def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceInfo, voice: Voice) -> BagSequence:
     """The scans of one LiDAR, of packets that are `opened` or of messages, without what rides along."""
     sequence = BagSequence(
-        info.name or printable(stem_of(bag.path)), bag.path, bag, index.topic, index.messages, index.stamps_ns, index.stamps_ns,
-        info.rate_hz or (measured_rate(index.stamps_ns) if opened is None else opened.rate_hz),
+        name=info.name or printable(stem_of(bag.path)), path=bag.path, kind=KIND, bag=bag, topic=index.topic,
+        messages=index.messages, headers_ns=index.stamps_ns, stamps_ns=index.stamps_ns,
+        rate_hz=info.rate_hz or (measured_rate(index.stamps_ns) if opened is None else opened.rate_hz),
         motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
-        notes=voice.notes, problems=voice.problems, halves=index.halves,
-        stated_times=stated_times(info),
+        notes=voice.notes, problems=voice.problems, halves=index.halves, stated_times=stated_times(info),
         unit_m=LENGTHS.get(info.point_unit or ""),
     )  # fmt: skip
     if opened is not None:

@@ -1,10 +1,12 @@
-"""A sequence whose scans are files of one folder: what all folder readers give."""
+"""Sequences whose scans are files of one folder: what all folder readers give, and how they open one."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,69 +16,47 @@ from lslam.formats.array_headers import HEADERS
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.point_records import KITTI, PointRecord
+from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.formats.state_files import DAMAGE
-from lslam.readers.point_clock import PointClock
-from lslam.readers.point_times import TimeRule, azimuth_times
-from lslam.readers.point_units import in_metres
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
+from lslam.printable import printable
+from lslam.readers.ground_truth import Voice, load_poses
+from lslam.readers.listing import check_stamps
+from lslam.readers.point_clock import PointClock, open_clock, read_samples
+from lslam.readers.point_times import Sample, azimuth_times
+from lslam.readers.point_units import in_metres, settle_unit
+from lslam.readers.scan_records import scan_record
+from lslam.readers.scan_stamps import rows_of_scans
+from lslam.readers.sequence_on_disk import SequenceOnDisk
+from lslam.readers.sidecars import compensation_note, load_gnss, load_imu, per_point_folder, read_info, stated_times
 from lslam.types.scan import Scan, Span
-from lslam.types.sequence import Calibration, Scans, StatedTimes
 from lslam.types.trajectory import Trajectory
 
+Matrix = NDArray[np.float64]
 
-@dataclass
-class FolderSequence(Scans):
-    """A `Sequence` over point files. See `lslam.types.sequence` for the attributes every sequence has.
+
+@dataclass(kw_only=True)
+class FolderSequence(SequenceOnDisk):
+    """A recording of point files.
 
     files : one per scan; correction_deg : rotation of every point about p x z, 0 for none
     rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
     clock : how the files' own per-point times are read, None when they have none or are not to be used
     sweep_s : (N, 2) begin and end of each sweep, s from its stamp, when per-point times follow from the azimuth; else None
     record : of the points, where the files do not name their fields; unit_m : of coordinates, None where nobody states it
-    rings : number of beams, if known; sensor : its name, if known
     """
 
-    name: str
-    path: Path
-    kind: str
     files: list[Path]
-    stamps_ns: NDArray[np.int64]
-    rate_hz: float
-    motion_compensated: bool | None = None
-    calibration: Calibration = field(default_factory=Calibration)
-    ground_truth: Trajectory | None = None
-    imu: ImuStream | None = None
-    gnss: GnssStream | None = None
-    notes: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    stated_times: StatedTimes = field(default_factory=StatedTimes)
     correction_deg: float = 0.0
     rows: int | None = None
     cols: int | None = None
     per_point: Path | None = None
     clock: PointClock | None = None
     sweep_s: NDArray[np.float64] | None = None
-    rings: int | None = None
-    sensor: str | None = None
     record: PointRecord | None = None
     unit_m: float | None = None
 
-    def __len__(self) -> int:
-        return len(self.files)
-
-    @property
-    def time_rule(self) -> TimeRule | None:
-        """How per-point times are meant; None where `clock` is."""
-        return None if self.clock is None else self.clock.rule
-
-    def scan(self, index: int) -> Scan:
-        """Read scan `index`; an empty file gives an empty scan.
-
-        Raises InputError naming the file when it cannot be read or contradicts `sequence.toml`, IndexError beyond the end.
-        """
-        if not 0 <= index < len(self.files):
-            raise IndexError(f"scan {index} of {len(self.files)}")
+    def _read(self, index: int) -> Scan:
+        """Raises InputError naming the file also where it contradicts `sequence.toml`."""
         path = self.files[index]
         stamp = int(self.stamps_ns[index])
         is_kitti = path.suffix.lower() == ".bin" and self.record in (None, KITTI)
@@ -109,6 +89,77 @@ class FolderSequence(Scans):
                 raise InputError(f"{path}: {len(cloud)} points are not {self.rows} rows of {self.cols} columns")
             rings = np.repeat(np.arange(self.rows, dtype=np.uint16), self.cols)
         return replace(cloud, rings=rings), times
+
+
+@dataclass
+class Folder:
+    """A folder of scans while it is opened: its scan files, what is stated about it, and where sentences go.
+
+    has_toml : whether there is a `sequence.toml`; record : of the points, where the files do not name their fields
+    """
+
+    path: Path
+    kind: str
+    files: list[Path]
+    info: SequenceInfo
+    has_toml: bool
+    voice: Voice
+    record: PointRecord | None
+
+    @classmethod
+    def begin(
+        cls, path: Path, kind: str, why: str, overrides: SequenceInfo, scans: tuple[list[Path], list[str]], nothing: str
+    ) -> Folder:
+        """Raises InputError, which says `nothing` where there are no scans, else what is wrong with `sequence.toml` or points."""
+        info, has_toml = read_info(path, overrides)
+        files, left_out = scans
+        if not files:
+            raise InputError(nothing)
+        voice = Voice([f"format {kind}: {why}", *left_out, *compensation_note(info)], [])
+        return cls(path, kind, files, info, has_toml, voice, scan_record(files, info, voice))
+
+    def read(self, file: Path) -> PointCloud:
+        """The points of a scan file."""
+        return read_points(file, self.record)
+
+    def calibration(self, path: Path, read: Callable[[Path], Matrix | None]) -> Matrix | None:
+        """What `read` makes of the file; None, which is a problem, where it cannot be read."""
+        try:
+            return read(path)
+        except InputError as error:
+            self.voice.problems.append(f"calibration is not used: {error}")
+            return None
+
+    def take_rows(self, source: Path, stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+        """Keep the scans that have a row of stamps in `source`; the stamps of these, which increase, and the rate, Hz."""
+        self.files, stamps = rows_of_scans(source, stamps, self.files, self.voice)
+        return check_stamps(stamps, self.info.rate_hz, source, self.voice.problems)
+
+    def clock(self, stamps: NDArray[np.int64], rate_hz: float) -> PointClock | None:
+        """How per-point times of the files are read, learnt on a few scans."""
+        if self.record == KITTI:
+            return None
+        samples = read_samples(len(self.files), lambda k: Sample(self.read(self.files[k]), int(stamps[k])))
+        return open_clock(list(samples.values()), rate_hz, self.info, self.voice.notes, self.voice.problems)
+
+    def truth(self, path: Path | None, stamps: NDArray[np.int64]) -> Trajectory | None:
+        """The poses in a file, of the body that is stated or else that the file names."""
+        truth = None if path is None else load_poses(path, stamps, self.files, self.voice)
+        return None if truth is None else replace(truth, frame=self.info.ground_truth_frame or truth.frame)
+
+    def sequence(self, **parts: Any) -> FolderSequence:
+        """The sequence of `parts`, see `FolderSequence`, with what is stated of every kind of folder, its points in m."""
+        info, problems = self.info, self.voice.problems
+        beside = {"imu": load_imu, "gnss": load_gnss}
+        parts = {name: load(self.path, info, problems) for name, load in beside.items() if name not in parts} | parts
+        sequence = FolderSequence(**{
+            "name": info.name or printable(self.path.name), "path": self.path, "kind": self.kind, "files": self.files,
+            "motion_compensated": info.motion_compensated, "record": self.record, "rows": info.rows, "cols": info.cols,
+            "per_point": per_point_folder(self.path, info), "rings": info.rings or info.rows, "sensor": info.sensor,
+            "unit_m": LENGTHS.get(info.point_unit or ""), "stated_times": stated_times(info),
+            "notes": self.voice.notes, "problems": problems, **parts,
+        })  # fmt: skip
+        return settle_unit(sequence)
 
 
 def _split(raw: NDArray[np.float32]) -> PointCloud:

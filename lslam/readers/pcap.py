@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import velodyne_packets
@@ -21,49 +20,22 @@ from lslam.readers.listing import list_scans
 from lslam.readers.pcap_ouster import open_ouster
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.pcap_velodyne import open_velodyne
+from lslam.readers.sequence_on_disk import SequenceOnDisk
 from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, read_info, stated_times
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans, StatedTimes, no_shared_time
-from lslam.types.trajectory import Trajectory
+from lslam.types.sequence import Calibration, no_shared_time
 
 KIND = "pcap"
 _PACKET_BYTES, _LOOKED_AT = 200, 20  # LiDAR packets are larger; so many tell whose they are
 
 
-@dataclass
-class PcapSequence(Scans):
-    """A `Sequence` over a capture. See `lslam.types.sequence` for the attributes every sequence has.
+@dataclass(kw_only=True)
+class PcapSequence(SequenceOnDisk):
+    """A recording in a capture, of `revolutions`."""
 
-    rings : number of beams; sensor : the model; has_assumed_extrinsics : nothing says where the IMU sits
-    """
-
-    name: str
-    path: Path
     revolutions: Revolutions
-    stamps_ns: NDArray[np.int64]
-    rate_hz: float
-    rings: int
-    sensor: str
-    kind: str = KIND
-    motion_compensated: bool | None = False
-    calibration: Calibration = field(default_factory=Calibration)
-    ground_truth: Trajectory | None = None
-    imu: ImuStream | None = None
-    gnss: GnssStream | None = None
-    notes: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    stated_times: StatedTimes = field(default_factory=StatedTimes)
-    has_assumed_extrinsics: bool = False
 
-    def __len__(self) -> int:
-        return len(self.stamps_ns)
-
-    def scan(self, index: int) -> Scan:
-        """Read scan `index`. Raises IndexError beyond the end."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"scan {index} of {len(self)}")
+    def _read(self, index: int) -> Scan:
         return read_scan(self.revolutions, index, not self.motion_compensated)
 
 
@@ -97,8 +69,9 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
     opened = _opener(path, datagrams)(path, datagrams, voice)
     revolutions = opened.revolutions
     sequence = PcapSequence(
-        info.name or printable(path.stem), path, revolutions, revolutions.stamps_ns,
-        info.rate_hz or opened.rate_hz, info.rings or opened.rings, info.sensor or opened.sensor,
+        name=info.name or printable(path.stem), path=path, kind=KIND,
+        revolutions=revolutions, stamps_ns=revolutions.stamps_ns,
+        rate_hz=info.rate_hz or opened.rate_hz, rings=info.rings or opened.rings, sensor=info.sensor or opened.sensor,
         motion_compensated=bool(info.motion_compensated), notes=voice.notes, problems=voice.problems,
         stated_times=stated_times(info),
         calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),

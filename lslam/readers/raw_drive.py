@@ -5,20 +5,19 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_rigid
-from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
+from lslam.formats.oxts_files import read_oxts
 from lslam.formats.stamp_files import read_stamps
-from lslam.readers.bag_topics import GNSS, IMU, why_none
+from lslam.readers.bag_topics import GNSS, IMU, Companion, why_none
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND
+from lslam.readers.kitti_raw import oxts_streams
 from lslam.readers.lookup import sequence_number
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 
 # Sequence -> drive and its first frame (KITTI odometry development kit).
@@ -58,24 +57,16 @@ def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """
     if sequence.imu is not None:
         return sequence
-    bag = getattr(sequence, "bag", None)
-    if bag is not None:
-        raise why_none(bag, IMU)
-    if not isinstance(sequence, FolderSequence):
+    if not hasattr(sequence, "bag") and not _is_cut(sequence):
+        if isinstance(sequence, FolderSequence):
+            raise InputError(
+                f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
+                "add it, or run without --imu, by a method that needs none"
+            )
         raise InputError(
             f"{sequence.path} ({sequence.kind}) has no IMU: run without --imu, by a method that needs none"
         )
-    if not _is_cut(sequence):
-        raise InputError(
-            f"{sequence.path} has no IMU: looked for {sequence.path / 'imu.csv'} and `imu` in sequence.toml there; "
-            "add it, or run without --imu, by a method that needs none"
-        )
-    oxts, stamps_ns, T_lidar_imu, source = _samples(sequence, data_root, "IMU", "imu.csv", "--imu")
-    return replace(
-        sequence, imu=ImuStream(stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy()),
-        calibration=replace(sequence.calibration, T_lidar_imu=T_lidar_imu),
-        notes=[*sequence.notes, f"IMU of {source}"], problems=list(dict.fromkeys([*sequence.problems, *oxts.problems])),
-    )  # fmt: skip
+    return _with_oxts(sequence, data_root, IMU, "IMU", "imu.csv")
 
 
 def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
@@ -83,35 +74,24 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
 
     Other folders come back as they are. Raises as `with_imu`.
     """
-    if sequence.gnss is not None:
+    if sequence.gnss is not None or not (hasattr(sequence, "bag") or _is_cut(sequence)):
         return sequence
-    bag = getattr(sequence, "bag", None)
-    if bag is not None:
-        raise why_none(bag, GNSS)
-    if not isinstance(sequence, FolderSequence) or not _is_cut(sequence):
-        return sequence
-    flags = "--gnss and --georeference"
-    oxts, stamps_ns, T_lidar_imu, source = _samples(sequence, data_root, "satellite fixes", "gnss.csv", flags)
-    # The position that OXTS gives is that of the IMU's origin (devkit readme).
-    return replace(
-        sequence, gnss=GnssStream(stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy()),
-        calibration=replace(sequence.calibration, T_lidar_gnss=T_lidar_imu),
-        notes=[*sequence.notes, f"GNSS of {source}"], problems=list(dict.fromkeys([*sequence.problems, *oxts.problems])),
-    )  # fmt: skip
+    return _with_oxts(sequence, data_root, GNSS, "satellite fixes", "gnss.csv")
 
 
 def _is_cut(sequence: Sequence) -> bool:
     """Whether a sequence is known to be cut from a raw drive."""
-    return sequence.kind == KIND and sequence_number(sequence.path.name) in DRIVES
+    is_kitti = isinstance(sequence, FolderSequence) and sequence.kind == KIND
+    return is_kitti and sequence_number(sequence.path.name) in DRIVES
 
 
-def _samples(
-    sequence: FolderSequence, data_root: Path | None, what: str, file: str, flags: str
-) -> tuple[Oxts, NDArray[np.int64], NDArray[np.float64], str]:
-    """OXTS of the drive, its stamps (N,), ns, on the sequence's clock, T_lidar_imu (4, 4), and in words where from.
+def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what: str, file: str) -> Sequence:
+    """The sequence with a stream of its raw drive, on its own clock.
 
-    Raises InputError that names `what` is missing, the `file` that would have it, and the `flags` that ask for it.
+    Raises InputError that names `what` is missing and the `file` that would have it; for a bag as `why_none`.
     """
+    if not isinstance(sequence, FolderSequence):
+        raise why_none(sequence.bag, kind)  # type: ignore[attr-defined]
     date, number, first = DRIVES[sequence_number(sequence.path.name)]
     roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
     places = dict.fromkeys([*roots, *list(sequence.path.parents)[: 1 + _UPWARDS], Path.cwd()])
@@ -127,7 +107,7 @@ def _samples(
         raise InputError(
             f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and the raw drive in "
             f"{looked}, and there without raw/ and {date}/; fetch {date}_drive_{number:04d}_sync or _extract, or run "
-            f"without {flags}"
+            f"without {kind.wish}"
         )
     beside = [folder / CALIBRATION for folder in (drive.parent, drive, drive.parent / date, drive.parent.parent)]
     calibration = next((path for path in beside if path.is_file()), None)
@@ -140,7 +120,15 @@ def _samples(
     stamps_ns = oxts.stamps_ns - begin_ns + int(sequence.stamps_ns[0])
     rate_hz = 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
     source = f"{drive} at {rate_hz:.0f} Hz, its frame {first} by {clock} taken as the first scan"
-    return oxts, stamps_ns, read_rigid(calibration), source
+    imu, gnss = oxts_streams(oxts, stamps_ns)
+    T_lidar_imu = read_rigid(calibration)
+    # The position that OXTS gives is that of the IMU's origin (devkit readme).
+    parts: dict[str, Any] = (
+        {"imu": imu, "calibration": replace(sequence.calibration, T_lidar_imu=T_lidar_imu)} if kind is IMU else
+        {"gnss": gnss, "calibration": replace(sequence.calibration, T_lidar_gnss=T_lidar_imu)}
+    )  # fmt: skip
+    problems = list(dict.fromkeys([*sequence.problems, *oxts.problems]))
+    return replace(sequence, notes=[*sequence.notes, f"{kind.name} of {source}"], problems=problems, **parts)
 
 
 def _begin(drive: Path, first: int) -> tuple[int, str]:

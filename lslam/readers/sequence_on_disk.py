@@ -1,0 +1,58 @@
+"""What the sequences of all readers have in common."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.types.gnss import GnssStream
+from lslam.types.imu import ImuStream
+from lslam.types.scan import Scan
+from lslam.types.sequence import Calibration, Scans, StatedTimes
+from lslam.types.trajectory import Trajectory
+
+
+@dataclass(kw_only=True)
+class SequenceOnDisk(Scans):
+    """A `Sequence`. See `lslam.types.sequence` for the attributes every sequence has.
+
+    rings : number of beams, sensor : its name; None where nobody states them
+    stated_times : what is stated about the times of points; has_assumed_extrinsics : nothing says where the IMU sits
+    """
+
+    name: str
+    path: Path
+    kind: str
+    stamps_ns: NDArray[np.int64]
+    rate_hz: float
+    motion_compensated: bool | None = None
+    calibration: Calibration = field(default_factory=Calibration)
+    ground_truth: Trajectory | None = None
+    imu: ImuStream | None = None
+    gnss: GnssStream | None = None
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    stated_times: StatedTimes = field(default_factory=StatedTimes)
+    rings: int | None = None
+    sensor: str | None = None
+    has_assumed_extrinsics: bool = False
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index`; a file or message without points gives an empty scan.
+
+        Raises InputError naming the file, or bag, topic and message, when it is damaged, IndexError beyond the end.
+        """
+        if not 0 <= index < len(self):
+            raise IndexError(f"scan {index} of {len(self)}")
+        return self._read(index)
+
+    @abstractmethod
+    def _read(self, index: int) -> Scan:
+        """Scan `index`, which there is."""
