@@ -16,6 +16,7 @@ from types import ModuleType
 
 import blas_kernels  # noqa: F401
 import pytest
+from compiled_once import compile_once
 from hypothesis import settings
 from shared_towns import Towns
 
@@ -24,6 +25,7 @@ from lslam.foreign import importing_open3d
 from lslam.locks import one_at_a_time
 
 pytest_plugins = ["perturbed_scans"]
+compile_once()
 
 # How long an example takes is the machine's affair.
 settings.register_profile("untimed", deadline=None)

@@ -1,0 +1,31 @@
+"""A worker of the tests that needs a kernel waits for the one that compiles it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+from lslam.kernels.jit import kernel
+from lslam.locks import lock
+
+results = []
+
+
+@kernel
+def twice(x: float) -> float:
+    return 2.0 * x
+
+
+def test_a_kernel_that_another_process_compiles_is_waited_for() -> None:
+    compiled: Any = twice
+    folder = Path(compiled._cache.cache_path)
+    folder.mkdir(parents=True, exist_ok=True)
+    waiting = Thread(target=lambda: results.append(twice(21.0)), daemon=True)
+    with (folder / "twice.lock").open("a") as stream:
+        assert lock(stream)
+        waiting.start()
+        waiting.join(0.3)
+        assert results == []
+    waiting.join()
+    assert results == [42.0]
