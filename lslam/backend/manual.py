@@ -15,10 +15,10 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.georeference import to_wgs84
-from lslam.readers.selection import Selection
 from lslam.types.keyframe import Keyframe
 from lslam.types.manual import Instant, KnownPair, Manual, NamedPair
 from lslam.types.scan_result import ScanResult
+from lslam.types.selection import Selection
 from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]

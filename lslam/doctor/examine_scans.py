@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.errors import InputError
 from lslam.preprocessing.rings import RingRule
-from lslam.readers.selection import with_rings
+from lslam.preprocessing.views import with_rings
 from lslam.types.scan import FARTHEST_M, NO_RING, Scan
 from lslam.types.sequence import Sequence
 

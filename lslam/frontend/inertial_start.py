@@ -24,9 +24,9 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_cleaning import LEAST_RATE_HZ, ImuRefusedError, is_slow, rate_of
 from lslam.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry import create_odometry
-from lslam.readers.selection import Selection, select
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
+from lslam.types.selection import Selection, select
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")

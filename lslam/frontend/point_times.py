@@ -14,9 +14,10 @@ from lslam.kernels import jit
 from lslam.locks import one_at_a_time
 from lslam.preprocessing.clock_proposals import azimuth_proposal, columns_clock, order_clock, propose_clock
 from lslam.preprocessing.sweep_clock import SweepClock
+from lslam.preprocessing.views import Clocked
 from lslam.readers.merged_lidars import MergedLidars
-from lslam.readers.selection import Clocked, SequenceView
 from lslam.types.scan import Scan
+from lslam.types.selection import SequenceView
 from lslam.types.sequence import Sequence, StatedTimes
 
 log = logging.getLogger("lslam")

@@ -21,11 +21,11 @@ from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
-from lslam.readers.selection import Selection
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import MotionModel
 from lslam.types.scan import FARTHEST_M, Scan, Span
 from lslam.types.scan_result import ScanResult
+from lslam.types.selection import Selection
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 

@@ -29,12 +29,13 @@ from lslam.pipeline.check import check_config
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.prior_map_files import require_map
 from lslam.pipeline.watch import Watch
+from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_streams
-from lslam.readers.selection import select, with_rings
 from lslam.stopping import asking
 from lslam.types.manual import Manual
 from lslam.types.scan import Span
+from lslam.types.selection import select
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 

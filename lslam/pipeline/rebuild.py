@@ -44,8 +44,8 @@ from lslam.pipeline.map_files import (
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.preprocessing.sweep_clock import SweepClock
+from lslam.preprocessing.views import Clocked
 from lslam.readers import open_sequence
-from lslam.readers.selection import Clocked, select
 from lslam.remote import as_path
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
@@ -54,6 +54,7 @@ from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference, OutputCrs
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
+from lslam.types.selection import select
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json

@@ -37,7 +37,7 @@ from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
 from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
-from lslam.readers.point_clock import PointClock, open_clock, read_samples
+from lslam.readers.point_clock import open_clock, read_samples
 from lslam.readers.point_stamps import onto_recording, point_stamps, points_off, step_against
 from lslam.readers.point_times import Sample
 from lslam.readers.point_units import in_metres, settle_unit
@@ -62,20 +62,17 @@ class BagSequence(SequenceOnDisk):
     """A recording in a bag.
 
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
-    clock : how per-point times are read, None when there are none or they are not to be used
     uses : what each topic that is used is used for; halves : further messages of a scan
-    revolutions : of packets, which then are read in place of messages; unit_m : of coordinates, None where nobody states it
+    revolutions : of packets, which then are read in place of messages
     """
 
     bag: Bag
     topic: BagTopic
     messages: NDArray[np.int64]
     headers_ns: NDArray[np.int64]
-    clock: PointClock | None = None
     uses: dict[str, str] = field(default_factory=dict)
     halves: Halves = field(default_factory=dict)
     revolutions: Revolutions | None = None
-    unit_m: float | None = None
 
     def _read(self, index: int) -> Scan:
         if self.revolutions is not None:

@@ -40,9 +40,8 @@ class FolderSequence(SequenceOnDisk):
 
     files : one per scan; correction_deg : rotation of every point about p x z, 0 for none
     rows, cols : organised clouds, point r * cols + c has ring r; per_point : folder of `<stem>.npz` with `t` and `ring`
-    clock : how the files' own per-point times are read, None when they have none or are not to be used
     sweep_s : (N, 2) begin and end of each sweep, s from its stamp, when per-point times follow from the azimuth; else None
-    record : of the points, where the files do not name their fields; unit_m : of coordinates, None where nobody states it
+    record : of the points, where the files do not name their fields
     """
 
     files: list[Path]
@@ -50,10 +49,8 @@ class FolderSequence(SequenceOnDisk):
     rows: int | None = None
     cols: int | None = None
     per_point: Path | None = None
-    clock: PointClock | None = None
     sweep_s: NDArray[np.float64] | None = None
     record: PointRecord | None = None
-    unit_m: float | None = None
 
     def _read(self, index: int) -> Scan:
         """Raises InputError naming the file also where it contradicts `sequence.toml`."""

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
-from lslam.readers.selection import SequenceView, with_rings
+from lslam.preprocessing.views import with_rings
 from lslam.readers.sidecars import read_info
 from lslam.types.scan import NO_RING, Scan, Span
+from lslam.types.selection import SequenceView
 from lslam.types.sequence import Sequence
 
 # More than any LiDAR has: the rings of the k-th one begin at k times this.

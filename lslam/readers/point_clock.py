@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from lslam.formats.point_cloud import PointCloud
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.point_times import Sample, TimeRule, apply_rule, densest, is_usable, learn_rule
 from lslam.types.scan import is_measured
+from lslam.types.sequence import readable
 
 # Sweeps of a sensor differ by less than this factor in length; what is wider holds times that are wrong.
 _WIDER = 1.6
@@ -137,15 +139,10 @@ class PointClock:
 def read_samples(count: int, read: Callable[[int], Sample]) -> dict[int, Sample]:
     """The scans of a recording of `count` that a rule is learnt on, by their number: the first with points, one in the middle
     and the last; those that cannot be read are left out."""
-    samples: dict[int, Sample] = {}
-    for index in dict.fromkeys((*range(min(count, 2 * _FIRST)), count // 2, count - 1)):
-        if len(samples) >= _FIRST and index < min(count, 2 * _FIRST):
-            continue
-        with suppress(InputError):
-            sample = read(index)
-            if len(sample.cloud):
-                samples[index] = sample.thinned(_ENOUGH)
-    return samples
+    first = range(min(count, 2 * _FIRST))
+    others = [k for k in dict.fromkeys((count // 2, count - 1)) if k not in first]
+    some = chain(islice(readable(first, read), _FIRST), readable(others, read))
+    return {index: sample.thinned(_ENOUGH) for index, sample in some}
 
 
 def open_clock(

@@ -49,17 +49,21 @@ class TimeRule:
         return self.sweep * self.ns_per_unit * 1e-9
 
 
-class Sample(NamedTuple):
+@dataclass(frozen=True)
+class Sample:
     """A scan by which a rule is learnt: its points, or every `step`-th of them, and the stamp of its header, ns."""
 
     cloud: PointCloud
     stamp_ns: int
     step: int = 1
 
+    def __len__(self) -> int:
+        return len(self.cloud)
+
     def thinned(self, most: int) -> Sample:
         """The same with `most` points, or a few more where it has fewer than twice as many."""
-        step = max(len(self.cloud) // most, 1)
-        return Sample(self.cloud.select(np.arange(0, len(self.cloud), step)), self.stamp_ns, step)
+        step = max(len(self) // most, 1)
+        return Sample(self.cloud.select(np.arange(0, len(self), step)), self.stamp_ns, step)
 
 
 class _TimeReading(NamedTuple):
@@ -90,32 +94,25 @@ def learn_rule(
     refusal: InputError | None = None
     counts = Counter(clock.name for sample in samples for clock in sample.cloud.clocks)
     for name in sorted(counts, key=lambda name: 2 * counts[name] < len(samples)):
-        readings, having = [], []
-        for sample in samples:
-            clock = next((c for c in sample.cloud.clocks if c.name == name), None)
-            if clock is None or not len(sample.cloud):
-                continue
-            having.append(sample)
+        having = [(c, sample) for sample in samples if len(sample) for c in sample.cloud.clocks if c.name == name]
+        readings = []
+        for clock, sample in having:
             try:
                 readings.append(_read(clock, sample, rate_hz, unit, reference))
             except InputError as error:
                 refusal = refusal or (None if clock.is_doubtful else error)
         if readings and 2 * len(readings) >= len(having):
-            return _agree(name, readings, having, rate_hz, unit, reference)
+            points = float(np.median([sample.step * len(sample) for _, sample in having]))
+            return _agree(name, readings, points, rate_hz, unit, reference)
     if refusal is not None:
         raise refusal
     return None
 
 
 def _agree(
-    name: str,
-    readings: list[_TimeReading],
-    having: list[Sample],
-    rate_hz: float,
-    unit: str | None,
-    reference: str | None,
+    name: str, readings: list[_TimeReading], points: float, rate_hz: float, unit: str | None, reference: str | None
 ) -> TimeRule:
-    """The rule that most of the scans obey."""
+    """The rule that most of the scans obey, which have so many points."""
     usual = Counter(r.unit for r in readings).most_common(1)[0][0]
     readings = [r for r in readings if r.unit == usual]
     # A clock that started with the recording looks like an offset in the first scans.
@@ -131,32 +128,28 @@ def _agree(
     ns = _UNITS_NS[usual]
     farthest = max(max(abs(r.low), abs(r.high)) for r in readings)
     return TimeRule(
-        ns,
-        is_absolute,
-        is_before_stamp=not is_absolute and instant == "scan_end",
+        ns, is_absolute, is_before_stamp=not is_absolute and instant == "scan_end", field=name, points=points,
         sentence=f"per-point times from field {name!r} ({readings[0].dtype}), {usual}, {words}{how}",
-        field=name,
         sweep=float(np.median([r.high - r.low for r in readings])),
         reach=np.inf if is_absolute else max(_LONGEST * 1e9 / rate_hz / ns, 1.5 * farthest),
-        points=float(np.median([sample.step * len(sample.cloud) for sample in having])),
-    )
+    )  # fmt: skip
 
 
 def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, reference: str | None) -> _TimeReading:
     """What the times of one scan can be, by most of its points. Raises InputError when no unit fits."""
     usable = is_usable(sample.cloud, clock.values)
-    values = clock.values[usable]
+    values, points = clock.values[usable], sample.cloud.points[usable]
     period_ns = 1e9 / rate_hz
+
+    def can_be(u: str) -> bool:
+        low, high = limits[u]
+        is_sweep = _SHORTEST <= (high - low) * _UNITS_NS[u] / period_ns <= _LONGEST
+        return is_sweep and (not clock.is_doubtful or (u == clock.unit and _is_swept(points, values, low, high)))
+
     limits = {u: _limits(values, _LONGEST * period_ns / ns) for u, ns in _UNITS_NS.items()}
-    fitting = [
-        u for u, ns in _UNITS_NS.items() if _SHORTEST <= (limits[u][1] - limits[u][0]) * ns / period_ns <= _LONGEST
-    ]
-    if clock.is_doubtful:
-        points = sample.cloud.points[usable]
-        fitting = [u for u in fitting if u == clock.unit and _is_swept(points, values, *limits[u])]
+    fitting = [u for u in limits if can_be(u)]
     if unit is not None:
-        fitting = [unit]
-        limits[unit] = _limits(values, np.inf)
+        fitting, limits = [unit], {unit: _limits(values, np.inf)}
     if not fitting:
         low, high = _limits(values, np.inf)
         raise InputError(

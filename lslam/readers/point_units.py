@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 from math import inf, isnan, log, nan
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.sequence_toml import LENGTHS
-from lslam.types.scan import Scan
+from lslam.readers.sequence_on_disk import SequenceOnDisk
+from lslam.types.sequence import readable
 
 # Scans of a sensor that drives or is carried have smaller medians in metres.
 _LONG_RANGE_M = 60.0
@@ -26,24 +25,7 @@ _PATCHES, _PATCH_POINTS, _MOST_POINTS = 200, 12, 60_000
 # What no LiDAR and no recording has: steps of coordinates, and surfaces thinner or thicker.
 _COARSEST_M, _THINNEST_M, _THICKEST_M = 0.1, 0.002, 0.3
 
-
-class Measured(Protocol):
-    """A sequence whose points may be in another unit."""
-
-    unit_m: float | None
-    notes: list[str]
-    problems: list[str]
-
-    def __len__(self) -> int:
-        """Number of scans."""
-        ...
-
-    def scan(self, index: int) -> Scan:
-        """Read scan `index`."""
-        ...
-
-
-T = TypeVar("T", bound=Measured)
+T = TypeVar("T", bound=SequenceOnDisk)
 
 
 def in_metres(cloud: PointCloud, unit_m: float | None) -> PointCloud:
@@ -58,11 +40,10 @@ def settle_unit(sequence: T) -> T:
         sequence.notes.append(f"points in {name}, as stated")
         return sequence
     some: list[NDArray[np.float64]] = []
-    for index in sorted({0, len(sequence) // 2, len(sequence) - 1}) if len(sequence) else []:
-        with suppress(InputError):
-            points = sequence.scan(index).points.astype(np.float64)
-            points = points[np.isfinite(points).all(1) & (points != 0).any(1)]
-            some += [points] if len(points) >= _MIN_POINTS else []
+    last = len(sequence) - 1
+    for _, scan in readable(sorted({0, len(sequence) // 2, last}) if last >= 0 else (), sequence.scan):
+        points = scan.points[np.isfinite(scan.points).all(1) & (scan.points != 0).any(1)].astype(np.float64)
+        some += [points] if len(points) >= _MIN_POINTS else []
         if some and float(np.median(np.linalg.norm(some[0], axis=1))) < _LONG_RANGE_M:
             return sequence
     if some:

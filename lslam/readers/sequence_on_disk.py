@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.readers.point_clock import PointClock
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
@@ -22,6 +23,8 @@ class SequenceOnDisk(Scans):
 
     rings : number of beams, sensor : its name; None where nobody states them
     stated_times : what is stated about the times of points; has_assumed_extrinsics : nothing says where the IMU sits
+    clock : how per-point times are read, None when there are none or they are not to be used
+    unit_m : of coordinates, None where nobody states it
     """
 
     name: str
@@ -40,6 +43,8 @@ class SequenceOnDisk(Scans):
     rings: int | None = None
     sensor: str | None = None
     has_assumed_extrinsics: bool = False
+    clock: PointClock | None = None
+    unit_m: float | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -29,12 +29,12 @@ from lslam.errors import (
 )
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
 from lslam.pipeline.storage import spool_of
-from lslam.readers.selection import SequenceView
 from lslam.remote import RemotePath
 from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 from lslam.types.scan import Scan
+from lslam.types.selection import SequenceView
 from lslam.types.sequence import Sequence
 
 # Bytes of scans a process keeps at most, and its share of what was free when it began.

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sized
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.errors import InputError
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 from lslam.types.trajectory import Trajectory
+
+T = TypeVar("T", bound=Sized)
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,17 @@ class StatedTimes:
 def no_shared_time(stream: str) -> str:
     """The problem of a recording whose `stream`, IMU or GNSS, lies wholly before or after its scans."""
     return f"{stream}: it shares no time with the scans"
+
+
+def readable(indices: Iterable[int], read: Callable[[int], T]) -> Iterator[tuple[int, T]]:
+    """What `read` makes of each index, where it can be read and has points."""
+    for index in indices:
+        try:
+            value = read(index)
+        except InputError:
+            continue
+        if len(value):
+            yield index, value
 
 
 class Scans(ABC):

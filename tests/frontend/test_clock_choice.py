@@ -16,10 +16,10 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.frontend.point_times import with_point_times
 from lslam.readers.merged_lidars import MergedLidars
-from lslam.readers.selection import SequenceView
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan import Scan
+from lslam.types.selection import SequenceView
 from lslam.types.sequence import StatedTimes
 
 Change = Callable[[Scan], Scan]

@@ -19,7 +19,7 @@ from lslam.geometry import se3
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
-from lslam.readers.selection import with_rings
+from lslam.preprocessing.views import with_rings
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

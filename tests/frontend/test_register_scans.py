@@ -12,10 +12,10 @@ from stub_sequences import Standstill, Stub, noise, sample, with_points
 from lslam.config import Config, load_config
 from lslam.frontend.register_scans import PRIOR_COVARIANCE, estimate, is_diverged, read_ahead, to_trajectory
 from lslam.odometry import create_odometry
-from lslam.readers.selection import select
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult, Status
+from lslam.types.selection import select
 
 
 def outcomes(*runs: tuple[Status, int]) -> list[ScanResult]:

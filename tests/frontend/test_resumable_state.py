@@ -20,7 +20,7 @@ from lslam.frontend.tracker import Tracker
 from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
 from lslam.odometry.stationary import StationaryDetector
-from lslam.readers.selection import with_rings
+from lslam.preprocessing.views import with_rings
 from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.simulation.lidar_models import LIDARS

@@ -14,11 +14,11 @@ from lslam.config.config import Config
 from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
-from lslam.readers.selection import select
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.studies.worker import ScanStore, SequenceCache
 from lslam.types.scan_result import ScanResult
+from lslam.types.selection import select
 from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]

@@ -18,9 +18,9 @@ from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.readers import open_sequence
-from lslam.readers.selection import select
 from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan
+from lslam.types.selection import select
 from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]

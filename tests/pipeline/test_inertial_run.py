@@ -29,12 +29,12 @@ from lslam.inertial.initialise import FirstPoses
 from lslam.odometry import create_odometry
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
-from lslam.readers.selection import Selection, select
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
+from lslam.types.selection import Selection, select
 from lslam.types.sequence import Sequence
 
 COUNT = 60

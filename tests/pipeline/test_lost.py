@@ -23,13 +23,13 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
-from lslam.readers.selection import select
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_check import MotionCheck
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
+from lslam.types.selection import select
 from lslam.types.sequence import Sequence
 
 BEGIN = 30

@@ -24,10 +24,11 @@ from lslam.formats.kitti_layout import write_scan, write_times
 from lslam.frontend.point_times import with_point_times
 from lslam.geometry import se3
 from lslam.pipeline.resume import input_digest
+from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
 from lslam.readers.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
-from lslam.readers.selection import select, with_rings
 from lslam.types.scan import Scan
+from lslam.types.selection import select
 from lslam.types.sequence import Sequence, StatedTimes
 
 T_FRONT_REAR = se3.exp(np.array([-1.6, 0.4, -0.2, 0.0, 0.05, 2.9]))

@@ -12,7 +12,7 @@ import pytest
 from lslam.config import load_config
 from lslam.errors import InputError
 from lslam.pipeline.job import choose_scans
-from lslam.readers.selection import with_rings
+from lslam.preprocessing.views import with_rings
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan import NO_RING, Scan
 
