@@ -248,12 +248,6 @@ def _needed(chunk: Chunk | None, offset: int, is_head: bool) -> tuple[int, int]:
     return chunk.position + offset, _HEAD
 
 
-def check_compression(path: Path, name: str) -> None:
-    """Raise InputError for a compression lslam does not know."""
-    if name not in ("", "bz2", "lz4", "zstd"):
-        raise InputError(f"{path}: compression {name!r} of its chunks is not known: bz2, lz4 and zstd are")
-
-
 def unpack(compression: str, packed: bytes, most: int = LARGEST) -> bytes:
     """All of `packed`, one frame or several: a few bytes may unpack to any number, so no more than `most` come out.
 
@@ -292,20 +286,3 @@ def zstd() -> Any:
     else:
         from backports import zstd
     return zstd
-
-
-def gather(topic: Topic, stamps: list[NDArray[np.int64]], where: list[Pairs]) -> None:
-    """Fill the index of `topic` from pieces, in the order the messages were recorded."""
-    if not stamps:
-        return
-    topic.stamps_ns, topic.where = np.concatenate(stamps), np.concatenate(where)
-    order = np.argsort(topic.stamps_ns, kind="stable")
-    topic.stamps_ns, topic.where = topic.stamps_ns[order], topic.where[order]
-
-
-def describe_loss(path: Path, position: int, size: int, what: str = "record") -> str:
-    """What a file lost that was cut off after `position` of its `size` bytes."""
-    return (
-        f"{path} is cut off: the last {size - position} of its {size} bytes ({(size - position) / size:.1%}) hold no whole "
-        f"{what} and are lost, everything before is read"
-    )
