@@ -19,7 +19,11 @@ from lslam.cli import options
 @click.option("--all", "all_scans", is_flag=True, help="Examine the points of every scan.")
 @click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
 @click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
-@click.option("--quick", is_flag=True, help="Register no scans: the IMU's clock and axes are not checked.")
+@click.option(
+    "--quick",
+    is_flag=True,
+    help="Register no scans: the IMU's clock and axes, and the order of the points, are not checked.",
+)
 @click.option("--imu-toml", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
               help="Write the IMU's noise as a configuration for --config.")  # fmt: skip
 @options.reading

@@ -37,7 +37,8 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     """JSON-ready facts about `sequence`; point statistics come from `samples` scans spread evenly, all when None.
 
     `findings` are what is wrong: `code`, `what`, `way_out`; `problems` the same as sentences. Scans that cannot be read are
-    among them. With `is_quick` no scan is registered, so the IMU's clock and axes are not compared with the scans.
+    among them. With `is_quick` no scan is registered, so the IMU's clock and axes are not compared with the scans, and
+    no clock of points without times is sought.
     """
     findings = [Finding("recording", sentence) for sentence in sequence.problems]
     n = len(sequence)
@@ -53,6 +54,11 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         notes.append(sentence)
     limits = points["per_point_times"]
     choice = getattr(clocked, "clock_choice", None)
+    if is_quick and limits is None and choice is None and not clocked.motion_compensated:
+        notes.append(
+            "point times: no field has them; whether the order of the points tells them is not looked into, because that "
+            "takes registrations"
+        )
     units = examine_units(sequence, sequence.ground_truth, sweep=None if limits is None else Span(*limits))
     findings += units
     imu = examine_imu(sequence, findings)

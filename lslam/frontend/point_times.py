@@ -6,13 +6,15 @@ import logging
 
 import numpy as np
 
+from lslam.config import Config
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.frontend.clock_agreement import FEWEST_SCANS
 from lslam.frontend.clock_choice import ClockChoice, choose_clock
 from lslam.kernels import jit
 from lslam.locks import one_at_a_time
-from lslam.preprocessing.clock_proposals import azimuth_proposal, columns_clock, order_clock, propose_clock
+from lslam.odometry import create_odometry
+from lslam.preprocessing.clock_proposals import Proposal, azimuth_proposal, columns_clock, order_clock, propose_clock
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.preprocessing.views import Clocked
 from lslam.readers.merged_lidars import MergedLidars
@@ -63,8 +65,18 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
     proposal = propose_clock(scans, nominal, getattr(sequence, "rows", None))
     if proposal is None:
         return sequence
-    with one_at_a_time(jit.lock_file(), "compiles kernels"), jit.announced(log):
-        return _with(sequence, choose_clock(sequence, proposal, scans[0], preprocess))
+    return _with(sequence, _by_agreement(sequence, proposal, scans, preprocess))
+
+
+def _by_agreement(
+    sequence: Sequence, proposal: Proposal, scans: list[Scan], preprocess: PreprocessConfig
+) -> ClockChoice:
+    """What the agreement of scans decides."""
+    with jit.announced(log):
+        # Other processes wait while this one compiles, not while it registers.
+        with one_at_a_time(jit.lock_file(), "compiles kernels"):
+            create_odometry(Config()).warm_up()
+        return choose_clock(sequence, proposal, scans[0], preprocess)
 
 
 def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
@@ -95,7 +107,7 @@ def _as_stated(
         proposal = azimuth_proposal(scans, nominal)
         clock = proposal.clock
         if proposal.is_guess:
-            choice = choose_clock(sequence, proposal, scans[0], preprocess)
+            choice = _by_agreement(sequence, proposal, scans, preprocess)
             if choice.clock is None:
                 raise InputError(
                     f"{sequence.path}: point_times = 'azimuth', and neither the order of the points nor the agreement of "

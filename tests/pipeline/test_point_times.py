@@ -91,8 +91,11 @@ def test_info_says_the_clock_and_how_clear_it_was(folder: Path) -> None:
     assert not any("per-point times" in problem for problem in facts["problems"])
     quick = CliRunner().invoke(cli, ["info", str(folder), "--quick"])
     assert "per-point times    none" in quick.output
+    assert "whether the order of the points tells them is not looked into" in " ".join(quick.output.split())
+    assert "not looked into" not in shown.output
     stated = CliRunner().invoke(cli, ["info", str(folder), "--quick", "--point-times", "azimuth"])
     assert "point times: by the azimuth of the points, clockwise, from azimuth 0 deg" in stated.output
+    assert "not looked into" not in " ".join(stated.output.split())
 
 
 def test_sequence_toml_states_the_clock(folder: Path) -> None:
