@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
-from lslam.formats.osm_files import DECIMALS
+from lslam.formats.osm_data import DECIMALS
 from lslam.untrusted import MISFIT, parse_json
 
 Floats = NDArray[np.float64]

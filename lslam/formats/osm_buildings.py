@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.osm_files import DECIMALS, Member, OsmData, Relation, Way, read_osm
+from lslam.formats.osm_data import DECIMALS, AreaMaker, OsmData, Place, Relation, Way
+from lslam.formats.osm_files import read_osm
 from lslam.formats.osm_rings import footprints_from_rings, join_rings
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.building import Building, Footprint, footprint_polygon
@@ -120,37 +121,15 @@ def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: flo
 def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attribution: str | None) -> OsmData:
     """An extract of `buildings` (local frame at `origin`), degrees rounded to 7 decimals: what a file of it reads back as.
 
-    One footprint without holes is a way, everything else a multipolygon. Nodes, and rings of multipolygons, get negative
-    numbers, which no element of OpenStreetMap has.
+    Nodes, and rings of multipolygons, get negative numbers, which no element of OpenStreetMap has.
     """
     data = OsmData(attribution=attribution)
-    numbers = iter(range(-1, -(2**62), -1))
-    taken = {int(b.osm_id.split("/")[1]) for b in buildings}
-
-    def fresh() -> int:
-        return next(n for n in numbers if n not in taken)
-
-    def add_ring(ring: Floats, number: int, tags: Mapping[str, str]) -> int:
-        fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
-        ids = [fresh() for _ in ring]
-        for node, (lat, lon, _) in zip(ids, fixes.tolist(), strict=True):
-            data.add_node(node, round(lat, DECIMALS), round(lon, DECIMALS))
-        data.add_way(Way(number, (*ids, ids[0]), tags))
-        return number
-
-    for building in buildings:
-        kind, number = building.osm_id.split("/")
+    names = [(kind, int(number)) for kind, number in (building.osm_id.split("/") for building in buildings)]
+    maker = AreaMaker(data, {number for _, number in names}, shares_nodes=False)
+    for name, building in zip(names, buildings, strict=True):
+        polygons = [[_places(ring, origin) for ring in footprint.rings] for footprint in building.footprints]
         tags = _written_tags(building)
-        if kind == "way" and len(building.footprints) == 1 and not building.footprints[0].holes:
-            add_ring(building.footprints[0].outer, int(number), tags)
-            continue
-        members = []
-        for footprint in building.footprints:
-            members.append(Member("way", add_ring(footprint.outer, fresh(), {}), "outer"))
-            members += [Member("way", add_ring(hole, fresh(), {}), "inner") for hole in footprint.holes]
-        # A way that became several outlines cannot keep its number: relations have their own.
-        found = int(number) if kind == "relation" else fresh()
-        data.add_relation(Relation(found, tuple(members), {"type": "multipolygon", **tags}))
+        maker.add(name, polygons, tags, {"type": "multipolygon", **tags})
     return data
 
 
@@ -234,6 +213,12 @@ def _relation_footprints(
 def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str, str]) -> Building:
     own = {key: value for key, value in tags.items() if key != "type"}
     return Building(osm_id, footprints, height_of(tags), base_of(tags), own)
+
+
+def _places(ring: Floats, origin: NDArray[Any]) -> list[Place]:
+    """Corners (K, 2), m, in degrees as a file has them."""
+    fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
+    return [(round(lat, DECIMALS), round(lon, DECIMALS)) for lat, lon, _ in fixes.tolist()]
 
 
 def _written_tags(building: Building) -> dict[str, str]:

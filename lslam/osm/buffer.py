@@ -22,10 +22,9 @@ from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, LslamError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_buildings import buildings_of
-from lslam.formats.osm_files import from_overpass
-from lslam.formats.overpass_reply import OverpassReply
 from lslam.geometry.geodesy import from_local
 from lslam.osm.bounds import Bounds, around
+from lslam.osm.overpass_reply import OverpassReply, from_overpass
 from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")

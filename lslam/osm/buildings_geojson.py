@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
-from lslam.formats.osm_files import DECIMALS
+from lslam.formats.osm_data import DECIMALS
 from lslam.geometry import se2
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.osm_files import DECIMALS, OsmData
+from lslam.formats.osm_data import DECIMALS, OsmData
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, about
 

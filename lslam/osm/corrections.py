@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.osm import OsmConfig
-from lslam.formats.osm_files import OsmData, write_osm
+from lslam.formats.osm_data import OsmData
+from lslam.formats.osm_files import write_osm
 from lslam.geometry import se2
 from lslam.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
 from lslam.kernels import wall_matching

@@ -24,11 +24,11 @@ import numpy as np
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.atomic import atomic_write
-from lslam.formats.osm_files import GaveUpError, from_overpass
-from lslam.formats.overpass_reply import OverpassReply
+from lslam.formats.osm_files import GaveUpError
 from lslam.kernels.cache import cache_folder
 from lslam.locks import one_at_a_time
 from lslam.osm.bounds import Bounds
+from lslam.osm.overpass_reply import OverpassReply, from_overpass
 from lslam.untrusted import whole_number
 from lslam.version import __version__
 
@@ -69,7 +69,7 @@ def fetch_buildings(
 ) -> OverpassReply:
     """The Overpass reply for `bounds`: from `folder` when a reply for it or a larger box is there, else from `config.server`.
 
-    It is checked (by `osm_files.from_overpass`) and written to `folder` when it is complete. `sleep` waits between attempts.
+    It is checked (by `from_overpass`) and written to `folder` when it is complete. `sleep` waits between attempts.
 
     Raises InputError when the server is unreachable or busy at all attempts, when the reply is a web page, incomplete, too
     long or about another place, and when `config.cache` is `only` and there is no reply in `folder`.

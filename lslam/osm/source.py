@@ -16,12 +16,13 @@ from lslam.config import Config
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
-from lslam.formats.osm_files import OsmData, merged, read_osm
-from lslam.formats.overpass_reply import OverpassReply
+from lslam.formats.osm_data import OsmData
+from lslam.formats.osm_files import read_osm
 from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
 from lslam.osm.buffer import Fetch, OsmBuffer
 from lslam.osm.overpass import fetch_buildings, reply_folder
+from lslam.osm.overpass_reply import OverpassReply, merged
 from lslam.osm.walls import OsmMap
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
 from lslam.formats.osm_buildings import BuildingExtract, buildings_near, read_buildings
-from lslam.formats.osm_files import OsmData
+from lslam.formats.osm_data import OsmData
 from lslam.geometry import portable
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.moving import Mover

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.osm_buildings import is_underground
-from lslam.formats.osm_files import OsmData
+from lslam.formats.osm_data import OsmData
 from lslam.geometry.geodesy import to_local
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.types.building import Building, footprint_polygon, is_canopy

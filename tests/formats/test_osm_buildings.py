@@ -20,10 +20,12 @@ from lslam.formats.osm_buildings import (
     osm_from_buildings,
     read_buildings,
 )
-from lslam.formats.osm_files import ATTRIBUTION, from_overpass, read_osm, write_osm
+from lslam.formats.osm_data import ATTRIBUTION
+from lslam.formats.osm_files import read_osm, write_osm
 from lslam.formats.point_files import read_bin
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
+from lslam.osm.overpass_reply import from_overpass
 from lslam.types.building import Building, Footprint, footprint_polygon
 
 CLOSE = 1e-4  # m: the projection there and back is far better than a file's centimetre

@@ -12,7 +12,7 @@ from osm_builders import ORIGIN, ExtractMaker, square_at
 
 from lslam.errors import InputError
 from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.osm_files import ATTRIBUTION
+from lslam.formats.osm_data import ATTRIBUTION
 from lslam.geometry.geodesy import from_local
 
 
@@ -117,6 +117,8 @@ def test_swapped_degrees_are_said_to_be_swapped_whichever_side_has_them_so(tmp_p
         (polygon([[8.0, 49.0], [8.1, 49.0], [8.0, 49.0]]), "fewer than four positions"),
         (polygon([[8.0, 49.0], ["east"], [8.1, 49.1], [8.0, 49.0]]), "is no position"),
         ({"type": "Polygon"}, "a Polygon without a list of rings"),
+        ({"type": "FeatureCollection", "features": 1.5}, "a FeatureCollection without a list of features"),
+        ({"type": ["Feature"], "geometries": 1}, "no list of elements"),
         ({"type": "FeatureCollection", "features": [feature({"type": "Point", "coordinates": [8, 49]})]},
          "holds no building outline"),
     ],

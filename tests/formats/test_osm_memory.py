@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 
-from lslam.formats.osm_files import OsmData, from_overpass, merged, read_osm, write_osm
-from lslam.formats.overpass_reply import OverpassReply
+from lslam.formats.osm_data import OsmData
+from lslam.formats.osm_files import read_osm, write_osm
 from lslam.osm.bounds import Bounds
 from lslam.osm.overpass import _file_name, kept_reply
+from lslam.osm.overpass_reply import OverpassReply, from_overpass, merged
 
 HOUSES = 6_000
 BOX = Bounds(48.95, 8.35, 49.05, 8.45)

@@ -18,10 +18,10 @@ from overpass_server import FakeOverpass, house, running
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError
 from lslam.formats.osm_buildings import buildings_of
-from lslam.formats.osm_files import from_overpass
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer
 from lslam.osm.overpass import fetch_buildings
+from lslam.osm.overpass_reply import from_overpass
 from lslam.osm.walls import OsmMap
 from lslam.types.building import Building
 

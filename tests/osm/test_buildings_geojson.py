@@ -12,7 +12,7 @@ from formats.osm_builders import ORIGIN, square_at
 
 from lslam.errors import InputError, OutputError
 from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.osm_files import ATTRIBUTION
+from lslam.formats.osm_data import ATTRIBUTION
 from lslam.osm.buildings_geojson import read_corrected, write_corrected
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 

@@ -15,10 +15,9 @@ from overpass_server import FakeOverpass, running
 
 from lslam.config.osm import OsmConfig
 from lslam.errors import InputError
-from lslam.formats.osm_files import from_overpass
-from lslam.formats.overpass_reply import OverpassReply
 from lslam.osm.bounds import Bounds
 from lslam.osm.overpass import fetch_buildings, kept_reply, query
+from lslam.osm.overpass_reply import OverpassReply, from_overpass
 
 BOX = Bounds(49.0, 8.4, 49.01, 8.42)
 

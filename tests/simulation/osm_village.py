@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.osm_buildings import osm_from_buildings
-from lslam.formats.osm_files import ATTRIBUTION, OsmData, Way, write_osm
+from lslam.formats.osm_data import ATTRIBUTION, OsmData, Way
+from lslam.formats.osm_files import write_osm
 from lslam.geometry.geodesy import from_local
 from lslam.types.building import Building, Footprint
 

@@ -12,7 +12,8 @@ from osm_village import MAIN, ORIGIN, SIDE, houses, village, write_village
 from shapely import LineString, MultiPolygon, Point, contains_xy, distance, points
 
 from lslam.errors import InputError, UsageError
-from lslam.formats.osm_files import ATTRIBUTION, read_osm, write_osm
+from lslam.formats.osm_data import ATTRIBUTION
+from lslam.formats.osm_files import read_osm, write_osm
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
