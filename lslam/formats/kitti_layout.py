@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.formats.atomic import atomic_write, write_text
-from lslam.formats.point_files import write_points
+from lslam.formats.point_files import write_bin
 from lslam.formats.pose_rows import seconds_text
 from lslam.geometry import portable, se3
 from lslam.types.trajectory import Trajectory
@@ -32,7 +32,7 @@ def write_scan(
 ) -> None:
     """Write points, and beside them what is known of times, s from the scan's stamp, and rings. That file comes last, always."""
     cloud, beside = scan_files(folder, number)
-    write_points(cloud, points, intensity)
+    write_bin(cloud, points, intensity)
     known: dict[str, Any] = {name: v for name, v in (("t", times), ("ring", rings)) if v is not None}
     with atomic_write(beside) as stream:
         np.savez_compressed(stream, **known)

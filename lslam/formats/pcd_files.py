@@ -1,21 +1,22 @@
-"""PCD files of the Point Cloud Library, version 0.7: ascii, binary and binary_compressed, read and written."""
+"""PCD files of the Point Cloud Library, version 0.7: ascii, binary and binary_compressed are read, binary is written."""
 
 from __future__ import annotations
 
 import io
+import math
 import re
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError, cause
-from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import AXES, float_table, organised, packed_columns
+from lslam.errors import InputError, cause
+from lslam.formats.point_cloud import AXES, organised, packed_columns, text_columns
 from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
@@ -29,17 +30,16 @@ _KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWP
 @dataclass(frozen=True)
 class _Header:
     names: list[str]
-    counts: list[int]
-    dtype: np.dtype[Any]  # of one point, its fields numbered
+    dtype: np.dtype[Any]  # of one point, its fields numbered; those that repeat are arrays
     points: int
     shape: tuple[int, int]  # rows and columns
     encoding: str
     size: int  # bytes of the header itself
 
     @property
-    def codes(self) -> list[np.dtype[Any]]:
-        """Types of the numbers of each field."""
-        return [self.dtype[k].base for k in range(len(self.names))]
+    def kinds(self) -> list[np.dtype[Any]]:
+        """Types of the fields."""
+        return [self.dtype[k] for k in range(len(self.names))]
 
 
 def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
@@ -62,30 +62,13 @@ def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
     return columns | (organised(height, width) if height * width == header.points else {})
 
 
-def write_pcd(
-    path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, encoding: str = "binary"
-) -> None:
-    """Write points (N, 3), m, and intensity (N,) as float32, atomically, in one of `ENCODINGS`."""
-    if encoding not in ENCODINGS:
-        raise UsageError(f"unknown PCD encoding {encoding!r}; known: {', '.join(ENCODINGS)}")
-    table = float_table(points, intensity)
-    with atomic_write(path) as stream:
-        stream.write(pcd_header(len(table), ["x", "y", "z", "intensity"][: table.shape[1]], encoding))
-        if encoding == "binary":
-            stream.write(table.data)
-        elif encoding == "ascii":
-            np.savetxt(stream, table, fmt="%.9g")
-        else:
-            stream.write(_compress(np.ascontiguousarray(table.T).view(np.uint8).ravel()))
-
-
-def pcd_header(count: int, names: Sequence[str], encoding: str = "binary") -> bytes:
-    """Header of `count` points of float32 fields."""
+def pcd_header(count: int, names: Sequence[str]) -> bytes:
+    """Header of `count` binary points of float32 fields."""
     k = len(names)
     return (
         "# .PCD v0.7 - Point Cloud Data file format\n"
         f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(['4'] * k)}\nTYPE {' '.join(['F'] * k)}\n"
-        f"COUNT {' '.join(['1'] * k)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {encoding}\n"
+        f"COUNT {' '.join(['1'] * k)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
     ).encode()
 
 
@@ -109,28 +92,28 @@ def _read_header(path: Path, data: bytes) -> _Header:
 
 def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Header:
     names = entries.get("FIELDS", [])
-    sizes, kinds = entries.get("SIZE", []), entries.get("TYPE", [])
+    sizes, types = entries.get("SIZE", []), entries.get("TYPE", [])
     repeats = entries.get("COUNT", ["1"] * len(names))
     if not names:
         raise InputError(f"{path}: PCD header has no FIELDS")
-    if not len(names) == len(sizes) == len(kinds) == len(repeats):
+    if not len(names) == len(sizes) == len(types) == len(repeats):
         raise InputError(
-            f"{path}: PCD header contradicts itself: {len(names)} FIELDS, {len(sizes)} SIZE, {len(kinds)} TYPE, "
+            f"{path}: PCD header contradicts itself: {len(names)} FIELDS, {len(sizes)} SIZE, {len(types)} TYPE, "
             f"{len(repeats)} COUNT"
         )
-    codes: list[str] = []
-    for name, length, kind in zip(names, sizes, kinds, strict=True):
+    kinds: list[tuple[str, str, tuple[int, ...]]] = []
+    for name, length, kind, repeat in zip(names, sizes, types, repeats, strict=True):
         if kind not in _KINDS or whole_number(length) not in _KINDS[kind]:
             raise InputError(f"{path}: PCD field {name!r} has TYPE {kind} with SIZE {length}, which does not exist")
-        codes.append(f"<{kind.lower()}{length}")
-    counts = [_number(path, "COUNT", c) for c in repeats]
-    if not any(counts):
+        count = _number(path, "COUNT", repeat)
+        kinds.append((str(len(kinds)), f"<{kind.lower()}{length}", () if count == 1 else (count,)))
+    if not any(math.prod(shape) for _, _, shape in kinds):
         raise InputError(f"{path}: PCD header has no FIELDS")
-    shapes = [() if count == 1 else (count,) for count in counts]
     try:
-        dtype = np.dtype([(str(k), code, shape) for k, (code, shape) in enumerate(zip(codes, shapes, strict=True))])
+        dtype = np.dtype(kinds)
     except ValueError:
-        raise InputError(f"{path}: PCD header says {sum(counts)} numbers a point: too many") from None
+        numbers = sum(math.prod(shape) for _, _, shape in kinds)
+        raise InputError(f"{path}: PCD header says {numbers} numbers a point: too many") from None
     width = _number(path, "WIDTH", *entries.get("WIDTH", ["0"]))
     height = _number(path, "HEIGHT", *entries.get("HEIGHT", ["1"]))
     points = _number(path, "POINTS", *entries.get("POINTS", [str(width * height)]))
@@ -141,7 +124,7 @@ def _check_header(path: Path, entries: dict[str, list[str]], size: int) -> _Head
     encoding = entries["DATA"][0].lower() if entries["DATA"] else ""
     if encoding not in ENCODINGS:
         raise InputError(f"{path}: PCD DATA {encoding!r} is unknown; known: {', '.join(ENCODINGS)}")
-    return _Header(names, counts, dtype, points, (height, width), encoding, size)
+    return _Header(names, dtype, points, (height, width), encoding, size)
 
 
 def _number(path: Path, key: str, *words: str) -> int:
@@ -152,7 +135,7 @@ def _number(path: Path, key: str, *words: str) -> int:
 
 
 def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, NDArray[Any]]:
-    width = sum(header.counts)
+    width = sum(math.prod(kind.shape) for kind in header.kinds)
     lines = bytes(body).split(b"\n")
     while lines and not lines[-1].strip():
         lines.pop()
@@ -168,15 +151,10 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
         table, unread = mixed
     if table.shape != (header.points, width):
         raise InputError(f"{path}: PCD ascii lines hold {table.shape[1]} numbers where FIELDS and COUNT say {width}")
-    columns, k = {}, 0
-    for name, count, code in zip(header.names, header.counts, header.codes, strict=True):
-        values = table[:, k] if count == 1 else table[:, k : k + count]
-        # Text holds the digits that it holds, whatever type its header names.
-        as_read = name.lower() in AXES or code.kind != "f"
-        label = f"{name} (bytes in place of digits)" if k in unread else name
-        columns[label] = values if as_read else values.astype(code)
-        k += count
-    return columns
+    starts = accumulate((math.prod(kind.shape) for kind in header.kinds[:-1]), initial=0)
+    fields = zip(header.names, starts, strict=True)
+    labels = [f"{name} (bytes in place of digits)" if k in unread else name for name, k in fields]
+    return text_columns(table, labels, header.kinds)
 
 
 def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[NDArray[np.float64], set[int]] | None:
@@ -184,10 +162,11 @@ def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[NDArray[np.float
 
     C++ streams a char so: all columns of one byte are read as that. Any other one column of a few bytes is left NaN and named.
     """
-    if 2 * sum(header.counts) * header.points > len(body) + 1:
+    counts = [math.prod(kind.shape) for kind in header.kinds]
+    if 2 * sum(counts) * header.points > len(body) + 1:
         return None
-    sizes = np.repeat([code.itemsize for code in header.codes], header.counts)
-    is_axis = np.repeat([name.lower() in AXES for name in header.names], header.counts)
+    sizes = np.repeat([kind.base.itemsize for kind in header.kinds], counts)
+    is_axis = np.repeat([name.lower() in AXES for name in header.names], counts)
     chars = set(np.flatnonzero(sizes == 1).tolist())
     others = [{k} for k in np.flatnonzero((sizes > 1) & ~is_axis).tolist()]
     for raw in [chars, *others] if chars else others:
@@ -228,17 +207,8 @@ def _compressed_columns(path: Path, header: _Header, body: memoryview) -> dict[s
     if decompress(source, out) != plain:
         raise InputError(f"{path}: PCD compressed data are damaged")
     columns, at = {}, 0
-    for name, count, code in zip(header.names, header.counts, header.codes, strict=True):
-        size = header.points * count * code.itemsize
-        values = out[at : at + size].view(code)
-        columns[name] = values if count == 1 else values.reshape(header.points, count)
-        at += size
+    for name, kind in zip(header.names, header.kinds, strict=True):
+        end = at + header.points * kind.itemsize
+        columns[name] = out[at:end].view(kind.base).reshape(header.points, *kind.shape)
+        at = end
     return columns
-
-
-def _compress(plain: NDArray[np.uint8]) -> bytes:
-    from lslam.kernels.lzf import compress
-
-    target = np.empty(len(plain) + len(plain) // 32 + 16, np.uint8)
-    size = compress(plain, target, np.full(65536, -1, np.int64))
-    return struct.pack("<II", size, len(plain)) + target[:size].tobytes()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import AXES, packed_columns
+from lslam.formats.point_cloud import packed_columns, text_columns
 from lslam.untrusted import whole_number
 
 _TYPES = {
@@ -141,8 +141,5 @@ def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int
         raise InputError(
             f"{path}: PLY ascii lines hold {table.shape[1]} numbers for {len(element.properties)} properties"
         )
-    return {
-        # Text holds the digits that it holds, whatever type its header names.
-        name: table[:, k] if name.lower() in AXES or not code.startswith("f") else table[:, k].astype(code)
-        for k, (name, code) in enumerate(element.properties)
-    }
+    names, codes = zip(*element.properties, strict=True)
+    return text_columns(table, names, [np.dtype(code) for code in codes])

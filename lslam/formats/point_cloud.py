@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -119,6 +120,19 @@ def packed_columns(
         raise InputError(f"{path}: {kind} header says {count} points of {record} bytes, the file holds {whole}")
     table = np.ndarray((count,), dtype, data, at if count else 0)
     return {name: table[str(k)] for k, name in enumerate(names)}
+
+
+def text_columns(
+    table: NDArray[np.float64], names: Sequence[str], kinds: Sequence[np.dtype[Any]]
+) -> dict[str, NDArray[Any]]:
+    """Columns of numbers (N, K) that were text, by field; axes hold the digits that they hold, whatever type a header names."""
+    columns, k = {}, 0
+    for name, kind in zip(names, kinds, strict=True):
+        end = k + math.prod(kind.shape)
+        values = table[:, k:end].reshape(len(table), *kind.shape)
+        columns[name] = values if name.lower() in AXES or kind.base.kind != "f" else values.astype(kind.base)
+        k = end
+    return columns
 
 
 def float_table(points: NDArray[Any], intensity: NDArray[Any] | None) -> NDArray[np.float32]:

@@ -15,8 +15,8 @@ from lslam.errors import InputError, UsageError, cause
 from lslam.formats.array_headers import HEADERS
 from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
-from lslam.formats.pcd_files import pcd_columns, pcd_header, write_pcd
-from lslam.formats.ply_files import ply_columns, ply_header, write_ply
+from lslam.formats.pcd_files import pcd_columns, pcd_header
+from lslam.formats.ply_files import ply_columns, ply_header
 from lslam.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
 from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
 from lslam.remote import RemotePath
@@ -111,28 +111,15 @@ def _other_sizes(size: int, record: PointRecord) -> str:
     return ", ".join(sizes) or "another number of"
 
 
-def write_points(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, *, comment: str = "") -> None:
-    """Write points (N, 3), m, and intensity (N,) as float32 to a .ply, .pcd (both binary), .bin or .npy file, atomically.
+def write_bin(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None) -> None:
+    """Write points (N, 3), m, and intensity (N,), or zeros, as KITTI's records, atomically.
 
-    `comment` goes into PLY headers only. Raises UsageError on another suffix or arrays that do not match, OutputError
-    when the file cannot be written.
+    Raises UsageError on arrays that do not match, OutputError when the file cannot be written.
     """
     if np.ndim(points) != 2 or np.shape(points)[1] != 3 or (intensity is not None and len(intensity) != len(points)):
         raise UsageError(f"{path}: points must be (N, 3) and intensity (N,), not {np.shape(points)}")
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        write_ply(path, points, intensity, comment)
-    elif suffix == ".pcd":
-        write_pcd(path, points, intensity)
-    elif suffix in (".bin", ".npy"):
-        table = float_table(points, np.zeros(len(points)) if intensity is None else intensity)
-        with atomic_write(path) as stream:
-            if suffix == ".npy":
-                np.save(stream, table)
-            else:
-                stream.write(table.data)
-    else:
-        raise UsageError(f"{path}: no point file lslam writes; known suffixes: {', '.join(SUFFIXES)}")
+    with atomic_write(path) as stream:
+        stream.write(float_table(points, np.zeros(len(points)) if intensity is None else intensity).data)
 
 
 def read_array(path: Path) -> NDArray[Any]:

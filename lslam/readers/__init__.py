@@ -83,29 +83,21 @@ def open_sequence(
 
     if rate_hz is not None and not is_rate(rate_hz):
         raise UsageError(f"a scan rate of {rate_hz} Hz makes no sense")
+    topics: dict[str, Any] = {
+        "lidar_topic": lidar_topic, "lidar_frame": lidar_frame, "imu_topic": imu_topic, "gnss_topic": gnss_topic,
+    }  # fmt: skip
     overrides = SequenceInfo(
-        rows=rows,
-        cols=cols,
-        rate_hz=rate_hz,
-        motion_compensated=motion_compensated,
-        vertical_correction_deg=vertical_correction_deg,
-        T_lidar_imu=None if extrinsics is None else read_transform(extrinsics),
-        lidar_topic=lidar_topic,
-        lidar_frame=lidar_frame,
-        imu_topic=imu_topic,
-        gnss_topic=gnss_topic,
-        point_times=None if point_times == "auto" else point_times,
-    )
+        rows=rows, cols=cols, rate_hz=rate_hz, motion_compensated=motion_compensated,
+        vertical_correction_deg=vertical_correction_deg, point_times=None if point_times == "auto" else point_times,
+        T_lidar_imu=None if extrinsics is None else read_transform(extrinsics), **topics,
+    )  # fmt: skip
     try:
         sequence = _open(folder, overrides)
     except OSError as error:
         raise _unreadable(name_or_path, error) from None
     from lslam.readers.raw_drive import with_streams
 
-    flags = {
-        "--lidar-topic": lidar_topic, "--lidar-frame": lidar_frame, "--imu-topic": imu_topic, "--gnss-topic": gnss_topic,
-    }  # fmt: skip
-    given = [flag for flag, name in flags.items() if name is not None]
+    given = [f"--{key.replace('_', '-')}" for key, name in topics.items() if name is not None]
     if given and sequence.kind != "bag":
         raise UsageError(f"{', '.join(given)} is for bags: {folder} is {sequence.kind}")
     sequence = with_streams(sequence, imu, gnss, data_root)

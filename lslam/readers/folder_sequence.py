@@ -27,7 +27,7 @@ from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.scan_records import scan_record
 from lslam.readers.scan_stamps import rows_of_scans
 from lslam.readers.sequence_on_disk import SequenceOnDisk
-from lslam.readers.sidecars import compensation_note, load_gnss, load_imu, per_point_folder, read_info, stated_times
+from lslam.readers.sidecars import compensation_note, load_streams, per_point_folder, read_info, stated_times
 from lslam.types.scan import Scan, Span
 from lslam.types.trajectory import Trajectory
 
@@ -147,8 +147,8 @@ class Folder:
     def sequence(self, **parts: Any) -> FolderSequence:
         """The sequence of `parts`, see `FolderSequence`, with what is stated of every kind of folder, its points in m."""
         info, problems = self.info, self.voice.problems
-        beside = {"imu": load_imu, "gnss": load_gnss}
-        parts = {name: load(self.path, info, problems) for name, load in beside.items() if name not in parts} | parts
+        if "imu" not in parts:
+            parts["imu"], parts["gnss"] = load_streams(self.path, info, problems)
         sequence = FolderSequence(**{
             "name": info.name or printable(self.path.name), "path": self.path, "kind": self.kind, "files": self.files,
             "motion_compensated": info.motion_compensated, "record": self.record, "rows": info.rows, "cols": info.cols,

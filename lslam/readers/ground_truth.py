@@ -18,7 +18,7 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
 from lslam.geometry import geodesy, portable, se3, so3
 from lslam.geometry.interpolate import poses_at
-from lslam.readers.listing import file_numbers, rows_of
+from lslam.readers.listing import file_numbers, filled_stamps, rows_of
 from lslam.remote import RemotePath, as_path
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
@@ -96,20 +96,9 @@ def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
     known = found[have]
     if len(known) < 2 or np.any(np.diff(known) <= 0) or (not have.all() and len(truth) == len(files)):
         return None
-    return Numbered(truth.select(known), have, _stamps_by_number(numbers_of_files, have, truth.stamps_ns[known]))
-
-
-def _stamps_by_number(
-    numbers_of_files: NDArray[np.int64], have: NDArray[np.bool_], known: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """(N,) ns: `known` where there are any, between them evenly, before and after them at their median step."""
-    at, since = numbers_of_files[have], known - known[0]
-    step = float(np.median(np.diff(since) / np.diff(at)))
-    reckoned = np.interp(numbers_of_files, at, since)
-    reckoned += step * (np.minimum(numbers_of_files - at[0], 0) + np.maximum(numbers_of_files - at[-1], 0))
-    stamps: NDArray[np.int64] = known[0] + np.rint(reckoned).astype(np.int64)
-    stamps[have] = known
-    return stamps
+    return Numbered(
+        truth.select(known), have, filled_stamps(numbers_of_files, numbers_of_files[have], truth.stamps_ns[known])
+    )
 
 
 def to_lidar(

@@ -25,7 +25,7 @@ from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.folder_sequence import Folder, FolderSequence
 from lslam.readers.ground_truth import find_ground_truth, oxts_truth, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps, rows_of
-from lslam.readers.sidecars import calibration_over, load_gnss, load_imu, vertical_correction
+from lslam.readers.sidecars import calibration_over, load_streams, vertical_correction
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Calibration
@@ -87,11 +87,14 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
             "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
             "leaves scans as they are)"
         )
-    imu, gnss = (None, None) if oxts is None or oxts.stamps_ns is None else oxts_streams(oxts, oxts.stamps_ns)
+    imu, gnss = load_streams(path, info, voice.problems)
+    if oxts is not None and oxts.stamps_ns is not None:
+        of_oxts = oxts_streams(oxts, oxts.stamps_ns)
+        imu, gnss = imu or of_oxts[0], gnss or of_oxts[1]
     return folder.sequence(
         stamps_ns=stamps, rate_hz=rate, motion_compensated=compensated, calibration=calibration,
         ground_truth=_ground_truth(folder, stamps, oxts, calibration),
-        imu=load_imu(path, info, voice.problems) or imu, gnss=load_gnss(path, info, voice.problems) or gnss,
+        imu=imu, gnss=gnss,
         correction_deg=vertical_correction(info, folder.files, folder.record, voice.notes), sweep_s=sweep,
         sensor=info.sensor or (None if folder.has_toml else "HDL-64E"),
     )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,17 @@ def rows_of(files: list[Path], count: int) -> tuple[NDArray[np.int64], str]:
 def nominal_stamps(count: int, rate_hz: float, start_ns: int = 0) -> Stamps:
     """(count,) ns at `rate_hz` from `start_ns`."""
     return start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def filled_stamps(numbers: NDArray[Any], at: NDArray[Any], stamps: Stamps) -> Stamps:
+    """(N,) ns of scans by their `numbers`: `stamps` (M,) of those numbered `at`, evenly between, at the median step beyond."""
+    steps = np.diff(stamps) / np.diff(at)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    since = np.interp(numbers, at, stamps - stamps[0])
+    since += step * (np.minimum(numbers - at[0], 0) + np.maximum(numbers - at[-1], 0))
+    filled: Stamps = stamps[0] + np.rint(since).astype(np.int64)
+    filled[np.isin(numbers, at)] = stamps
+    return filled
 
 
 def load_stamps(path: Path, problems: list[str]) -> Stamps | None:

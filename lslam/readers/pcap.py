@@ -21,7 +21,7 @@ from lslam.readers.pcap_ouster import open_ouster
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.pcap_velodyne import open_velodyne
 from lslam.readers.sequence_on_disk import SequenceOnDisk
-from lslam.readers.sidecars import calibration_over, compensation_note, load_gnss, load_imu, read_info, stated_times
+from lslam.readers.sidecars import calibration_over, compensation_note, load_streams, read_info, stated_times
 from lslam.types.scan import Scan
 from lslam.types.sequence import Calibration, no_shared_time
 
@@ -76,7 +76,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
         stated_times=stated_times(info),
         calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),
     )  # fmt: skip
-    beside = load_imu(path.parent, info, voice.problems)
+    beside, sequence.gnss = load_streams(path.parent, info, voice.problems)
     sequence.imu = opened.imu if beside is None else beside
     if beside is not None and info.T_lidar_imu is None:
         voice.problems.append(
@@ -85,7 +85,6 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
         )
         sequence.calibration = calibration_over(info, Calibration(T_lidar_imu=np.eye(4)))
         sequence.has_assumed_extrinsics = True
-    sequence.gnss = load_gnss(path.parent, info, voice.problems)
     stamps = sequence.stamps_ns
     for what, stream in (("IMU", sequence.imu), ("GNSS", sequence.gnss)):
         if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):

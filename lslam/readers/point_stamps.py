@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
-from lslam.readers.listing import DEFAULT_RATE_HZ
+from lslam.readers.listing import DEFAULT_RATE_HZ, filled_stamps
 from lslam.readers.point_clock import PointClock, read_samples
 from lslam.readers.point_times import Sample, learn_rule
 
@@ -45,7 +45,7 @@ def point_stamps(count: int, read: Callable[[int], PointCloud], rate_hz: float |
     at, stamps = np.array(list(begins), np.int64), np.array(list(begins.values()), np.int64)
     if not len(at) or 2 * len(at) < count or (np.diff(stamps) < 0.5e9 * clock.rule.sweep_s).any():
         return None
-    return PointStamps(_filled(count, at, stamps), clock.rule.sweep_s, clock.rule.field)
+    return PointStamps(filled_stamps(np.arange(count), at, stamps), clock.rule.sweep_s, clock.rule.field)
 
 
 def _clock(count: int, read: Callable[[int], PointCloud], rate_hz: float | None) -> PointClock | None:
@@ -56,17 +56,6 @@ def _clock(count: int, read: Callable[[int], PointCloud], rate_hz: float | None)
             rule = learn_rule(samples, rate)
             return PointClock(rule, rate) if rule is not None and rule.is_absolute else None
     return None
-
-
-def _filled(count: int, at: NDArray[np.int64], stamps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(count,) ns: `stamps` at the indices `at`, evenly between them, at the median step before and after."""
-    step = float(np.median(np.diff(stamps) / np.diff(at))) if len(at) > 1 else 0.0
-    index = np.arange(count)
-    since = np.interp(index, at, stamps - stamps[0])
-    since += step * (np.minimum(index - at[0], 0) + np.maximum(index - at[-1], 0))
-    filled: NDArray[np.int64] = stamps[0] + np.rint(since).astype(np.int64)
-    filled[at] = stamps
-    return filled
 
 
 def onto_recording(points: PointStamps, recorded: Stamps) -> tuple[Stamps, str]:

@@ -17,7 +17,7 @@ from lslam.readers.folder_sequence import Folder, FolderSequence
 from lslam.readers.ground_truth import Numbered, find_ground_truth, pair_by_number, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, check_stamps, list_scans, nominal_stamps
 from lslam.readers.scan_stamps import StampedScans, stamp_scans
-from lslam.readers.sidecars import calibration_over, load_gnss, load_imu
+from lslam.readers.sidecars import calibration_over, load_streams
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Calibration
@@ -50,7 +50,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
     calib = path / "calib.txt"
     T_cam0_lidar = folder.calibration(calib, read_odometry_calib) if calib.is_file() else None
     calibration = calibration_over(info, Calibration(T_cam0_lidar))
-    imu, gnss = load_imu(path, info, voice.problems), load_gnss(path, info, voice.problems)
+    imu, gnss = load_streams(path, info, voice.problems)
     beside = [stream.stamps_ns for stream in (imu, gnss) if stream is not None and len(stream)]
     scans, truth = _stamps_and_truth(folder, beside, calibration)
     folder.files = scans.files

@@ -14,7 +14,7 @@ from lslam.formats.point_cloud import PointCloud
 from lslam.formats.pose_rows import read_rows
 from lslam.readers.clocks import Clock, agree, jitter_notes, onto, stands_still
 from lslam.readers.ground_truth import Voice
-from lslam.readers.listing import check_stamps, file_numbers, load_stamps, rows_of
+from lslam.readers.listing import check_stamps, file_numbers, filled_stamps, load_stamps, rows_of
 from lslam.readers.name_stamps import stamps_in_names
 from lslam.readers.point_stamps import PointStamps, point_stamps
 from lslam.untrusted import whole_number
@@ -187,6 +187,4 @@ def _filled_gaps(stamps: Stamps, count: int) -> Stamps | None:
     whole = np.rint(steps / step)
     if np.abs(steps / step - whole).max() > _NEAR or len(stamps) + int((whole - 1).sum()) != count:
         return None
-    at = np.concatenate([[0], np.cumsum(whole)])
-    filled: Stamps = stamps[0] + np.rint(np.interp(np.arange(count), at, stamps - stamps[0])).astype(np.int64)
-    return filled
+    return filled_stamps(np.arange(count), np.concatenate([[0], np.cumsum(whole)]), stamps)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,11 +13,11 @@ import numpy as np
 from lslam.errors import InputError
 from lslam.formats.point_files import read_points
 from lslam.formats.point_records import KITTI, PointRecord
-from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
+from lslam.formats.sequence_toml import EXTRINSICS, FILE_NAME, SequenceInfo, read_sequence_toml
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
-from lslam.types.sequence import Calibration, StatedTimes
+from lslam.types.sequence import Calibration, StatedTimes, readable
 
 T = TypeVar("T")
 
@@ -81,12 +82,8 @@ def vertical_correction(info: SequenceInfo, files: list[Path], record: PointReco
 
 def _top_elevation_deg(files: list[Path], record: PointRecord | None) -> float | None:
     """99th percentile of elevation in the first scan that can be read, None when there is none."""
-    for path in files[:5]:
-        try:
-            points = read_points(path, record).points
-        except InputError:
-            continue
-        points = points[np.isfinite(points).all(1)]
+    for _, cloud in readable(range(len(files[:5])), lambda k: read_points(files[k], record)):
+        points = cloud.points[np.isfinite(cloud.points).all(1)]
         h = np.hypot(points[:, 0], points[:, 1])
         far = h > 2
         if far.sum() >= 100:
@@ -94,23 +91,15 @@ def _top_elevation_deg(files: list[Path], record: PointRecord | None) -> float |
     return None
 
 
-def load_imu(folder: Path, info: SequenceInfo, problems: list[str]) -> ImuStream | None:
-    """The IMU file `sequence.toml` names, or `imu.csv` in the sequence folder."""
-    return _load(folder, info.imu, "imu.csv", read_imu_csv, problems)
-
-
-def load_gnss(folder: Path, info: SequenceInfo, problems: list[str]) -> GnssStream | None:
-    """The GNSS file `sequence.toml` names, or `gnss.csv` in the sequence folder."""
-    return _load(folder, info.gnss, "gnss.csv", read_gnss_csv, problems)
+def load_streams(folder: Path, info: SequenceInfo, problems: list[str]) -> tuple[ImuStream | None, GnssStream | None]:
+    """The IMU and the fixes in the files that `sequence.toml` names, or in `imu.csv` and `gnss.csv` in the sequence folder."""
+    imu = _load(folder, info.imu, "imu.csv", read_imu_csv, problems)
+    return imu, _load(folder, info.gnss, "gnss.csv", read_gnss_csv, problems)
 
 
 def calibration_over(info: SequenceInfo, found: Calibration) -> Calibration:
     """Extrinsics that `sequence.toml` states, else those found."""
-    return Calibration(
-        T_cam0_lidar=found.T_cam0_lidar if info.T_cam0_lidar is None else info.T_cam0_lidar,
-        T_lidar_imu=found.T_lidar_imu if info.T_lidar_imu is None else info.T_lidar_imu,
-        T_lidar_gnss=found.T_lidar_gnss if info.T_lidar_gnss is None else info.T_lidar_gnss,
-    )
+    return replace(found, **{name: T for name in EXTRINSICS if (T := getattr(info, name)) is not None})
 
 
 def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest, sample_copy, strict_json
+from point_writers import write_points
 
-from lslam.formats.point_files import write_points
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3, so3
 from lslam.readers import open_sequence

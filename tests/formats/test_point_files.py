@@ -13,10 +13,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
+from point_writers import ENCODINGS, write_pcd, write_points
 
 from lslam.errors import InputError, OutputError, UsageError
-from lslam.formats.pcd_files import ENCODINGS, write_pcd
-from lslam.formats.point_files import read_bin, read_points, write_points
+from lslam.formats.point_files import read_bin, read_points
 
 CLOUDS = hnp.arrays(
     np.float32,
@@ -265,7 +265,7 @@ def test_writers_refuse_what_makes_no_sense(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="suffixes"):
         write_points(tmp_path / "a.xyz", points)
     with pytest.raises(UsageError, match="intensity"):
-        write_points(tmp_path / "a.ply", points, intensity[:2])
+        write_points(tmp_path / "a.bin", points, intensity[:2])
     with pytest.raises(OutputError, match="nowhere"):
         write_points(tmp_path / "nowhere" / "a.ply", points)
     assert not list(tmp_path.iterdir())

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 from formats.test_point_records import packed, revolution
 from fuzz.cases import Files, Parser
+from point_writers import write_pcd
 
-from lslam.formats.pcd_files import write_pcd
 from lslam.formats.ply_files import write_ply
 from lslam.formats.point_files import read_cloud, read_points, write_cloud
 from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2

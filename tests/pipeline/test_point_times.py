@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from point_writers import write_points
 
 from lslam.cli.main import cli
 from lslam.config import load_config
 from lslam.errors import InputError
-from lslam.formats.point_files import write_points
 from lslam.geometry import se3
 from lslam.geometry.interpolate import poses_at
 from lslam.pipeline.rebuild import open_scans, read_run

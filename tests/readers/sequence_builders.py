@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from point_writers import write_points
 
-from lslam.formats.point_files import write_points
 from lslam.geometry import se3
 
 # Camera 0 of KITTI looks along the LiDAR's x: z forward, x right, y down.

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_builders import START_NS, STEP_NS, Fill, bag, clouds, imu, scan, together
+from point_writers import write_points
 from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
@@ -17,7 +18,6 @@ from lslam.errors import InputError, StorageError, UsageError
 from lslam.formats import bag_messages
 from lslam.formats.bag_chunks import BLOCK, RangedFile
 from lslam.formats.bag_files import BagWriter
-from lslam.formats.point_files import write_points
 from lslam.pipeline.resume import input_digest, listing_digest
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence

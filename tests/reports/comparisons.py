@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from point_writers import write_points
 
-from lslam.formats.point_files import write_points
 from lslam.types.comparison import (
     Comparison,
     Difference,
