@@ -48,7 +48,7 @@ def _read_columns(path: Path, record: PointRecord | None = None) -> Mapping[str,
     if suffix == ".bin":
         raw = read_bytes(path)
         record = record or record_of({path: raw})[0]
-        _check_size(path, raw, record)
+        check_size(path, raw, record)
         return record.columns(raw)
     if suffix == ".npy":
         return _npy_columns(path, record)
@@ -74,11 +74,11 @@ def read_bin(path: Path) -> NDArray[np.float32]:
     Raises InputError naming the file and its size when that is no multiple of 16 bytes.
     """
     raw = read_bytes(path)
-    _check_size(path, raw, KITTI)
+    check_size(path, raw, KITTI)
     return raw.view("<f4").reshape(-1, 4)
 
 
-def _check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
+def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
     """Raise InputError when the bytes of a file are no multiple of those of a point."""
     if len(raw) % record.size:
         what = "x, y, z, intensity as float32" if record == KITTI else str(record)
@@ -101,7 +101,7 @@ def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str
         records = " or ".join(f"{record.size} bytes ({record})" for record in recognition.fitting)
         could = f"its values allow records of {records}"
     else:
-        _check_size(path, raw, KITTI)
+        check_size(path, raw, KITTI)
         could = f"it could be truncated, or its records are of {_other_sizes(len(raw), KITTI)} bytes"
     raise InputError(f"{path}: as {KITTI} of {KITTI.size} bytes {recognition.reason}; {could}: {WAY_OUT}")
 
@@ -211,7 +211,7 @@ def read_cloud(path: Path) -> ArrayCloud:
     step = coordinate_step(cloud.points)
     if step > COARSE_M:
         log.warning(
-            "%s: its coordinates lie in steps of %.3g m, so far from the origin are they for float32 or for their digits: write "
+            "%s: its coordinates lie in steps of %.3g m, too coarse so far from the origin: write "
             "them as double, or less an offset", path, step,
         )  # fmt: skip
     return cloud

@@ -60,10 +60,10 @@ class TextTable:
 
 def looks_like_header(line: str) -> bool:
     """Whether `line` begins with a name, or is empty before one (the index of pandas), and holds no number or date."""
-    fields = [field.strip("\"' ") for field in re.split(r"[,;\s]\s*", line.strip())]
-    name = next(filter(None, fields[:2]), "")
+    cells = split_cells(line.strip(), separator_of(line.strip()))
+    name = next(filter(None, cells[:2]), "")
     is_name = re.match(r"[A-Za-z_/]|\.[A-Za-z]", name) is not None and name.lower() not in ("nan", "inf", "infinity")
-    return is_name and not np.isfinite([_number(field) for field in fields]).any()
+    return is_name and not np.isfinite([_number(cell) for cell in cells]).any()
 
 
 def shortened(names: list[str]) -> str:

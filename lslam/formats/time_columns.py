@@ -72,8 +72,14 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
 
 
 def is_index(values: Floats) -> bool:
-    """Whether a column counts its rows: whole numbers one apart, three at least, smaller than any time since 1970."""
-    return len(values) > 2 and bool(np.all(np.diff(values) == 1)) and abs(values[0]) < 1e8
+    """Whether a column counts rows: whole numbers one apart but where rows are lost, three at least, smaller than any time
+    since 1970.
+    """
+    steps = np.diff(values)
+    is_count = (
+        len(values) > 2 and bool(np.all((steps >= 1) & (values[1:] == np.rint(values[1:])))) and abs(values[0]) < 1e8
+    )
+    return is_count and float(np.mean(steps == 1)) > 0.5
 
 
 def is_fraction(whole: Floats, rest: Floats, unit_ns: int | None = None) -> bool:
@@ -152,7 +158,9 @@ def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
     numbers = [table.numbers(k) for k in range(width)]
     out: list[Units] = []
     for k in range(width):
-        if k and not (is_index(numbers[k - 1]) or np.isnan(numbers[k - 1]).all()):
+        if np.isnan(numbers[k]).all() and k + 1 < width:
+            continue
+        if out and not is_index(numbers[k - 1]):
             break
         is_pair = k + 1 < width and is_fraction(numbers[k], numbers[k + 1])
         out.append({k: SECOND_NS, k + 1: 1} if is_pair else {k: None})

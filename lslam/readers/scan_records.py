@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.point_files import read_array, read_bytes, record_of
+from lslam.formats.point_files import check_size, read_array, read_bytes, record_of
 from lslam.formats.point_records import KITTI, PointRecord, name_columns, parse_record
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.ground_truth import Voice
@@ -34,6 +34,9 @@ def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRec
         return None
     if info.bin_record is not None:
         record = parse_record(info.bin_record)
+        misfits = [path for path, data in raw.items() if suffix == ".bin" and len(data) % record.size]
+        if 2 * len(misfits) > len(raw):
+            check_size(misfits[0], raw[misfits[0]], record)
         voice.notes.append(f"points of {len(record.names)} columns, {record}, as stated")
         return record
     if suffix == ".bin":

@@ -142,6 +142,10 @@ def test_a_record_can_be_stated(tmp_path: Path) -> None:
     assert any(f"{words}, as stated" in note for note in s.notes)
     np.testing.assert_allclose(s.scan(1).points[:, 0], revolution()["x"], atol=0.0051)
     np.testing.assert_array_equal(s.scan(1).rings, columns["ring"])
+    # Some files of many have whole records of any size, by chance.
+    (tmp_path / "sequence.toml").write_text('bin_record = "x y z intensity _:u1"\n')
+    with pytest.raises(InputError, match="bytes are no multiple of 17"):
+        open_sequence(tmp_path)
     for bad in ("x y", "x y z z", "x:f1 y z", "x y z:q3", ""):
         (tmp_path / "sequence.toml").write_text(f'bin_record = "{bad}"\n')
         with pytest.raises(InputError, match="bin_record"):

@@ -68,6 +68,7 @@ def test_stamps_files_have_the_time_of_the_table(names: str, more: str, tmp_path
         lambda k, t: f"{t // 10**9} {t % 10**9} scan_{k}.pcd",
         lambda k, t: f"{k} {t // 10**9}.{t % 10**9:09d}",
         lambda k, t: f"{k},{t}",
+        lambda k, t: f"{k + k // 7} {t // 10**9}.{t % 10**9:09d}",
         lambda k, t: f"scan_{k}.pcd,{t}",
         lambda k, t: f"scan_{k}.pcd {t // 10**9} {t % 10**9}",
         lambda k, t: f"{k} {t // 10**9} {t % 10**9}",

@@ -86,6 +86,7 @@ FILES = {
         + ",".join(f"/odom/pose/pose/{k}" for k in (*VECTORS, *(f"orientation/{a}_deg" for a in ("roll", "pitch", "yaw"))))
         + ",/odom/twist/twist/linear/x",
     ),
+    "pandas with a name for the index": lines(lambda i: [str(i), seconds(i), *pose(i)], ",", f"Unnamed: 0,timestamp,{NAMES}"),
     "pandas": lines(lambda i: [str(i), seconds(i), *pose(i)], ",", f",timestamp,{NAMES}"),
     "pandas with dates": lines(
         lambda i: [f"{np.datetime64(int(NS[i]), 'ns')}".replace("T", " "), *pose(i)], ",", f",{NAMES}"

@@ -245,6 +245,17 @@ def test_scans_lost_from_numbered_files_go_by_their_numbers(tmp_path: Path) -> N
     np.testing.assert_allclose(open_sequence(tmp_path / "a").stamps_ns, np.delete(stamps, [4, 11]), atol=1000)
 
 
+@pytest.mark.parametrize("lost_row", [None, 7])
+@pytest.mark.parametrize("label", ["{k:06d}.bin", "{k}"])
+def test_rows_go_with_the_scans_that_they_name(label: str, lost_row: int | None, tmp_path: Path) -> None:
+    stamps = lost(tmp_path / "a", [])
+    order = np.random.default_rng(0).permutation(20) if label.endswith("bin") else np.arange(20)
+    rows = [f"{label.format(k=k)} {stamps[k]}" for k in order.tolist() if k != lost_row]
+    (tmp_path / "a" / "stamps.txt").write_text("\n".join(rows))
+    s = open_sequence(tmp_path / "a")
+    np.testing.assert_array_equal(s.stamps_ns, stamps if lost_row is None else np.delete(stamps, lost_row))
+
+
 # -- what rides along
 
 
