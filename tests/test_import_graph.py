@@ -36,7 +36,7 @@ LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 # The one home of each heavy or foreign library.
 HOMES = {
     "gtsam": ["graph/"],
-    "rosbags": ["formats/bag_files.py"],
+    "rosbags": ["formats/bag_files.py", "convert/bag_writer.py"],
     "ruamel": ["formats/bag_listing.py"],
     "laspy": ["formats/las_files.py"],
     "small_gicp": ["odometry/small_gicp.py"],

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.convert.convert_trajectory import change_frame
 from lslam.convert.output import check_beside, check_output, staged
 from lslam.errors import InputError
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import INFO_TOPIC, BagWriter
+from lslam.formats.bag_files import INFO_TOPIC
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
 from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
 from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv

@@ -10,7 +10,7 @@ import sys
 import threading
 from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,7 @@ BLOCK = 1 << 15
 # Blocks asked for together, and blocks kept: 2 and 8 MB.
 _AHEAD, _KEPT = 64, 256
 LARGEST = 1 << 29  # bytes of a compressed chunk or message when it is unpacked; recorders make a thousandth of it
-_BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
-_HEAD = 1 << 12  # bytes that hold the headers of a record and of its message
+PACKED_BLOCK = 1 << 18  # compressed bytes read at a time when only the beginning of a chunk is wanted
 IN_FILE = -1  # chunk number of a message that lies in the file itself
 Pairs = NDArray[np.int64]
 
@@ -161,19 +160,19 @@ class ChunkFile:
         """`size` bytes from `position`. Raises CutOffError when the file ends before."""
         if size < 0 or position + size > self.size:
             raise CutOffError
-        if self._ranged:
-            data = self._ranged.read(position, size)
-            if len(data) < size:
-                raise CutOffError
-            return data
-        assert self._file is not None
-        data = os.pread(self._file.fileno(), size, position)
+        data = self._read(position, size)
         while len(data) < size:  # a signal, or more than the 2 GB one call reads
-            more = os.pread(self._file.fileno(), size - len(data), position + len(data))
+            more = self._read(position + len(data), size - len(data))
             if not more:
                 raise CutOffError
             data += more
         return data
+
+    def _read(self, position: int, size: int) -> bytes:
+        if self._ranged:
+            return self._ranged.read(position, size)
+        assert self._file is not None
+        return os.pread(self._file.fileno(), size, position)
 
     def expect(self, ranges: Callable[[], Iterable[tuple[int, int]]]) -> None:
         """Of a file in storage: say which (position, size) of it will be read next, as `RangedFile.expect`.
@@ -183,10 +182,6 @@ class ChunkFile:
         if self._ranged:
             with contextlib.suppress(CutOffError, struct.error, LookupError, ValueError, InputError):
                 self._ranged.expect(ranges())
-
-    def expect_messages(self, chunks: Sequence[Chunk], where: Pairs, is_head: bool) -> None:
-        """Likewise, the messages that lie there, or with `is_head` no more than their beginnings."""
-        self.expect(lambda: (_needed(None if n == IN_FILE else chunks[n], k, is_head) for n, k in where.tolist()))
 
     def part(self, chunk: Chunk | None, offset: int, size: int, is_head: bool = False) -> bytes:
         """At most `size` bytes of the records of `chunk` from `offset`; None is the file itself.
@@ -233,19 +228,10 @@ class ChunkFile:
             if engine.needs_input:
                 if used == chunk.size:
                     raise EOFError("it ends too early")
-                data = self.read(chunk.position + used, min(_BLOCK, chunk.size - used))
+                data = self.read(chunk.position + used, min(PACKED_BLOCK, chunk.size - used))
                 used += len(data)
             records += engine.decompress(data, max_length=least - len(records))
         return bytes(records)
-
-
-def _needed(chunk: Chunk | None, offset: int, is_head: bool) -> tuple[int, int]:
-    """Position and size of what is read first of a message."""
-    if chunk is None:
-        return offset, _HEAD
-    if chunk.compression:
-        return chunk.position, min(_BLOCK, chunk.size) if is_head else chunk.size
-    return chunk.position + offset, _HEAD
 
 
 def unpack(compression: str, packed: bytes, most: int = LARGEST) -> bytes:

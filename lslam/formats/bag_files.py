@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2, read and written without ROS. What rosbags knows of message types is used nowhere else.
+"""Bags of ROS 1 and ROS 2, read without ROS.
 
 Reading goes through an index of our own: any message can be read at any time, the files are never loaded, and recordings that
 were cut off or never indexed are read as far as they are whole.
@@ -6,23 +6,18 @@ were cut off or never indexed are read as far as they are whole.
 
 from __future__ import annotations
 
-import contextlib
-import os
-import shutil
-import sqlite3
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError, UsageError, cause
+from lslam.errors import InputError
 from lslam.formats.bag_chunks import Topic, unpack, zstd
 from lslam.formats.bag_listing import (
     SUFFIXES,
@@ -33,41 +28,26 @@ from lslam.formats.bag_listing import (
     shown,
     suffix_of,
 )
+from lslam.formats.bag_records import ChunkedBag
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.bag_unpacking import unpacked
 from lslam.formats.mcap_records import McapFile
 from lslam.formats.ros1_records import Ros1Bag
 from lslam.remote import RemotePath
 
+T = TypeVar("T")
+
 # Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
 INFO_TOPIC = "/lslam/sequence"
-# What belongs to the whole of a run.
-MAP_TOPIC, PATH_TOPIC = "/map", "/path"
-LATCHED = ("/tf_static", INFO_TOPIC, MAP_TOPIC, PATH_TOPIC)
-KINDS = ("bag", "mcap", "sqlite")
 _ENCODINGS = ("cdr", "ros1")
+_SAID = 3  # damaged messages that are named one by one
 _ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
 _ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
 
 
-class Recording(Protocol):
-    """One file of a bag."""
-
-    path: Path
-    topics: list[Topic]
-    loss: str
-
-    def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
-        """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
-        ...
-
-    def expect(self, topic: Topic, is_head: bool) -> None:
-        """Know that all messages of `topic` will be read next, or their beginnings; only storage makes use of it."""
-        ...
-
-
+Recording = ChunkedBag | SqliteBag
 _Reader = Callable[[Path, Path], Recording]
 READERS: dict[str, _Reader] = {".bag": Ros1Bag, ".bag.active": Ros1Bag, ".mcap": McapFile, ".db3": SqliteBag}
 _MAGIC: dict[bytes, _Reader] = {b"#ROSBAG": Ros1Bag, b"\x89MCAP0": McapFile, b"SQLite format 3": SqliteBag}
@@ -151,11 +131,6 @@ class Bag:
         """Topics with messages that lslam can decode, of the types whose names (`Imu`, `PointCloud2`) are given."""
         return [t for t in self.topics if len(t) and t.encoding in _ENCODINGS and t.type.rsplit("/", 1)[-1] in names]
 
-    def expect(self, topic: BagTopic, is_head: bool = False) -> None:
-        """Say that all messages of `topic` will be read next, or no more than their beginnings."""
-        for recording, part in topic.parts:
-            recording.expect(part, is_head)
-
     def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
         """Message `k` of `topic` as it was serialised, or its first `limit` bytes at the least.
 
@@ -165,24 +140,32 @@ class Bag:
         data = recording.read(part, row, limit)
         return _unpacked(recording, part, row, limit) if data[:4] == _ZSTD else data
 
-    def messages(self, topic: BagTopic, broken: list[str]) -> Iterator[bytes]:
-        """All messages of `topic`; of those that are damaged the reason goes to `broken`."""
-        return (data for _, data in self.numbered(topic, broken))
+    def each(
+        self, topic: BagTopic, read: Callable[[bytes], T], problems: list[str], limit: int | None = None
+    ) -> Iterator[tuple[int, T]]:
+        """The number of every message of `topic` and what `read` makes of it, or of its first `limit` bytes.
 
-    def numbered(self, topic: BagTopic, broken: list[str]) -> Iterator[tuple[int, bytes]]:
-        """As `messages`, each with its number."""
-        self.expect(topic)
+        Of those that are damaged the first are named in `problems`, the others counted.
+        """
+        broken: list[str] = []
+        for recording, part in topic.parts:
+            recording.expect(part, limit is not None)
         for k in range(len(topic)):
             try:
-                yield k, self.message(topic, k)
+                value = read(self.message(topic, k, limit))
             except InputError as error:
                 broken.append(str(error))
+            else:
+                yield k, value
+        problems.extend(broken[:_SAID])
+        if len(broken) > _SAID:
+            problems.append(f"{len(broken) - _SAID} more messages of {topic.name} are damaged")
 
     def decode(self, topic: BagTopic, data: bytes) -> Any:
         """A message as an object with the fields of its type. Raises InputError when it does not fit the type."""
         from rosbags.serde import SerdeError
 
-        store = _store(topic.encoding)
+        store = typestore(topic.encoding)
         try:
             if topic.encoding == "ros1":
                 return store.deserialize_ros1(data, topic.type)
@@ -261,95 +244,8 @@ def read_header(topic: BagTopic, data: bytes) -> Header:
     return Header(seconds * 10**9 + nanoseconds, frame.lstrip("/"), at + length, order)
 
 
-class BagWriter:
-    """Writes a bag, whole or not at all: a ROS 1 `.bag`, or a ROS 2 folder, or a single file when `path` ends in .mcap or .db3.
-
-    Raises OutputError when it cannot be written, UsageError for a compression the kind does not have.
-    """
-
-    def __init__(self, path: Path, kind: str, is_zstd: bool = False) -> None:
-        if is_zstd and kind == "bag":
-            raise UsageError("--zstd is for mcap and sqlite: ROS 1 does not know it")
-        self.path, self.kind = path, kind
-        self.store = _store("ros1" if kind == "bag" else "cdr")
-        self._part = path.with_name(path.name + ".part")
-        self._connections: dict[str, Any] = {}
-        try:
-            shutil.rmtree(self._part, ignore_errors=True)
-            self._part.mkdir(parents=True)
-            self._writer = _writer(self._part / path.name, kind, is_zstd)
-        except OSError as error:
-            raise OutputError(f"{path} cannot be written: {cause(error)}") from None
-
-    def __enter__(self) -> BagWriter:
-        return self
-
-    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
-        """Write a message, an object of `store.types`. Raises OutputError for a full disk or a time before 1970."""
-        if stamp_ns < 0:
-            raise OutputError(f"{self.path} cannot hold the time {stamp_ns} ns: times of bags begin in 1970")
-        kind = message.__msgtype__
-        try:
-            if topic not in self._connections:
-                more = _latched(self.kind) if topic in LATCHED else {}
-                self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self.store, **more)
-            serialise = self.store.serialize_ros1 if self.kind == "bag" else self.store.serialize_cdr
-            self._writer.write(self._connections[topic], stamp_ns, serialise(message, kind))
-        except (OSError, sqlite3.Error) as error:
-            raise OutputError(f"{self.path} cannot be written: {cause(error)}") from None
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            if kind is not None:
-                with contextlib.suppress(Exception):
-                    self._writer.abort()
-                return
-            self._writer.close()
-            made = self._part / self.path.name
-            if made.is_dir() and self.path.suffix in (".mcap", ".db3"):
-                made = next(p for p in made.iterdir() if p.suffix == self.path.suffix)
-            os.replace(made, self.path)
-        except (OSError, sqlite3.Error) as failure:
-            raise OutputError(f"{self.path} cannot be written: {cause(failure)}") from None
-        finally:
-            shutil.rmtree(self._part, ignore_errors=True)
-
-
-def _writer(path: Path, kind: str, is_zstd: bool) -> Any:
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
-
-    writer: Any = Writer1(path)
-    if kind != "bag":
-        # The newest metadata with the notation of QoS that ROS 2 had before Jazzy.
-        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer = Writer2(path, version=8, storage_plugin=plugin)
-        if is_zstd:
-            mode = CompressionMode.STORAGE if kind == "mcap" else CompressionMode.MESSAGE
-            writer.set_compression(mode, CompressionFormat.ZSTD)
-    writer.open()
-    return writer
-
-
-def _latched(kind: str) -> dict[str, Any]:
-    """What makes nodes that come late hear the last message of a topic."""
-    if kind == "bag":
-        return {"latching": 1}
-    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-
-    never = QosTime(2147483647, 4294967295)
-    quality = Qos(
-        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
-        QosLiveliness.AUTOMATIC, never, False,
-    )  # fmt: skip
-    return {"offered_qos_profiles": [quality]}
-
-
 @cache
-def _store(encoding: str) -> Any:
+def typestore(encoding: str) -> Any:
     """The standard message types: their layout never changed, so what a bag says about them is not needed."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.bag_chunks import IN_FILE, Chunk, ChunkFile, CutOffError, Topic
+from lslam.formats.bag_chunks import IN_FILE, PACKED_BLOCK, Chunk, ChunkFile, CutOffError, Topic
 
 # What reading a damaged record ends in.
 BROKEN = (CutOffError, struct.error, LookupError, ValueError, OverflowError)
+_HEAD = 1 << 12  # bytes that hold the headers of a record and of its message
 INDICES = 8192  # bytes of the indices of a chunk, about
 _COMPRESSIONS = ("", "bz2", "lz4", "zstd")
 Rows = NDArray[np.int64]
@@ -94,7 +95,16 @@ class ChunkedBag(ABC):
 
     def expect(self, topic: Topic, is_head: bool) -> None:
         """Know that all messages of `topic` will be read next, or no more than their beginnings."""
-        self._file.expect_messages(self._chunks, topic.where, is_head)
+
+        def places() -> Iterator[tuple[int, int]]:
+            for number, offset in topic.where.tolist():
+                chunk = Chunk(0, 0, 0) if number == IN_FILE else self._chunks[number]
+                if chunk.compression:
+                    yield chunk.position, min(PACKED_BLOCK, chunk.size) if is_head else chunk.size
+                else:
+                    yield chunk.position + offset, _HEAD
+
+        self._file.expect(places)
 
     @abstractmethod
     def _misnomer(self, head: bytes) -> str:

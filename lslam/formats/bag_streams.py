@@ -42,10 +42,10 @@ class Stream:
 _Row = tuple[int, str, Sequence[float]] | None
 
 
-def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
+def read_imu(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
     """Samples (N, 6) of a sensor_msgs/Imu topic: acceleration, m/s2, and angular velocity, rad/s; nothing is converted.
 
-    Messages that are damaged are left out, the reasons go to `broken`.
+    Messages that are damaged are left out and named in `problems`.
     """
 
     def sample(data: bytes) -> _Row:
@@ -56,10 +56,10 @@ def read_imu(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
         accel, gyro = (struct.unpack_from(f"{header.order}3d", data, at + offset) for offset in (_ACCEL, _GYRO))
         return header.stamp_ns, header.frame, accel + gyro
 
-    return _read(bag, topic, broken, 6, sample)
+    return _read(bag, topic, problems, 6, sample)
 
 
-def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
+def read_fixes(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
     """Fixes (N, 4) of a NavSatFix topic: latitude, longitude (deg), height (m), one-sigma (m, NaN when unknown).
 
     Without a fix (status below 0, NaN) a message is left out.
@@ -75,10 +75,10 @@ def read_fixes(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
         sigma = float(np.sqrt(variance)) if is_known else np.nan
         return stamp_of(message), message.header.frame_id.lstrip("/"), [*position, sigma]
 
-    return _read(bag, topic, broken, 4, fix)
+    return _read(bag, topic, problems, 4, fix)
 
 
-def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
+def read_poses(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
     """Poses T_world_body (N, 4, 4) of an Odometry or PoseStamped topic; its frame is that of the body."""
 
     def pose(data: bytes) -> _Row:
@@ -87,20 +87,15 @@ def read_poses(bag: Bag, topic: BagTopic, broken: list[str]) -> Stream:
         body = getattr(message, "child_frame_id", "").lstrip("/")
         return stamp_of(message), body, _numbers(topic, own.position, own.orientation)
 
-    stream = _read(bag, topic, broken, 7, pose)
+    stream = _read(bag, topic, problems, 7, pose)
     return replace(stream, values=_poses(stream.values))
 
 
-def _read(bag: Bag, topic: BagTopic, broken: list[str], width: int, row_of: Callable[[bytes], _Row]) -> Stream:
+def _read(bag: Bag, topic: BagTopic, problems: list[str], width: int, row_of: Callable[[bytes], _Row]) -> Stream:
     """The rows of `width` numbers that the messages of a topic say."""
     stamps, messages, values = array("q"), array("q"), array("d")
     frame = ""
-    for k, data in bag.numbered(topic, broken):
-        try:
-            row = row_of(data)
-        except InputError as error:
-            broken.append(str(error))
-            continue
+    for k, row in bag.each(topic, row_of, problems):
         if row is not None:
             stamps.append(row[0])
             messages.append(k)
@@ -116,29 +111,29 @@ def is_static(topic: BagTopic) -> bool:
     return topic.name.rsplit("/", 1)[-1] == "tf_static"
 
 
-def read_transforms(bag: Bag, topic: BagTopic, broken: list[str]) -> Transforms:
+def read_transforms(bag: Bag, topic: BagTopic, problems: list[str]) -> Transforms:
     """`T_parent_child` (N, 4, 4) by (parent, child), all that a TFMessage topic says of a pair, as it was recorded."""
     found: dict[tuple[str, str], list[list[float]]] = {}
-    for data in bag.messages(topic, broken):
-        try:
-            for t in bag.decode(topic, data).transforms:
-                pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
-                row = _numbers(topic, t.transform.translation, t.transform.rotation)
-                found.setdefault(pair, []).append(row)
-        except InputError as error:
-            broken.append(str(error))
+
+    def note(data: bytes) -> None:
+        for t in bag.decode(topic, data).transforms:
+            pair = (t.header.frame_id.lstrip("/"), t.child_frame_id.lstrip("/"))
+            row = _numbers(topic, t.transform.translation, t.transform.rotation)
+            found.setdefault(pair, []).append(row)
+
+    for _ in bag.each(topic, note, problems):
+        pass
     return {pair: _poses(np.array(rows, np.float64)) for pair, rows in found.items()}
 
 
 def read_text(bag: Bag, name: str) -> str | None:
     """The text of the last std_msgs/String on topic `name`, None when there is none."""
-    texts = [
-        str(bag.decode(topic, data).data)
-        for topic in bag.of_type("String")
-        if topic.name == name
-        for data in bag.messages(topic, [])
-    ]
-    return texts[-1] if texts else None
+    text = None
+    for topic in bag.of_type("String"):
+        if topic.name == name:
+            for _, data in bag.each(topic, bytes, []):
+                text = str(bag.decode(topic, data).data)
+    return text
 
 
 def chain(transforms: Transforms, a: str, b: str) -> Floats | None:

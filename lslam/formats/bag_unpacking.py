@@ -71,23 +71,19 @@ def _kind(path: Path) -> str:
 
 def _unpack(path: Path, kind: str, target: Any) -> str:
     size, most = 0, max(_MOST * path.stat().st_size, _LEAST)
+    library = zstd() if kind == "zstd" else import_module(_LIBRARIES[kind])
     try:
-        library = zstd() if kind == "zstd" else import_module(_LIBRARIES[kind])
         with library.open(path, "rb") as source:
             while data := source.read1(_BLOCK):
                 size += len(data)
                 if size > most:
                     raise InputError(f"{path} unpacks to more than {_MOST} times its size: it is no recording")
-                _write(path, target, data)
+                try:
+                    target.write(data)
+                except OSError as error:
+                    raise OutputError(f"{path} cannot be unpacked into {target.name}: {cause(error)}") from None
     except (EOFError, ValueError, RuntimeError, OSError, lzma.LZMAError, zlib_error, zstd().ZstdError) as error:
         if not size:
             raise InputError(f"{path} cannot be unpacked: {error}") from None
         return f"{path} is damaged or cut off: {size} bytes before that are unpacked ({error})"
     return ""
-
-
-def _write(path: Path, target: Any, data: bytes) -> None:
-    try:
-        target.write(data)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be unpacked into {target.name}: {cause(error)}") from None

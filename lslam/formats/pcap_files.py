@@ -34,6 +34,7 @@ _TSRESOL = 9  # option of an interface: the unit of its times
 _LINK_BYTES = {0: 4, 108: 4, 1: 14, 12: 0, 14: 0, 101: 0, 113: 16, 276: 20}
 _ETHERNET, _VLAN = 1, (0x8100, 0x88A8)
 _UDP, _IP_BYTES, _UDP_BYTES = 17, 20, 8
+_CUT = (EOFError, struct.error)
 
 
 @dataclass(frozen=True)
@@ -109,28 +110,23 @@ def _frames(path: Path, data: memoryview) -> tuple[Integers, str]:
         raise InputError(f"{path} is no capture: it begins with {magic.hex(' ')}, neither as pcap nor as pcapng does")
     rows: list[tuple[int, int, int, int]] = []
     loss = ""
-    for row in walk:
-        if row[1] < 0:
-            loss = f"{path} is cut off: its last record ends beyond the file, {len(rows)} before it are read"
-            break
-        rows.append(row)
+    try:
+        rows.extend(walk)
+    except _CUT:
+        loss = f"{path} is cut off: its last record ends beyond the file, {len(rows)} before it are read"
     return np.array(rows, np.int64).reshape(-1, 4), loss
 
 
 def _walk_pcap(data: memoryview, order: str, unit_ns: int) -> Iterator[tuple[int, int, int, int]]:
-    """Rows of `_frames`; the last has -1 bytes where the file is cut off."""
+    """Rows of `_frames`; raises one of `_CUT` where the file ends within a record."""
     link = struct.unpack_from(order + "I", data, 20)[0] & 0xFFFF
     record = struct.Struct(order + "IIII")
     at, end = 24, len(data)
     while at < end:
-        if at + 16 > end:
-            yield 0, -1, 0, 0
-            return
         seconds, fraction, length, _ = record.unpack_from(data, at)
         at += 16
         if at + length > end:
-            yield 0, -1, 0, 0
-            return
+            raise EOFError
         yield at, length, seconds * 10**9 + fraction * unit_ns, link
         at += length
 
@@ -140,19 +136,15 @@ def _walk_pcapng(data: memoryview) -> Iterator[tuple[int, int, int, int]]:
     at, end, order = 0, len(data), "<"
     interfaces: list[tuple[int, int]] = []
     while at < end:
-        if at + 12 > end:
-            yield 0, -1, 0, 0
-            return
-        kind = struct.unpack_from(order + "I", data, at)[0]
+        (kind,) = struct.unpack_from(order + "I", data, at)
         if kind == _SECTION:
             order = "<" if bytes(data[at + 8 : at + 12]) == b"\x4d\x3c\x2b\x1a" else ">"
             interfaces = []
-        size = struct.unpack_from(order + "I", data, at + 4)[0]
+        (size,) = struct.unpack_from(order + "I", data, at + 4)
         if size < 12 or size % 4 or at + size > end:
-            yield 0, -1, 0, 0
-            return
+            raise EOFError
         if kind == _INTERFACE and size >= 20:
-            link = struct.unpack_from(order + "H", data, at + 8)[0]
+            (link,) = struct.unpack_from(order + "H", data, at + 8)
             interfaces.append((link, _ticks_per_second(data[at + 16 : at + size - 4], order)))
         elif kind == _PACKET and size >= 32:
             number, high, low, length = struct.unpack_from(order + "IIII", data, at + 8)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,7 @@ from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud, cloud_from_fields, organised
 
 # sensor_msgs/PointField
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_CODES = {np.dtype(name): code for code, name in _TYPES.items()}
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LIVOX = {
     "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
     "formats": ["u4", "f4", "f4", "f4", "u1", "u1", "u1"],
@@ -66,17 +64,6 @@ def livox_id(data: bytes, start: int, is_ros1: bool) -> int | None:
     return data[at] if at < len(data) else None
 
 
-def encode_fields(columns: Mapping[str, NDArray[Any]]) -> tuple[list[tuple[str, int, int]], int, NDArray[np.uint8]]:
-    """Fields as (name, offset, type code), bytes per point and the data of a PointCloud2 with these columns, packed."""
-    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    table = np.empty(len(next(iter(columns.values()))), dtype)
-    for name, values in columns.items():
-        table[name] = values
-    assert dtype.fields is not None
-    fields = [(name, int(dtype.fields[name][1]), _CODES[values.dtype]) for name, values in columns.items()]
-    return fields, dtype.itemsize, table.view(np.uint8).reshape(-1)
-
-
 def _livox_body(start: int, is_ros1: bool) -> int:
     """Where the numbers of a CustomMsg begin; those of CDR are aligned from behind its first four bytes."""
     return start if is_ros1 else 4 + -(-(start - 4) // 8) * 8
@@ -87,9 +74,9 @@ def _dtype(message: Any, where: Path) -> np.dtype[Any]:
     step = int(message.point_step)
     fields: dict[str, tuple[Any, int]] = {}
     for f in message.fields:
-        if f.datatype not in _TYPES:
+        if f.datatype not in TYPES:
             continue
-        kind = np.dtype(order + _TYPES[f.datatype])
+        kind = np.dtype(order + TYPES[f.datatype])
         if f.offset + kind.itemsize > step:
             raise InputError(f"{where}: field {f.name!r} of the cloud lies beyond its {step} bytes per point")
         # A count that reaches beyond the point is not believed.

@@ -31,7 +31,6 @@ from lslam.readers.bag_topics import (
     index_scans,
     load_companion,
     put_in_order,
-    say_broken,
 )
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
@@ -191,19 +190,14 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
     sequence = BagSequence(
         name=info.name or printable(stem_of(bag.path)), path=bag.path, kind=KIND, bag=bag, topic=index.topic,
         messages=index.messages, headers_ns=index.stamps_ns, stamps_ns=index.stamps_ns,
-        rate_hz=info.rate_hz or (measured_rate(index.stamps_ns) if opened is None else opened.rate_hz),
-        motion_compensated=info.motion_compensated, rings=info.rings, sensor=info.sensor,
+        rate_hz=info.rate_hz or (opened.rate_hz if opened else measured_rate(index.stamps_ns)),
+        motion_compensated=info.motion_compensated, rings=info.rings or (opened.rings if opened else None),
+        sensor=info.sensor or (opened.sensor if opened else None), revolutions=opened.revolutions if opened else None,
         notes=voice.notes, problems=voice.problems, halves=index.halves, stated_times=stated_times(info),
-        unit_m=LENGTHS.get(info.point_unit or ""),
+        unit_m=LENGTHS.get(info.point_unit or ""), uses=dict(opened.uses) if opened else {},
     )  # fmt: skip
     if opened is not None:
-        return replace(
-            sequence,
-            rings=info.rings or opened.rings,
-            sensor=info.sensor or opened.sensor,
-            revolutions=opened.revolutions,
-            uses=dict(opened.uses),
-        )
+        return sequence
     settle_unit(sequence)
     ends = {
         read_header(index.topic, bag.message(index.topic, int(k), HEADER)).stamp_ns for k in index.messages[[0, -1]]
@@ -311,9 +305,7 @@ def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory |
     if topics[1:]:
         others = ", ".join(t.name for t in topics[1:])
         voice.notes.append(f"ground truth from {topic.name}, the first of {len(topics)}: {others} left out")
-    broken: list[str] = []
-    stream = read_poses(bag, topic, broken)
-    say_broken(broken, topic.name, voice)
+    stream = read_poses(bag, topic, voice.problems)
     order, stamps = put_in_order(stream.stamps_ns, stream.recorded_ns, f"{topic.name}: poses", voice)
     if not len(order):
         return None

@@ -14,7 +14,6 @@ from lslam.formats.bag_files import Bag
 from lslam.formats.bag_streams import Transforms, chain, is_static, read_transforms
 from lslam.geometry import se3, so3
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex
-from lslam.readers.bag_topics import say_broken
 from lslam.readers.ground_truth import Voice
 
 Floats = NDArray[np.float64]
@@ -87,10 +86,8 @@ class Links:
         found: dict[tuple[str, str], list[Floats]] = {}
         for topic in self.bag.of_type("TFMessage"):
             if is_static(topic) == wants_static:
-                broken: list[str] = []
-                for pair, poses in read_transforms(self.bag, topic, broken).items():
+                for pair, poses in read_transforms(self.bag, topic, self.voice.problems).items():
                     found.setdefault(pair, []).append(poses)
-                say_broken(broken, topic.name, self.voice)
         return {pair: np.concatenate(pieces) for pair, pieces in found.items()}
 
 

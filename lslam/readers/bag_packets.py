@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -16,7 +17,6 @@ from lslam.formats.bag_files import Bag, BagTopic
 from lslam.formats.bag_streams import read_text
 from lslam.formats.ouster_packets import OusterSensor, parse_metadata, read_metadata
 from lslam.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
-from lslam.readers.bag_topics import say_broken
 from lslam.readers.ground_truth import Voice
 from lslam.readers.pcap_ouster import open_with_metadata
 from lslam.readers.pcap_revolutions import Integers, Opened, metadata_beside
@@ -83,24 +83,17 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
     stamps, sizes, heads, places = [], [], [], []
     frame = ""
     for n, topic in enumerate(topics):
-        broken: list[str] = []
-        bag.expect(topic)
-        for k, recorded in enumerate(topic.stamps_ns.tolist()):
-            try:
-                own, packets, of = read_packets(topic, bag.message(topic, k))
-            except InputError as error:
-                broken.append(str(error))
-                continue
+        read = partial(read_packets, topic)
+        for k, (own, packets, of) in bag.each(topic, read, voice.problems):
             frame = frame or of
             count, size = packets.shape
-            stamps.append(np.where(own == 0, recorded, own))
+            stamps.append(np.where(own == 0, topic.stamps_ns[k], own))
             sizes.append(np.full(count, size, np.int64))
             head = np.zeros((count, len(positions)), np.uint8)
             inside = [i for i, p in enumerate(positions) if p < size]
             head[:, inside] = packets[:, [positions[i] for i in inside]]
             heads.append(head)
             places.append(np.column_stack([np.full((count, 2), (n, k)), np.arange(count)]).astype(np.int32))
-        say_broken(broken, topic.name, voice)
     if not sum(map(len, sizes)):
         raise InputError(f"{bag.path}: {topics[0].name} holds no packets that can be read")
     all_sizes = np.concatenate(sizes)

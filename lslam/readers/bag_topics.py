@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, LslamError, UsageError
-from lslam.formats.bag_files import Bag, BagTopic, read_header
+from lslam.formats.bag_files import Bag, BagTopic, Header, read_header
 from lslam.formats.bag_listing import missing_parts
 from lslam.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.formats.packet_makers import is_packets, maker_by_name, not_decoded
@@ -31,7 +31,6 @@ _LATE_STEPS = 10
 _CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
 _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _FEW = 4  # messages that may come late at the seam of two parts
-_SAID = 3  # damaged messages that are named one by one
 
 Stamps = NDArray[np.int64]
 
@@ -122,9 +121,8 @@ def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) 
         )
     if len(topics) != 1:
         return None
-    topic, what, broken = topics[0], f"{kind.name}: samples", list[str]()
-    stream = kind.read(bag, topic, broken)
-    say_broken(broken, topic.name, voice)
+    topic, what = topics[0], f"{kind.name}: samples"
+    stream = kind.read(bag, topic, voice.problems)
     if not len(stream.stamps_ns):
         voice.problems.append(f"{kind.name}: {topic.name} holds {len(topic)} messages and none that can be used")
         return None
@@ -151,29 +149,23 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     Only headers are read, where stamps do not repeat. Raises InputError when not a single one can be, UsageError for a LiDAR
     that is not there.
     """
-    kept, frames, ids, stamps, broken = [], list[str](), list[int | None](), [], []
-    is_livox = topic.type.endswith("CustomMsg")
-    bag.expect(topic, is_head=True)
-    for k in range(len(topic)):
-        try:
-            data = bag.message(topic, k, HEADER)
-            header = read_header(topic, data)
-        except InputError as error:
-            broken.append(str(error))
-            continue
-        kept.append(k)
-        stamps.append(header.stamp_ns)
-        frames.append(header.frame)
-        ids.append(livox_id(data, header.end, topic.encoding == "ros1") if is_livox else None)
-    say_broken(broken, topic.name, voice)
-    if not kept:
-        way_out = "; where its index is wrong `rosbag reindex` mends it" if topic.encoding == "ros1" else ""
+    is_livox, is_ros1 = topic.type.endswith("CustomMsg"), topic.encoding == "ros1"
+
+    def beginning(data: bytes) -> tuple[Header, int | None]:
+        header = read_header(topic, data)
+        return header, livox_id(data, header.end, is_ros1) if is_livox else None
+
+    begun = dict(bag.each(topic, beginning, voice.problems, HEADER))
+    if not begun:
+        way_out = "; where its index is wrong `rosbag reindex` mends it" if is_ros1 else ""
         raise InputError(f"{bag.path}: none of the {len(topic)} messages of {topic.name} can be read{way_out}")
-    recorded = topic.stamps_ns[kept]
-    messages, headers = np.array(kept, np.int64), np.array(stamps, np.int64)
+    messages = np.array(list(begun), np.int64)
+    recorded = topic.stamps_ns[messages]
+    headers = np.array([header.stamp_ns for header, _ in begun.values()], np.int64)
+    frames, ids = [header.frame for header, _ in begun.values()], [number for _, number in begun.values()]
     names = name_lidars(frames, ids)
     chosen = choose_lidars(topic, names, wanted, voice)
-    is_own = _no_copies(headers, lambda i: bag.message(topic, kept[i]), f"{topic.name}: scans", voice)
+    is_own = _no_copies(headers, lambda i: bag.message(topic, int(messages[i])), f"{topic.name}: scans", voice)
     indices = []
     for name, mine in chosen:
         its = [names[k] for k in np.flatnonzero(mine)]
@@ -268,13 +260,6 @@ def _told_again(stamps: Stamps, late: Stamps, step: float) -> NDArray[np.bool_]:
         own = int(end - begin)
         again[begin:end] = 2 <= own <= 2 * there and own + there >= _CROWDED * (float(hi - lo) / step + 1)
     return again
-
-
-def say_broken(broken: Sequence[str], topic: str, voice: Voice) -> None:
-    """The first damaged messages one by one, the others by their number."""
-    voice.problems.extend(broken[:_SAID])
-    if len(broken) > _SAID:
-        voice.problems.append(f"{len(broken) - _SAID} more messages of {topic} are damaged")
 
 
 def _named(bag: Bag, topics: list[BagTopic], wanted: str, flag: str, what: str) -> BagTopic:

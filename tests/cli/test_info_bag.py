@@ -14,9 +14,10 @@ from rosbags.highlevel import AnyReader
 sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from bag_builders import KINDS, START_NS, SUFFIX, bag, clouds, imu, together, transforms
 
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.doctor.examine_bag import examine_bag
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import Bag, BagWriter, open_bag
+from lslam.formats.bag_files import Bag, open_bag
 
 
 def other(writer: BagWriter) -> None:

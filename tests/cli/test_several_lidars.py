@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from calling import lslam, strict_json
 
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.geometry import se3
 from lslam.readers import open_sequence
 

@@ -12,11 +12,11 @@ from rosbags.highlevel import AnyReader
 from stub_sequences import StampedInTheMiddle, sample
 
 from lslam.config import load_config
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.convert.convert_run import convert_run
 from lslam.convert.convert_sequence import convert_sequence
 from lslam.errors import InputError, OutputExistsError, UsageError
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
 from lslam.formats.pointcloud2 import decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.geometry import se3

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.types.scan import Scan
 
 START_NS = 1_700_000_000_123_456_789

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from bag_builders import GRAVITY, KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, clouds, imu, scan, together, transforms
 
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
 from lslam.geometry import se3
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence

@@ -14,9 +14,9 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
 from lslam.frontend.register_scans import sweep_of
 from lslam.readers import open_sequence
 from lslam.types.scan import Scan, Span

@@ -10,8 +10,8 @@ import pytest
 from bag_builders import KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, clouds, imu, together, transforms
 from numpy.typing import NDArray
 
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.geometry import se3
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence

@@ -17,9 +17,9 @@ from stub_sequences import Stub
 from test_bag_clouds import CUSTOM, POINT
 
 from lslam.config.preprocess import PreprocessConfig
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
 from lslam.formats.kitti_layout import write_scan, write_times
 from lslam.frontend.point_times import with_point_times
 from lslam.geometry import se3

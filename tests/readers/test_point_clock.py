@@ -11,7 +11,7 @@ import pytest
 from bag_builders import START_NS, STEP_NS, bag, raw_cloud
 from numpy.typing import NDArray
 
-from lslam.formats.bag_files import BagWriter
+from lslam.convert.bag_writer import BagWriter
 from lslam.frontend.register_scans import sweep_of
 from lslam.readers import open_sequence
 from lslam.types.sequence import Sequence

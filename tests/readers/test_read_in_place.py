@@ -14,10 +14,10 @@ from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
 from lslam.config import Config
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, StorageError, UsageError
-from lslam.formats import bag_messages
 from lslam.formats.bag_chunks import BLOCK, RangedFile
-from lslam.formats.bag_files import BagWriter
 from lslam.pipeline.resume import input_digest, listing_digest
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence

@@ -11,8 +11,8 @@ import numpy as np
 from bag_builders import START_NS, bag
 from numpy.typing import NDArray
 
-from lslam.formats import bag_messages
-from lslam.formats.bag_files import BagWriter
+from lslam.convert import bag_messages
+from lslam.convert.bag_writer import BagWriter
 from lslam.geometry import se3
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate

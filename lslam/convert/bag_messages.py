@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.pointcloud2 import encode_fields
+from lslam.formats.pointcloud2 import TYPES
 from lslam.geometry import so3
 from lslam.types.scan import Scan
 
 Floats = NDArray[np.float64]
 
+_CODES = {np.dtype(name): code for code, name in TYPES.items()}  # of sensor_msgs/PointField
 _UNKNOWN = np.r_[-1.0, np.zeros(8)]  # sensor_msgs/Imu: a first covariance of -1 means that there is no such reading
 _DIAGONAL_KNOWN, _NO_COVARIANCE = 2, 0  # sensor_msgs/NavSatFix
 
@@ -38,18 +39,25 @@ def points(
 
 
 def _cloud(store: Any, head: Any, columns: Mapping[str, NDArray[Any]], is_dense: bool) -> Any:
-    fields, step, data = encode_fields(columns)
-    count = len(columns["x"])
-    field = store.types["sensor_msgs/msg/PointField"]
+    """PointCloud2 with these columns, packed."""
+    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    table = np.empty(len(columns["x"]), dtype)
+    for name, values in columns.items():
+        table[name] = values
+    assert dtype.fields is not None
+    field, places = store.types["sensor_msgs/msg/PointField"], dtype.fields
     return store.types["sensor_msgs/msg/PointCloud2"](
         header=head,
         height=1,
-        width=count,
-        fields=[field(name=name, offset=offset, datatype=code, count=1) for name, offset, code in fields],
+        width=len(table),
+        fields=[
+            field(name=name, offset=int(places[name][1]), datatype=_CODES[values.dtype], count=1)
+            for name, values in columns.items()
+        ],
         is_bigendian=False,
-        point_step=step,
-        row_step=step * count,
-        data=data,
+        point_step=dtype.itemsize,
+        row_step=dtype.itemsize * len(table),
+        data=table.view(np.uint8).reshape(-1),
         is_dense=is_dense,
     )
 
