@@ -7,6 +7,7 @@ from pathlib import Path
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 _MAP = str(SAMPLE / "sequences" / "00" / "map_perturbed.osm")
 _LONG_MAP = ("--clean", "--occupancy")
+_ALL = ("--imu", "--gnss", "--osm", _MAP, "--set", "osm.mode=non-rigid", *_LONG_MAP)
 
 # name -> words behind `lslam run sample_data`
 DRIVES: dict[str, tuple[str, ...]] = {
@@ -16,7 +17,9 @@ DRIVES: dict[str, tuple[str, ...]] = {
     "GNSS": ("--gnss", *_LONG_MAP),
     "OSM": ("--osm", _MAP, "--georeference", "--set", "osm.mode=two-level"),
     "features": ("--method", "loam", "--save-feature-map"),
-    "all": ("--imu", "--gnss", "--osm", _MAP, "--set", "osm.mode=non-rigid", *_LONG_MAP),
+    "all": _ALL,
+    # For the tests: half the scans, half as many keyframes, and an eighth of the map's voxels.
+    "sparse": (*_ALL, *("--set", "input.skip_frames=2", "--set", "keyframes.distance=4", "--set", "map.voxel=0.4")),
 }
 
 
