@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import os
 import struct
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,9 @@ from lslam.foreign import importing
 from lslam.formats.atomic import atomic_write
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.version import __version__
+
+if TYPE_CHECKING:
+    import lazrs
 
 _VLR, _EVLR = 54, 60  # bytes of their headers
 _LASZIP = b"laszip encoded"
@@ -35,26 +37,11 @@ _REACH = 2**31 - 1
 _BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
-@dataclass(frozen=True)
-class LasSizes:
-    """What holds of a file that was checked: bytes of a point, and of the points of its largest chunk, both decompressed."""
+def check_las(stream: BinaryIO) -> tuple[int, int]:
+    """Bytes of a point and of the points of the largest chunk, decompressed, of a LAS or LAZ file.
 
-    record: int
-    chunk: int = 0
-
-
-@dataclass(frozen=True)
-class _Laszip:
-    """The record that says how points are compressed; `layers` of a chunk, 0 where it has none."""
-
-    data: bytes
-    chunk_size: int
-    is_variable: bool
-    layers: int
-
-
-def check_las(stream: BinaryIO) -> LasSizes:
-    """The sizes in the header of a LAS or LAZ file, and in its chunks. Raises ValueError saying what contradicts what."""
+    Raises ValueError saying what contradicts what in the sizes of its header and its chunks.
+    """
     size = os.fstat(stream.fileno()).st_size
     head = stream.read(393)
     if head[:4] != b"LASF":
@@ -79,13 +66,14 @@ def check_las(stream: BinaryIO) -> LasSizes:
         if offset + count * record > size:
             raise ValueError(f"{count} points of {record} bytes from byte {offset} on reach beyond its {size} bytes")
     elif count:
-        return LasSizes(
-            record, record * _check_chunks(stream, _laszip(stream, own, vlrs, record), count, offset, record)
-        )
-    return LasSizes(record)
+        return record, record * _check_chunks(stream, *_laszip(stream, own, vlrs, record), count, offset, record)
+    return record, 0
 
 
-def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> _Laszip:
+def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs.LazVlr, int]:
+    """How points are compressed, and in how many layers a chunk lies, 0 where it has none."""
+    import lazrs
+
     position = begin
     for _ in range(vlrs):
         stream.seek(position)
@@ -94,26 +82,22 @@ def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> _Laszip:
             break
         user, number, length = struct.unpack_from("<16sHH", head, 2)
         if user.rstrip(b"\0") == _LASZIP and number == 22204:
-            return _understood(stream.read(length), record)
+            data = stream.read(length)
+            laszip = lazrs.LazVlr(data)
+            if laszip.item_size() != record or laszip.chunk_size() == 0:
+                raise ValueError(f"its compression is of points that have not {record} bytes")
+            compressor, items = struct.unpack_from("<H30xH", data)
+            kinds = list(struct.iter_unpack("<HHH", data[34 : 34 + 6 * items]))
+            layers = sum(size if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, size, _ in kinds)
+            return laszip, layers if compressor == _LAYERED else 0
         position += _VLR + length
     raise ValueError("nothing says how its points are compressed")
 
 
-def _understood(data: bytes, record: int) -> _Laszip:
-    if len(data) < 34:
-        raise ValueError("the record of its compression is cut off")
-    compressor, chunk_size, items = struct.unpack_from("<H10xI16xH", data)
-    if len(data) < 34 + 6 * items:
-        raise ValueError("the record of its compression is cut off")
-    kinds = [struct.unpack_from("<HH", data, 34 + 6 * k) for k in range(items)]
-    if sum(size for _, size in kinds) != record or chunk_size == 0:
-        raise ValueError(f"its compression is of points that have not {record} bytes")
-    layers = sum(size if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, size in kinds)
-    return _Laszip(data, chunk_size, chunk_size == 2**32 - 1, layers if compressor == _LAYERED else 0)
-
-
-def _check_chunks(stream: BinaryIO, laszip: _Laszip, count: int, offset: int, record: int) -> int:
+def _check_chunks(stream: BinaryIO, laszip: lazrs.LazVlr, layers: int, count: int, offset: int, record: int) -> int:
     """The most points a chunk has."""
+    import lazrs
+
     size = os.fstat(stream.fileno()).st_size
     stream.seek(offset)
     begin = offset + 8
@@ -128,33 +112,25 @@ def _check_chunks(stream: BinaryIO, laszip: _Laszip, count: int, offset: int, re
     # A chunk begins with one point as it is.
     if chunks * record > table - begin:
         raise ValueError(f"{chunks} chunks do not fit into {table - begin} bytes")
-    if not laszip.is_variable and chunks != -(-count // laszip.chunk_size):
-        raise ValueError(f"{count} points in chunks of {laszip.chunk_size} are not {chunks} chunks")
-    entries = _entries(stream, laszip, offset)
+    if not laszip.uses_variable_size_chunks() and chunks != -(-count // laszip.chunk_size()):
+        raise ValueError(f"{count} points in chunks of {laszip.chunk_size()} are not {chunks} chunks")
+    # The table is compressed itself; how many entries it has is known by now.
+    stream.seek(offset)
+    entries = lazrs.read_chunk_table(stream, laszip)
     for _, length in entries:
         if length < record or begin + length > table:
             raise ValueError(f"the chunk at byte {begin} is said to have {length} bytes")
-        _check_layers(stream, laszip, begin, length, record)
+        if layers:
+            _check_layers(stream, layers, begin, length, record)
         begin += length
     return max((points for points, _ in entries), default=0)
 
 
-def _entries(stream: BinaryIO, laszip: _Laszip, offset: int) -> list[tuple[int, int]]:
-    """Points and bytes of each chunk: the table is compressed itself, how many entries it has is known by now."""
-    import lazrs
-
-    stream.seek(offset)
-    found: list[Any] = lazrs.read_chunk_table(stream, lazrs.LazVlr(laszip.data))
-    return [(int(points), int(length)) for points, length in found]
-
-
-def _check_layers(stream: BinaryIO, laszip: _Laszip, begin: int, length: int, record: int) -> None:
-    if not laszip.layers:
-        return
+def _check_layers(stream: BinaryIO, layers: int, begin: int, length: int, record: int) -> None:
     stream.seek(begin + record)
-    need = 4 + 4 * laszip.layers
+    need = 4 + 4 * layers
     said = stream.read(need) if record + need <= length else b""
-    if len(said) < need or record + need + sum(struct.unpack_from(f"<{laszip.layers}I", said, 4)) > length:
+    if len(said) < need or record + need + sum(struct.unpack_from(f"<{layers}I", said, 4)) > length:
         raise ValueError(f"the chunk at byte {begin} has less than its layers need")
 
 
@@ -164,13 +140,9 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
     Coordinates are millimetres about an offset, the floor of the smallest ones. Intensities are 16 bits: 0..1 and 0..255
     are spread over them, larger values are kept. The file is dated 1970, so the same cloud gives the same bytes.
 
-    Parameters
-    ----------
     wkt : coordinate reference system of the points; empty: none
 
-    Raises
-    ------
-    OutputError : the file cannot be written, or the cloud is wider than the millimetres of LAS reach (2147 km)
+    Raises OutputError when the file cannot be written, or the cloud is wider than the millimetres of LAS reach (2147 km).
     """
     with importing("laspy", _WAY_OUT):
         import laspy
@@ -204,16 +176,14 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
         import lazrs  # noqa: F401
     try:
         with path.open("rb") as stream:
-            sizes = check_las(stream)
+            record, largest = check_las(stream)
             stream.seek(0)
             # On all cores whole chunks are decompressed at once, however large they are.
-            is_small = sizes.chunk <= _BLOCK
-            backend = laspy.LazBackend.LazrsParallel if is_small else laspy.LazBackend.Lazrs
+            backend = laspy.LazBackend.LazrsParallel if largest <= _BLOCK else laspy.LazBackend.Lazrs
             with laspy.open(stream, closefd=False, laz_backend=backend) as reader:
-                step = max(_BLOCK // sizes.record, 1)
                 blocks = [
                     (np.column_stack([block.x, block.y, block.z]), np.asarray(block.intensity, np.float32))
-                    for block in reader.chunk_iterator(step)
+                    for block in reader.chunk_iterator(max(_BLOCK // record, 1))
                 ]
                 header = reader.header
     except OSError as error:

@@ -21,7 +21,7 @@ from lslam.formats.pointcloud2 import livox_id
 from lslam.formats.pose_rows import seconds_text
 from lslam.readers.bag_halves import find_halves
 from lslam.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
-from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, jitter_notes, stands_still
+from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, say_jitter, stands_still
 from lslam.readers.ground_truth import Voice
 
 CLOUDS = ("PointCloud2", "CustomMsg")
@@ -178,7 +178,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
             voice.notes.append(
                 f"{what} have the stamps of their headers; they were recorded {delay_s:.3f} s after (median)"
             )
-        voice.notes.extend(jitter_notes(ordered, what))
+        say_jitter(ordered, what, voice)
         frame = next((frames[k] for k in np.flatnonzero(mine) if frames[k]), "")
         indices.append(ScanIndex(topic, name, frame, messages[own][order], ordered, halves))
     return indices
@@ -214,12 +214,8 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
         voice.problems.append(f"{what} have {fact}: the times of recording are used, late as they are")
         stamps = recorded
     late, again = _lateness(stamps)
-    agreement = agree(stamps, np.where(again, 0, late), Clock("the times of recording", recorded), what)
-    voice.problems.extend(agreement.problems)
-    voice.notes.extend(agreement.notes)
-    if agreement.problems:
-        stamps = agreement.stamps_ns
-        late, again = _lateness(stamps)
+    stamps = agree(stamps, np.where(again, 0, late), Clock("the times of recording", recorded), what, voice)
+    late, again = _lateness(stamps)
     index = np.arange(len(stamps), dtype=np.int64)
     if again.any():
         first = int(np.flatnonzero(again)[0])

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.readers.ground_truth import Voice
+
 Stamps = NDArray[np.int64]
 
 # Median intervals of two clocks that both tell the time of the drive; beyond, one was played back at another speed.
@@ -37,15 +39,6 @@ class Clock:
     stamps_ns: Stamps
 
 
-@dataclass(frozen=True)
-class OneClock:
-    """Stamps (N,) ns on one clock, in the order of the messages; what was wrong, and what else is worth a sentence."""
-
-    stamps_ns: Stamps
-    problems: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
 def stands_still(stamps: Stamps, witness: Stamps) -> bool:
     """Whether a clock gives several messages in a row one reading nearly everywhere, while the witness goes on."""
     if not len(stamps) or np.any(np.diff(witness) < 0) or len(np.unique(witness)) < len(witness) / 2:
@@ -55,8 +48,8 @@ def stands_still(stamps: Stamps, witness: Stamps) -> bool:
     return len(np.unique(stamps)) <= max(1, len(stamps) / MESSAGES_PER_STAMP)
 
 
-def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClock:
-    """`headers` (N,) with their steps taken out by the witness (N,), both in the order of recording.
+def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Voice) -> Stamps:
+    """`headers` (N,) with their steps taken out by the witness (N,), both in the order of recording; themselves without any.
 
     late_ns : (N,) by how much messages came after their turn, 0 for most; these say nothing about the clock
 
@@ -70,13 +63,13 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
     h, w = headers[keep], witness.stamps_ns[keep]
     period, speed = _period_and_speed(h, w)
     if not period or _in_parts(h):
-        return OneClock(headers)
+        return headers
     if not _SLOWEST <= speed <= _FASTEST:
-        note = (
+        voice.notes.append(
             f"{what}: {witness.name} run {speed:.3g} times as fast as the stamps of the headers, as of a recording that was "
             "played back or written anew: the headers count"
         )
-        return OneClock(headers, notes=(note,))
+        return headers
     steps, jumps = np.diff(h), np.diff(w)
     spread = _recording_spread(w, period)
     limit = max(0.5 * period + float(late_ns.max()), spread)
@@ -84,32 +77,31 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str) -> OneClo
     is_odd = np.abs(steps - period) > 0.5 * period
     edges = np.flatnonzero(is_apart & is_odd)
     sizes = _step_sizes(h, w, edges, limit)
-    notes: tuple[str, ...] = ()
     longest = np.abs(jumps[is_apart & ~is_odd]).max(initial=0)
     if longest > _JUMP_INTERVALS * max(period, spread):
-        notes = (
+        voice.notes.append(
             f"{what}: {witness.name} jump by up to {longest * 1e-9:.3f} s where the stamps of the headers go on: the headers "
-            "count",
+            "count"
         )
     edges, sizes = edges[sizes != 0], sizes[sizes != 0]
     if not len(edges):
-        return OneClock(headers, notes=notes)
+        return headers
     repaired = steps.copy()
     repaired[edges] = _intervals(steps[edges] - sizes, steps, period)
     since_first = np.concatenate([[0], np.cumsum(repaired)])
     offset = _offsets(h - h[0] - since_first, h - w, limit)
-    stamps = headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
     first = int(edges[0])
     places = f" and at {len(edges) - 1} more" if len(edges) > 1 else ""
     how = f"step by {steps[first] * 1e-9:+.3f} s" if steps[first] else "stand still"
-    problem = (
+    voice.problems.append(
         f"{what}: the stamps of their headers {how} at message {keep[first + 1]}{places}, where {witness.name} go on by "
         f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
     )
-    return OneClock(stamps, (problem,), notes)
+    stamps: Stamps = headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
+    return stamps
 
 
-def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str) -> OneClock:
+def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Voice) -> Stamps:
     """Stamps (N,) of a stream without a second clock, moved as `repaired` (M,) from `scans` (M,), where it steps as these did.
 
     A stream that does not step at the same instants by the same amount is on another clock and stays.
@@ -118,7 +110,7 @@ def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str) -> OneClo
     removed = np.diff(scans) - np.diff(repaired)
     at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
     if not len(at) or len(stamps) < 3:
-        return OneClock(stamps)
+        return stamps
     steps = np.diff(stamps)
     slack = 0.5 * interval + float(np.median(steps))
     offset = np.full(len(stamps), scans[0] - repaired[0])
@@ -127,11 +119,11 @@ def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str) -> OneClo
         is_alike = (np.abs(steps - size) < slack) & (np.abs(stamps[:-1] - scans[k]) < 2 * interval + slack)
         is_alike[: last + 1] = False
         if not is_alike.any():
-            return OneClock(stamps)
+            return stamps
         last = int(np.argmax(is_alike))
         offset[last + 1 :] += size
-    problem = f"{what}: its stamps step with those of the scans, {len(at)} times: moved alike"
-    return OneClock(stamps - offset, (problem,))
+    voice.problems.append(f"{what}: its stamps step with those of the scans, {len(at)} times: moved alike")
+    return stamps - offset
 
 
 def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
@@ -144,20 +136,19 @@ def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
     return best
 
 
-def jitter_notes(stamps: Stamps, what: str) -> tuple[str, ...]:
-    """That intervals vary more than those of a sensor do, (N,) stamps that increase."""
+def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
+    """Note that intervals vary more than those of a sensor do, (N,) stamps that increase."""
     steps = np.diff(stamps).astype(np.float64)
     if len(steps) < _SPREAD_SAMPLES or steps.min() <= 0:
-        return ()
+        return
     period = float(np.median(steps))
     off = steps - np.maximum(np.rint(steps / period), 1) * period
     sigma = 1.4826 * float(np.median(np.abs(off)))
-    if sigma < _JITTER * period:
-        return ()
-    return (
-        f"{what} follow each other unevenly, {sigma * 1e-6:.1f} ms (one sigma) about {period * 1e-6:.1f} ms: stamps of arrival, "
-        "not of the sensor",
-    )
+    if sigma >= _JITTER * period:
+        voice.notes.append(
+            f"{what} follow each other unevenly, {sigma * 1e-6:.1f} ms (one sigma) about {period * 1e-6:.1f} ms: stamps of "
+            "arrival, not of the sensor"
+        )
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:

@@ -118,9 +118,7 @@ def _with_scans(stream: Stream | None, scans: StampedScans, what: str, folder: F
     """An IMU or GNSS stream, moved where it steps with the clock of the scans."""
     if stream is None:
         return None
-    moved = follow(stream.stamps_ns, scans.raw_ns, scans.stamps_ns, what)
-    folder.voice.problems.extend(moved.problems)
-    return replace(stream, stamps_ns=moved.stamps_ns)
+    return replace(stream, stamps_ns=follow(stream.stamps_ns, scans.raw_ns, scans.stamps_ns, what, folder.voice))
 
 
 def _stamps_file(folder: Folder) -> Path | None:

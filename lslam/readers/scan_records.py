@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lslam.errors import InputError
 from lslam.formats.point_files import check_size, read_array, read_bytes, record_of
 from lslam.formats.point_records import KITTI, PointRecord, name_columns, parse_record
 from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.ground_truth import Voice
+from lslam.types.sequence import readable
 
 _LOOKED_AT = 3
 
@@ -27,9 +23,10 @@ def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRec
     suffix = files[0].suffix.lower()
     if suffix not in (".bin", ".npy"):
         return None
-    some = [files[k] for k in np.unique(np.linspace(0, len(files) - 1, min(len(files), _LOOKED_AT)).astype(int))]
-    raw = _readable(some, read_bytes if suffix == ".bin" else read_array)
-    tables = [table for table in raw.values() if len(table) and not table.dtype.names]
+    some = np.unique(np.linspace(0, len(files) - 1, min(len(files), _LOOKED_AT)).astype(int)).tolist()
+    read = read_bytes if suffix == ".bin" else read_array
+    raw = {files[k]: data for k, data in readable(some, lambda k: read(files[k]))}
+    tables = [table for table in raw.values() if not table.dtype.names]
     if suffix == ".npy" and not tables:
         return None
     if info.bin_record is not None:
@@ -52,11 +49,3 @@ def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRec
         unread = record.unread()
         voice.notes.append(sentence + (f"; {unread}, nothing says what they are" if unread else ""))
     return record
-
-
-def _readable(files: list[Path], read: Callable[[Path], NDArray[Any]]) -> dict[Path, NDArray[Any]]:
-    raw = {}
-    for path in files:
-        with suppress(InputError):
-            raw[path] = read(path)
-    return raw

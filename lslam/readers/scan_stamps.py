@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.pose_rows import read_rows
-from lslam.readers.clocks import Clock, agree, jitter_notes, onto, stands_still
+from lslam.readers.clocks import Clock, agree, onto, say_jitter, stands_still
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import check_stamps, file_numbers, filled_stamps, load_stamps, rows_of
 from lslam.readers.name_stamps import stamps_in_names
@@ -79,7 +79,7 @@ def stamp_scans(
     if points is not None and rate_hz is None and rate * points.sweep_s < 0.5:
         rate = round(1 / points.sweep_s, 1)
         voice.notes.append(f"scans lie farther apart than sweeps of {points.sweep_s:.3g} s last: rate {rate:g} Hz")
-    voice.notes.extend(jitter_notes(checked, "scans"))
+    say_jitter(checked, "scans", voice)
     return StampedScans(files, checked, rate, raw)
 
 
@@ -105,9 +105,7 @@ def _agreed(clocks: list[Clock], voice: Voice) -> Stamps:
         if stands_still(stamps, other.stamps_ns):
             voice.problems.append(f"{first.name}: its stamps stand still: {other.name} are used")
             return other.stamps_ns
-        agreement = agree(stamps, np.zeros_like(stamps), other, first.name)
-        voice.problems.extend(agreement.problems)
-        stamps = agreement.stamps_ns
+        stamps = agree(stamps, np.zeros_like(stamps), other, first.name, Voice([], voice.problems))
         if np.any(np.diff(stamps) <= 0):
             voice.problems.append(f"{first.name}: its stamps do not increase: {other.name} are used")
             return other.stamps_ns
