@@ -97,8 +97,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
         f"{what}: the stamps of their headers {how} at message {keep[first + 1]}{places}, where {witness.name} go on by "
         f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
     )
-    stamps: Stamps = headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
-    return stamps
+    return headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
 
 
 def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Voice) -> Stamps:
@@ -123,7 +122,7 @@ def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Vo
         last = int(np.argmax(is_alike))
         offset[last + 1 :] += size
     voice.problems.append(f"{what}: its stamps step with those of the scans, {len(at)} times: moved alike")
-    return stamps - offset
+    return np.asarray(stamps - offset)
 
 
 def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
