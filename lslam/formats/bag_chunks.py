@@ -10,7 +10,7 @@ import sys
 import threading
 from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,46 +62,31 @@ class RangedFile:
             return b""
         first, last = position // BLOCK, (position + size - 1) // BLOCK
         with self._lock:
-            if size >= BLOCK and not self._is_expected(first):
+            if size >= BLOCK and first not in self._blocks and not self._expected[self._due(first)]:
                 return self.path.read_ranges([(position, position + size)])[0]
             data = b"".join(self._block(k, last) for k in range(first, last + 1))
         return data[position - first * BLOCK :][:size]
 
-    def _is_expected(self, number: int) -> bool:
+    def _due(self, number: int) -> slice:
+        """Which of the expected blocks are fetched with this one; none where it is not expected itself."""
         at = bisect_left(self._expected, number)
-        return number in self._blocks or (at < len(self._expected) and self._expected[at] == number)
+        return slice(at, at + _AHEAD if self._expected[at : at + 1] == [number] else at)
 
     def _block(self, number: int, last: int) -> bytes:
         """A block; where it has to be fetched, those up to `last` and those expected next are fetched with it."""
         if number not in self._blocks:
-            at = bisect_left(self._expected, number)
-            next_ones = self._expected[at : at + _AHEAD] if self._is_expected(number) else []
-            wanted = [k for k in sorted({*range(number, last + 1), *next_ones}) if k not in self._blocks]
-            del self._expected[at : at + len(next_ones)]
-            runs = _runs(wanted)
+            due = self._due(number)
+            wanted = np.array(sorted({*range(number, last + 1), *self._expected[due]} - self._blocks.keys()))
+            del self._expected[due]
+            runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
             while len(self._blocks) > max(_KEPT - len(wanted), 0):
                 self._blocks.popitem(last=False)
-            found = self.path.read_ranges([(a * BLOCK, min(b * BLOCK, self.size)) for a, b in runs])
-            for (begin, end), data in zip(runs, found, strict=True):
-                for k in range(begin, end):
-                    self._blocks[k] = data[(k - begin) * BLOCK : (k - begin + 1) * BLOCK]
+            found = self.path.read_ranges([(int(r[0]) * BLOCK, min(int(r[-1] + 1) * BLOCK, self.size)) for r in runs])
+            for run, data in zip(runs, found, strict=True):
+                for n, k in enumerate(run.tolist()):
+                    self._blocks[k] = data[n * BLOCK : (n + 1) * BLOCK]
         self._blocks.move_to_end(number)
         return self._blocks[number]
-
-
-def _runs(numbers: list[int]) -> list[tuple[int, int]]:
-    """Neighbours as one: [begin, end) of each run of numbers in order.
-
-    >>> _runs([1, 2, 3, 7])
-    [(1, 4), (7, 8)]
-    """
-    runs: list[tuple[int, int]] = []
-    for number in numbers:
-        if runs and runs[-1][1] == number:
-            runs[-1] = (runs[-1][0], number + 1)
-        else:
-            runs.append((number, number + 1))
-    return runs
 
 
 class CutOffError(Exception):
@@ -203,50 +188,43 @@ class ChunkFile:
         kept, records = self._kept
         if kept == chunk.position and len(records) >= least:
             return records
+        # Of a chunk that is wanted whole one byte more shows that it unpacks to more than it should.
+        is_whole = least >= chunk.length // 2
+        step = max(chunk.size, 1) if is_whole else PACKED_BLOCK
+        pieces = (self.read(chunk.position + k, min(step, chunk.size - k)) for k in range(0, chunk.size, step))
         try:
-            records = self._unpack_beginning(chunk, least) if least < chunk.length // 2 else self._unpack(chunk)
-        except _damage() as error:
+            if is_whole and chunk.length > LARGEST:
+                raise ValueError(f"it is said to hold {chunk.length} bytes")
+            records = unpack(chunk.compression, pieces, chunk.length + 1 if is_whole else least)
+            if is_whole and (len(records) != chunk.length or (chunk.crc and crc32(records) != chunk.crc)):
+                raise ValueError("its length or its checksum is not what the file says")
+        except damage() as error:
             raise InputError(
                 f"{self.path}: the chunk at byte {chunk.position} is damaged and its messages are lost: {error}"
             ) from None
         self._kept = (chunk.position, records)
         return records
 
-    def _unpack(self, chunk: Chunk) -> bytes:
-        if chunk.length > LARGEST:
-            raise ValueError(f"it is said to hold {chunk.length} bytes")
-        records = unpack(chunk.compression, self.read(chunk.position, chunk.size), chunk.length)
-        if len(records) != chunk.length or (chunk.crc and crc32(records) != chunk.crc):
-            raise ValueError("its length or its checksum is not what the file says")
-        return records
 
-    def _unpack_beginning(self, chunk: Chunk, least: int) -> bytes:
-        engine = _codec(chunk.compression)()
-        records, used = bytearray(), 0
-        while len(records) < least and not engine.eof:
-            data = b""
-            if engine.needs_input:
-                if used == chunk.size:
-                    raise EOFError("it ends too early")
-                data = self.read(chunk.position + used, min(PACKED_BLOCK, chunk.size - used))
-                used += len(data)
-            records += engine.decompress(data, max_length=least - len(records))
-        return bytes(records)
+def unpack(compression: str, pieces: Iterator[bytes], most: int) -> bytes:
+    """What is packed in `pieces`, one frame or several, its first `most` bytes: a few may unpack to any number.
 
-
-def unpack(compression: str, packed: bytes, most: int = LARGEST) -> bytes:
-    """All of `packed`, one frame or several: a few bytes may unpack to any number, so no more than `most` come out.
-
-    Raises ValueError when there are more or the last frame is cut off, and what the decompressors raise.
+    Raises EOFError when it is cut off before that, and what the decompressors raise (`damage`).
     """
-    records = b""
-    while packed:
-        engine = _codec(compression)()
-        records += engine.decompress(packed, max_length=most + 1 - len(records))
-        if not engine.eof or len(records) > most:
-            raise ValueError(f"it is cut off or unpacks to more than {most} bytes")
-        packed = engine.unused_data or b""
-    return records
+    records, size, engine = list[bytes](), 0, None
+    while size < most:
+        if engine is None or engine.eof:
+            data = (engine.unused_data if engine else b"") or next(pieces, b"")
+            if not data:
+                break
+            engine = _codec(compression)()
+        else:
+            data = next(pieces, b"") if engine.needs_input else b""
+            if not data and engine.needs_input:
+                raise EOFError("it is cut off")
+        records.append(engine.decompress(data, max_length=most - size))
+        size += len(records[-1])
+    return b"".join(records)
 
 
 def _codec(name: str) -> Callable[[], Any]:
@@ -260,7 +238,7 @@ def _codec(name: str) -> Callable[[], Any]:
     return zstd().ZstdDecompressor  # type: ignore[no-any-return]
 
 
-def _damage() -> tuple[type[Exception], ...]:
+def damage() -> tuple[type[Exception], ...]:
     """What the decompressors raise."""
     return (OSError, EOFError, ValueError, RuntimeError, zstd().ZstdError)
 

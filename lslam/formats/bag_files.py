@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.bag_chunks import Topic, unpack, zstd
+from lslam.formats.bag_chunks import LARGEST, Topic, damage, unpack
 from lslam.formats.bag_listing import (
     SUFFIXES,
     copies_among,
@@ -257,10 +257,11 @@ def typestore(encoding: str) -> Any:
 
 def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
     """A message that was compressed by itself; what is wanted of its beginning lies in the first block."""
+    packed = recording.read(topic, k, None if limit is None else _ZSTD_BLOCK)
     try:
-        if limit is None:
-            return unpack("zstd", recording.read(topic, k))
-        begin: bytes = zstd().ZstdDecompressor().decompress(recording.read(topic, k, _ZSTD_BLOCK), max_length=limit)
-        return begin
-    except (zstd().ZstdError, ValueError) as error:
+        data = unpack("zstd", iter([packed]), LARGEST + 1 if limit is None else limit)
+        if len(data) > LARGEST:
+            raise ValueError(f"it unpacks to more than {LARGEST} bytes")
+    except damage() as error:
         raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None
+    return data

@@ -42,6 +42,11 @@ class Profile:
     frame: int
     range_mm: int = 1
 
+    @property
+    def positions(self) -> tuple[int, ...]:
+        """Of the bytes of a packet that tell its frame and its time."""
+        return (self.frame, self.frame + 1, *range(self.head, self.head + 8))
+
 
 PROFILES = {
     "LEGACY": Profile(0, 0, 16, 4, 12, 20, 4, -4, 10),
@@ -159,11 +164,10 @@ def _transform(numbers: Any) -> Floats:
     return T
 
 
-def frames_and_times(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[Integers, Integers]:
-    """(P,) the frame of each packet and the time of its first column, ns."""
-    p = sensor.profile
-    frame = packets[:, p.frame].astype(np.int64) | packets[:, p.frame + 1].astype(np.int64) << 8
-    return frame, _numbers(packets[:, p.head : p.head + 8], np.dtype("<u8"))[:, 0].astype(np.int64)
+def frames_and_times(heads: NDArray[np.uint8]) -> tuple[Integers, Integers]:
+    """(P,) the frame of each packet and the time of its first column, ns, by its bytes (P, 10) at `Profile.positions`."""
+    frame, time = _numbers(heads[:, :2], np.dtype("<u2")), _numbers(heads[:, 2:], np.dtype("<u8"))
+    return frame[:, 0].astype(np.int64), time[:, 0].astype(np.int64)
 
 
 def points_of(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[PointCloud, Integers]:

@@ -10,7 +10,6 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,60 +190,40 @@ def _assemble(data: NDArray[np.uint8], frames: Integers, loss: str) -> Datagrams
     short = int((is_udp & ~is_whole).sum())
     ip, ip_bytes, total = ip[is_whole], ip_bytes[is_whole], total[is_whole]
     flags = word(ip + 6)
-    pieces = _in_groups(word(ip + 12, 4), word(ip + 4), 8 * (flags & 0x1FFF), (flags & 0x2000) > 0)
-    return _joined(data, word, pieces, ip + ip_bytes, total - ip_bytes, frames[is_whole, 2], short, loss)
+    address, offset, has_more = word(ip + 12, 4), 8 * (flags & 0x1FFF), (flags & 0x2000) > 0
+    group = _datagram_of(address, word(ip + 4), has_more | (offset > 0))
+    order = np.lexsort([offset, group])
+    begin, length, stamps = (ip + ip_bytes)[order], (total - ip_bytes)[order], frames[is_whole, 2][order]
+    first = np.flatnonzero(np.diff(group[order], prepend=-1))
+    count = np.diff(first, append=len(begin)).astype(np.int64)
+    before = np.cumsum(length) - length
+    fits = offset[order] == before - np.repeat(before[first], count)
+    size = np.add.reduceat(length, first)
+    is_right = np.logical_and.reduceat(fits, first) & ~has_more[order][first + count - 1]
+    is_right &= (length[first] >= _UDP_BYTES) & (word(begin[first] + 4) == size)
+    # The UDP header opens the first piece.
+    sources = address[order][first] << 16 | word(begin[first])
+    begin[first] += _UDP_BYTES
+    length[first] -= _UDP_BYTES
+    if lost := int((~is_right).sum()) + short:
+        loss = f"{loss}; " if loss else ""
+        loss += f"{lost} datagrams of the capture lack a part and are left out"
+    return Datagrams(
+        data, stamps[first][is_right], size[is_right] - _UDP_BYTES, sources[is_right], first[is_right], count[is_right],
+        begin, length, loss,
+    )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Pieces:
-    """The frames of UDP datagrams sorted by datagram and offset: sender, offset in it, whether more follow, its number."""
+def _datagram_of(address: Integers, number: Integers, is_piece: NDArray[np.bool_]) -> Integers:
+    """(N,) the frame that came first of the datagram that each frame is of.
 
-    order: Integers
-    address: Integers
-    offset: Integers
-    has_more: NDArray[np.bool_]
-    group: Integers
-
-
-def _in_groups(address: Integers, number: Integers, offset: Integers, has_more: NDArray[np.bool_]) -> _Pieces:
-    """Pieces of one datagram share sender and number; numbers come again after 65,536 datagrams, never side by side."""
-    is_piece = has_more | (offset > 0)
-    # A datagram is named by the frame of it that came first.
+    Pieces of one datagram share sender and number; numbers come again after 65,536 datagrams, never side by side.
+    """
     group = np.arange(len(address), dtype=np.int64)
     pieces = np.flatnonzero(is_piece)
     by_sender = pieces[np.argsort(address[pieces], kind="stable")]
     if len(by_sender):
         same = (np.diff(address[by_sender]) == 0) & (np.diff(number[by_sender]) == 0)
         starts = np.flatnonzero(np.concatenate([[True], ~same]))
-        lengths = np.diff(np.concatenate([starts, [len(by_sender)]]))
-        group[by_sender] = np.repeat(by_sender[starts], lengths)
-    order = np.lexsort([offset, group])
-    return _Pieces(order, address[order], offset[order], has_more[order], group[order])
-
-
-def _joined(
-    data: NDArray[np.uint8], word: Any, pieces: _Pieces, begin: Integers, length: Integers, stamps: Integers,
-    short: int, loss: str,
-) -> Datagrams:  # fmt: skip
-    begin, length, stamps = begin[pieces.order], length[pieces.order], stamps[pieces.order]
-    first = np.flatnonzero(np.concatenate([[True], np.diff(pieces.group) > 0])) if len(begin) else np.zeros(0, np.int64)
-    count = np.diff(np.concatenate([first, [len(begin)]])).astype(np.int64)
-    before = np.cumsum(length) - length
-    fits = pieces.offset == before - np.repeat(before[first], count)
-    is_right = np.logical_and.reduceat(fits, first) if len(first) else np.zeros(0, bool)
-    size = np.add.reduceat(length, first) if len(first) else np.zeros(0, np.int64)
-    last = first + count - 1
-    head_is_there = length[first] >= _UDP_BYTES
-    is_right &= ~pieces.has_more[last] & head_is_there & (word(begin[first] + 4) == size)
-    lost = int((~is_right).sum()) + short
-    # The UDP header opens the first piece.
-    ports = word(begin[first])
-    begin[first] += _UDP_BYTES
-    length[first] -= _UDP_BYTES
-    if lost:
-        loss = f"{loss}; " if loss else ""
-        loss += f"{lost} datagrams of the capture lack a part and are left out"
-    return Datagrams(
-        data, stamps[first][is_right], size[is_right] - _UDP_BYTES,
-        (pieces.address[first] << 16 | ports)[is_right], first[is_right], count[is_right], begin, length, loss,
-    )  # fmt: skip
+        group[by_sender] = np.repeat(by_sender[starts], np.diff(starts, append=len(by_sender)))
+    return group

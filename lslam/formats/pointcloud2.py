@@ -13,12 +13,9 @@ from lslam.formats.point_cloud import PointCloud, cloud_from_fields, organised
 
 # sensor_msgs/PointField
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_LIVOX = {
-    "names": ["offset_time", "x", "y", "z", "reflectivity", "tag", "line"],
-    "formats": ["u4", "f4", "f4", "f4", "u1", "u1", "u1"],
-    "offsets": [0, 4, 8, 12, 16, 17, 18],
-}
-_LIVOX_BYTES = 19
+_LIVOX = [
+    ("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
+]  # fmt: skip
 
 
 def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
@@ -48,10 +45,9 @@ def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path
     try:
         timebase = int(np.frombuffer(data, f"{order}u8", 1, at)[0])
         count = int(np.frombuffer(data, f"{order}u4", 1, at + 16)[0])
-        stride = _LIVOX_BYTES if is_ros1 else _LIVOX_BYTES + 1
-        dtype = np.dtype({**_LIVOX, "itemsize": stride}).newbyteorder(order)  # type: ignore[call-overload]
-        padded = data[at + 20 :] + bytes(stride - _LIVOX_BYTES)  # behind the last point there is no padding
-        table = np.frombuffer(padded, dtype, count)
+        padding = [] if is_ros1 else [("padding", "u1")]
+        padded = data[at + 20 :] + bytes(len(padding))  # behind the last point there is none
+        table = np.frombuffer(padded, [(name, order + kind) for name, kind in _LIVOX + padding], count)
     except ValueError:
         raise InputError(f"{where}: a Livox message of {len(data)} bytes is cut off") from None
     columns = {name: _native(table[name]) for name in ("x", "y", "z", "reflectivity", "offset_time", "line", "tag")}

@@ -70,10 +70,8 @@ def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
         packets, frame = _gather(bag, [topic], (0, 1, 2, 3, *range(size - 6, size)), voice)
         return open_velodyne(where, packets, voice), frame
     sensor, source = _metadata(bag, topic)
-    p = sensor.profile
-    positions = (p.frame, p.frame + 1, *range(p.head, p.head + 8))
     inertial = [t for t in bag.of_type(PACKET) if _namespace(t) == _namespace(topic) and is_imu(bag, t)]
-    packets, _ = _gather(bag, [topic, *inertial], positions, voice)
+    packets, _ = _gather(bag, [topic, *inertial], sensor.profile.positions, voice)
     uses = {source: "metadata", **{t.name: "IMU" for t in inertial}}
     return replace(open_with_metadata(where, packets, sensor, source, voice), uses=uses), _OUSTER_FRAME
 

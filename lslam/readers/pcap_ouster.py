@@ -72,7 +72,7 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
             f"{len(datagrams)} datagrams have {sizes[np.argmax(counts)]}"
         )
     which = of_one_sender(datagrams, which, "LiDAR packets", voice)
-    frames, times = _heads(datagrams, which, sensor)
+    frames, times = frames_and_times(datagrams.bytes_at(which, sensor.profile.positions))
     order = in_order(times, "LiDAR packets", voice)
     which, frames, times = which[order], frames[order], times[order]
     shift = _shift(times, datagrams.stamps_ns[which], voice)
@@ -86,16 +86,6 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
     imu = _imu(datagrams, shift, voice)
     T_lidar_imu = None if imu is None else se3.normalise(sensor.T_sensor_imu)
     return Opened(revolutions, sensor.rate_hz, sensor.beams, sensor.name, imu, T_lidar_imu)
-
-
-def _heads(datagrams: Packets, which: Integers, sensor: OusterSensor) -> tuple[Integers, Integers]:
-    """Frame and time of each packet."""
-    p = sensor.profile
-    positions = (p.frame, p.frame + 1, *range(p.head, p.head + 8))
-    raw = datagrams.bytes_at(which, positions)
-    padded = np.zeros((len(raw), max(positions) + 1), np.uint8)
-    padded[:, list(positions)] = raw
-    return frames_and_times(padded, sensor)
 
 
 def _shift(times_ns: Integers, captured_ns: Integers, voice: Voice) -> int:
