@@ -11,7 +11,6 @@ import json
 import re
 import tomllib
 from collections.abc import Iterator
-from decimal import Decimal
 from pathlib import Path
 from typing import IO, Any
 
@@ -62,17 +61,6 @@ def whole_number(text: str) -> int | None:
     (7, None, None, None)
     """
     return int(text) if text.isdecimal() and len(text) <= 18 else None
-
-
-def decimal_number(text: str) -> Decimal:
-    """A finite decimal number below 2^63 in size, exactly; ValueError when it is none."""
-    try:
-        value = Decimal(text)
-        if value.is_finite() and abs(value) < _LARGEST:
-            return value
-    except ArithmeticError:  # 1e999999999 is a Decimal that cannot be reckoned with
-        pass
-    raise ValueError(f"no number below 2^63: {text[:40]!r}")
 
 
 def is_file(path: str | Path) -> bool:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause, nearest
 from lslam.formats.atomic import write_text
-from lslam.formats.pose_rows import seconds_to_ns
+from lslam.formats.stamp_texts import seconds_to_ns
 from lslam.geometry.crs_names import parse_crs
 from lslam.types.manual import ControlPoint, ControlResidual, Instant, NamedPair
 from lslam.untrusted import whole_number

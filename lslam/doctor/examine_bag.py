@@ -10,7 +10,7 @@ import numpy as np
 from lslam.doctor.findings import Facts
 from lslam.errors import LslamError
 from lslam.formats.bag_files import Bag, BagTopic, open_bag
-from lslam.formats.utc_times import utc_of
+from lslam.formats.stamp_texts import utc_of
 from lslam.readers import bag as bag_reader
 from lslam.readers.lookup import find_folder
 

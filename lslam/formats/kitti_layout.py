@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.point_files import write_bin
-from lslam.formats.pose_rows import seconds_text
+from lslam.formats.stamp_texts import seconds_text
 from lslam.geometry import portable, se3
 from lslam.types.trajectory import Trajectory
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.pose_rows import Row, check_increasing, read_rows
-from lslam.formats.text_tables import text_table
+from lslam.formats.text_tables import Row, read_rows, text_table
 from lslam.formats.time_columns import find_clock
 from lslam.remote import as_path
 
@@ -32,13 +31,12 @@ def read_stamps(path: Path, must_increase: bool = False) -> NDArray[np.int64]:
     Raises InputError naming file and line.
     """
     rows, comments = read_rows(path)
-    rows = [Row(row.number, text) for row in rows if (text := row.text.split("#")[0].strip())]
-    table = text_table(path, rows, comments) if rows else None
-    if table is None or not table.rows:
+    table = text_table(path, [Row(k, text) for k, line, _ in rows if (text := line.split("#")[0].strip())], comments)
+    if not table.rows:
         return np.zeros(0, np.int64)
     clock = find_clock(table) or find_clock(replace(table, names=()))
     if clock is None:
-        raise InputError(f"{path}, line {table.rows[0].number}: no column is a time (s, ns or date)")
+        raise table.error(0, "no column is a time (s, ns or date)")
     if must_increase:
-        check_increasing(clock.stamps_ns, table.rows, path)
+        table.check_increasing(clock.stamps_ns)
     return clock.stamps_ns

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
-from lslam.formats.pose_rows import read_rows
-from lslam.formats.text_tables import shortened, text_table
+from lslam.formats.text_tables import read_table, shortened
 from lslam.formats.time_columns import find_clock
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -38,7 +37,7 @@ def read_stamped_csv(
     units in brackets, case and what stands before the last points or slashes (`field.linear_acceleration.x`) do not count.
     The time is one column or two (`time_columns`). Raises InputError naming file, line and what is missing.
     """
-    table = text_table(path, *read_rows(path))
+    table = read_table(path)
     spellings = [_spellings(name) for name in table.names]
     where = [
         next((k for name in names for k, spelt in enumerate(spellings) if name in spelt), None)

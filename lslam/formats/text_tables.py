@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
-from lslam.formats.pose_rows import Row, date_to_ns
+from lslam.errors import InputError, cause
+from lslam.formats.stamp_texts import date_to_ns, seconds_text
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 _DATE_AND_TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\S+)")
@@ -18,44 +20,104 @@ _DATE_AND_TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\S+)")
 _MISSING = frozenset(("", "nan", "+nan", "-nan", "null", "none", "na", "n/a", "<na>"))
 
 
+class Row(NamedTuple):
+    """One line that carries data: its number in the file, from 1, its text, and its cells."""
+
+    number: int
+    text: str
+    cells: Sequence[str] = ()
+
+
 @dataclass(frozen=True)
 class TextTable:
     """Cells of a text file.
 
-    names : (K,) of the columns as the file has them, empty without a header; rows : (N,) lines; cells : (N,) lists of cells
-    separator : between cells, None for blanks
+    names : (K,) of the columns as the file has them, empty without a header; rows : (N,) lines below it
+    separator : between cells, None for blanks; first : the first line that is no comment; comments : those that are
     """
 
     path: Path
     names: tuple[str, ...]
     rows: list[Row]
-    cells: list[list[str]]
     separator: str | None
+    first: str
+    comments: list[str]
+
+    def error(self, k: int, what: str) -> InputError:
+        """What is wrong with row `k`, with its place in the file."""
+        return InputError(f"{self.path}, line {self.rows[k].number}: {what}")
 
     def numbers(self, column: int) -> NDArray[np.float64]:
         """(N,) float64 of a column, dates in seconds, NaN for what is no number or not there."""
-        return np.array([_number(cells[column]) if column < len(cells) else np.nan for cells in self.cells], np.float64)
+        cells = (row.cells[column] if column < len(row.cells) else "" for row in self.rows)
+        return np.array([_number(cell) for cell in cells], np.float64)
 
     def values(self, columns: list[int]) -> NDArray[np.float64]:
         """(N, K) float64 of columns, NaN where a number is missing; InputError with the line of a cell that is text."""
         values = np.empty((len(self.rows), len(columns)))
-        for i, (row, cells) in enumerate(zip(self.rows, self.cells, strict=True)):
+        for k, (_, text, cells) in enumerate(self.rows):
             try:
-                values[i] = [float("nan") if cells[c].lower() in _MISSING else float(cells[c]) for c in columns]
+                values[k] = [float("nan") if cells[c].lower() in _MISSING else float(cells[c]) for c in columns]
             except ValueError:
-                raise InputError(f"{self.path}, line {row.number}: not a number in {row.text[:60]!r}") from None
+                raise self.error(k, f"not a number in {text[:60]!r}") from None
         return values
+
+    def lost_rows(self, values: NDArray[np.float64], what: str) -> NDArray[np.bool_]:
+        """Where `values` (N, K) of poses hold NaN, which are `what` there.
+
+        Raises InputError when that is everywhere, and with the line of one that is infinite.
+        """
+        lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
+        if lost.all():
+            raise InputError(f"{self.path}: every row holds {what}: there is no pose")
+        infinite = np.flatnonzero(~lost & np.isinf(values).any(axis=1))
+        if len(infinite):
+            raise self.error(int(infinite[0]), "NaN or infinity; remove that pose")
+        return lost
 
     def check_widths(self, width: int, whose: str, is_least: bool = False) -> None:
         """InputError with the line that is not as wide as `whose` width; wider ones pass where it is the least."""
-        for row, cells in zip(self.rows, self.cells, strict=True):
-            if len(cells) < width or (len(cells) > width and not is_least):
-                raise InputError(f"{self.path}, line {row.number}: {len(cells)} columns where {whose} has {width}")
+        for k, row in enumerate(self.rows):
+            if len(row.cells) < width or (len(row.cells) > width and not is_least):
+                raise self.error(k, f"{len(row.cells)} columns where {whose} has {width}")
+
+    def check_increasing(self, stamps_ns: NDArray[np.int64]) -> None:
+        """InputError with the first line whose stamp is not after the one before."""
+        wrong = np.flatnonzero(np.diff(stamps_ns) <= 0)
+        if len(wrong):
+            k = int(wrong[0]) + 1
+            now, before = seconds_text(int(stamps_ns[k])), seconds_text(int(stamps_ns[k - 1]))
+            how = "repeats the stamp of the line before" if now == before else f"goes back in time from {before} s"
+            raise self.error(k, f"{now} s {how}; sort the poses and keep one per stamp")
 
     def select(self, mask: NDArray[np.bool_]) -> TextTable:
         """The rows where `mask` (N,) is true."""
-        kept = np.flatnonzero(mask).tolist()
-        return replace(self, rows=[self.rows[i] for i in kept], cells=[self.cells[i] for i in kept])
+        return replace(self, rows=[self.rows[k] for k in np.flatnonzero(mask).tolist()])
+
+
+def read_table(path: Path) -> TextTable:
+    """The table in a text file; InputError when it cannot be read as text."""
+    return text_table(path, *read_rows(path))
+
+
+def read_rows(path: Path) -> tuple[list[Row], list[str]]:
+    """Data lines and comment lines (with `#`, `%` or `//`) of a text file; InputError when it cannot be read as text."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not a text file: a trajectory or a table of times is expected") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
+    rows, comments = [], []
+    for number, line in enumerate(text.splitlines(), start=1):
+        stripped = line.strip()
+        if stripped.startswith(("#", "%", "//")):
+            comments.append(stripped)
+        elif stripped:
+            rows.append(Row(number, stripped))
+    return rows, comments
 
 
 def looks_like_header(line: str) -> bool:
@@ -96,16 +158,19 @@ def split_cells(text: str, separator: str | None) -> list[str]:
 
 def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
     """The table of the data lines and comments of a file; the names are those of the first line or of a comment as wide."""
-    header = ""
-    if rows and looks_like_header(rows[0].text):
-        header, rows = rows[0].text, rows[1:]
-    if not rows:
-        header = header or (comments[0].lstrip("#% ") if comments else "")
-        return TextTable(path, tuple(split_cells(header, separator_of(header))) if header else (), [], [], None)
-    separator = separator_of(rows[0].text)
-    cells = [split_cells(row.text, separator) for row in rows]
-    names = split_cells(header, separator_of(header)) if header else _names_in(comments, len(cells[0]))
-    return TextTable(path, tuple(names), rows, cells, separator)
+    first = header = rows[0].text if rows else ""
+    if looks_like_header(header):
+        rows = rows[1:]
+    elif rows:
+        header = ""
+    else:
+        header = comments[0].lstrip("#% ") if comments else ""
+    separator = separator_of(rows[0].text) if rows else None
+    rows = [row._replace(cells=split_cells(row.text, separator)) for row in rows]
+    names = split_cells(header, separator_of(header)) if header else []
+    if rows and not names:
+        names = _names_in(comments, len(rows[0].cells))
+    return TextTable(path, tuple(names), rows, separator, first, comments)
 
 
 def _names_in(comments: list[str], width: int) -> list[str]:

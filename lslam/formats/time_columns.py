@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
-from lslam.formats.pose_rows import date_to_ns, seconds_to_ns
+from lslam.formats.stamp_texts import date_to_ns, seconds_to_ns
 from lslam.formats.text_tables import TextTable
 
 Floats = NDArray[np.float64]
@@ -107,7 +106,7 @@ def unit_ns_of(name: str) -> int | None:
 
 def _by_name(table: TextTable, taken: Collection[int]) -> list[Units]:
     words = [tokens_of(name) for name in table.names]
-    width = len(table.cells[0]) if table.cells else len(words)
+    width = len(table.rows[0].cells) if table.rows else len(words)
     free = [k for k in range(min(len(words), width)) if k not in taken]
     ranked: list[tuple[int, bool, int, Units]] = []
     for k in free:
@@ -154,7 +153,7 @@ def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[
 
 def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
     """First columns without names: a time, seconds and nanoseconds, and either behind an index or a text."""
-    width = min([3, *taken, *(len(cells) for cells in table.cells)]) if table.cells else 0
+    width = min([3, *taken, *(len(row.cells) for row in table.rows)]) if table.rows else 0
     numbers = [table.numbers(k) for k in range(width)]
     out: list[Units] = []
     for k in range(width):
@@ -177,17 +176,16 @@ def _increases(values: Floats) -> bool:
 def _stamps(table: TextTable, units: Units, default_ns: int | None) -> NDArray[np.int64]:
     out = np.zeros(len(table.rows), np.int64)
     for column, stated_ns in units.items():
-        is_decimal = any("." in cells[column] for cells in table.cells if column < len(cells))
-        unit_ns = stated_ns or default_ns or unit_by_size(table.numbers(column), is_decimal)
-        for i, (row, cells) in enumerate(zip(table.rows, table.cells, strict=True)):
-            text = cells[column] if column < len(cells) else ""
+        texts = [row.cells[column] if column < len(row.cells) else "" for row in table.rows]
+        unit_ns = stated_ns or default_ns or unit_by_size(table.numbers(column), any("." in text for text in texts))
+        for k, text in enumerate(texts):
             try:
                 date_ns = date_to_ns(text)
             except ValueError as error:
-                raise InputError(f"{table.path}, line {row.number}: {text!r} is no time: {error}") from None
-            out[i] += seconds_to_ns(text, table.path, row.number, unit_ns) if date_ns is None else date_ns
+                raise table.error(k, f"{text!r} is no time: {error}") from None
+            out[k] += seconds_to_ns(text, table.path, table.rows[k].number, unit_ns) if date_ns is None else date_ns
             if stated_ns == 1 and date_ns is None and re.fullmatch(r"[-+]?\d*\.\d*[1-9]\d*", text):
-                raise InputError(f"{table.path}, line {row.number}: {text!r} is no whole number of nanoseconds")
+                raise table.error(k, f"{text!r} is no whole number of nanoseconds")
     return out
 
 

@@ -117,28 +117,28 @@ def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
     scalar : place of the quaternion's w, `first` or `last`, or empty where nothing says it
     Raises InputError when no layout fits, or several do.
     """
-    values = np.stack([table.numbers(k) for k in range(len(table.cells[0]))], axis=1)
-    width = values.shape[1]
-    line = f"{table.path}, line {table.rows[0].number}"
+    width = len(table.rows[0].cells)
+    values = np.stack([table.numbers(k) for k in range(width)], axis=1)
     leading = _leading_times(values)
     fits = [n for n in leading if width >= n + 7 and _are_unit(values[:, n + 3 : n + 7])]
     if len(fits) > 1:
-        raise InputError(f"{line}: {width} columns may be read in {len(fits)} ways: {_WAY_OUT} in a first line")
+        raise table.error(0, f"{width} columns may be read in {len(fits)} ways: {_WAY_OUT} in a first line")
     if not fits and width - 3 in leading:
         return PoseColumns([width - 3, width - 2, width - 1], width - 3, [])
     if not fits and width != 8:
-        raise InputError(
-            f"{line}: {width} columns are no trajectory format lslam knows (12 or 16 numbers: KITTI; 8: TUM; 4: time and "
-            f"position; commas: EuRoC or named columns); {_WAY_OUT} in a first line, or --format forces a format"
+        raise table.error(
+            0,
+            f"{width} columns are no trajectory format lslam knows (12 or 16 numbers: KITTI; 8: TUM; 4: time and "
+            f"position; commas: EuRoC or named columns); {_WAY_OUT} in a first line, or --format forces a format",
         )
     n = fits[0] if fits else 1
     order = scalar
     if table.separator is not None or not scalar:
         order = _scalar_by_motion(values[:, n : n + 3], values[:, n + 3 : n + 7]) or scalar
     if not order:
-        raise InputError(
-            f"{line}: a table without a header: {_WAY_OUT} (t,x,y,z,qx,qy,qz,qw), or use --format euroc for integer "
-            "nanoseconds"
+        raise table.error(
+            0,
+            f"a table without a header: {_WAY_OUT} (t,x,y,z,qx,qy,qz,qw), or use --format euroc for integer nanoseconds",
         )
     notes = []
     if scalar and order != scalar:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.pose_rows import Row, check_finite, check_increasing, frame_in, pose_texts, write_lines
-from lslam.formats.text_tables import looks_like_header, shortened, text_table
+from lslam.formats.atomic import write_text
+from lslam.formats.text_tables import TextTable, looks_like_header, shortened
 from lslam.formats.time_columns import find_clock
 from lslam.formats.trajectory_columns import named_columns, placed_columns
 from lslam.geometry import se3, so3
@@ -32,14 +33,14 @@ def fits_euroc(first: str) -> bool:
     return fits_csv(first) and re.fullmatch(r"\d{15,}", re.split(r"[,;]", first)[0].strip()) is not None
 
 
-def read_euroc(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
+def read_euroc(table: TextTable, times: Path | None) -> Trajectory:
     """Poses of the IMU, if no comment names another body."""
-    return parse(path, rows, comments, scalar="first", default_ns=1, frame="imu")
+    return parse(table, scalar="first", default_ns=1, frame="imu")
 
 
-def read_csv(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
+def read_csv(table: TextTable, times: Path | None) -> Trajectory:
     """Poses of the body that a comment names."""
-    return parse(path, rows, comments)
+    return parse(table)
 
 
 def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
@@ -50,51 +51,54 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     ]
     for stamp, pose in zip(trajectory.stamps_ns.tolist(), pose_texts(trajectory, "wxyz"), strict=True):
         lines.append(",".join([str(stamp), *pose]))
-    write_lines(path, lines)
+    write_text(Path(path), "".join(f"{line}\n" for line in lines))
 
 
-def parse(
-    path: Path,
-    rows: list[Row],
-    comments: list[str],
-    scalar: str = "",
-    default_ns: int | None = None,
-    frame: str = "unknown",
-) -> Trajectory:
+def pose_texts(trajectory: Trajectory, order: str) -> Iterator[list[str]]:
+    """Cells of each pose: the position and the quaternion in the order `xyzw` or `wxyz`."""
+    q = so3.to_quaternion(trajectory.poses[:, :3, :3])[:, ["xyzw".index(axis) for axis in order]]
+    for position, rotation in zip(trajectory.positions.tolist(), q.tolist(), strict=True):
+        yield [*(f"{v:.9f}" for v in position), *(f"{v:.12f}" for v in rotation)]
+
+
+def frame_in(comments: list[str]) -> str | None:
+    """The frame that a comment states as `frame: NAME`, or None."""
+    for comment in comments:
+        found = re.search(r"(?<![A-Za-z_])frame\s*[:=]\s*([A-Za-z_]\w*)", comment)
+        if found:
+            return found.group(1)
+    return None
+
+
+def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, frame: str = "unknown") -> Trajectory:
     """Read a table by the names of its columns, which may stand in a comment, else by what stands in them.
 
     scalar : place of w in quaternions without names, `first` or `last`; default_ns : unit of times without one
     frame : the body, if no comment names another
     Rows whose position or rotation is NaN or empty are lost poses and are left out.
     """
-    table = text_table(path, rows, comments)
-    if not table.rows:
-        raise InputError(f"{path} has a header but no poses")
+    path = table.path
     chosen = named_columns(table) if table.names else None
     if chosen is not None and not any("_rs_" in name.lower() for name in table.names):
         frame = "unknown"
     if chosen is None:
-        if looks_like_header(rows[0].text):
+        if looks_like_header(table.first):
             raise InputError(
                 f"{path}: no column for x, y, z in the header {', '.join(table.names)}; "
                 "name the columns t, x, y, z, qx, qy, qz, qw"
             )
         table = replace(table, names=())
-    width = len(table.names) or len(table.cells[0])
+    width = len(table.names) or len(table.rows[0].cells)
     table.check_widths(width, "the header" if table.names else "the first line", is_least=table.separator is not None)
     columns, leading, notes = chosen or placed_columns(table, scalar)
     values = table.values(columns)
-    lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
-    if lost.all():
-        raise InputError(f"{path}: every row holds NaN or no numbers: there is no pose")
+    lost = table.lost_rows(values, "NaN or no numbers")
     table, values = table.select(~lost), values[~lost]
-    check_finite(values, table.rows, path)
-    taken = columns if table.names else range(leading, len(table.cells[0]))
-    clock = find_clock(table, taken, default_ns)
+    clock = find_clock(table, columns if table.names else range(leading, width), default_ns)
     if clock is None:
         raise InputError(f"{path}: no column is a time in the header {', '.join(table.names)}; name it t, or stamp_ns")
-    check_increasing(clock.stamps_ns, table.rows, path)
-    poses, has_rotations, rotation_notes = poses_of(values, table.rows, path)
+    table.check_increasing(clock.stamps_ns)
+    poses, has_rotations, rotation_notes = poses_of(values, table)
     left_out = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns)]
     if left_out:
         hint = "" if len(columns) > 3 else "; rotations are read as quaternions (qx, qy, qz, qw)"
@@ -105,14 +109,14 @@ def parse(
     return Trajectory(
         stamps_ns=clock.stamps_ns,
         poses=poses,
-        frame=frame_in(comments) or frame,
+        frame=frame_in(table.comments) or frame,
         source=str(path),
         has_rotations=has_rotations,
         notes=tuple(notes),
     )
 
 
-def poses_of(values: Floats, rows: list[Row], path: Path) -> tuple[Floats, bool, list[str]]:
+def poses_of(values: Floats, table: TextTable) -> tuple[Floats, bool, list[str]]:
     """Poses (N, 4, 4) of positions (N, 3) or positions and quaternions xyzw (N, 7), whether their rotations are any, and notes.
 
     Quaternions of zeros everywhere are none, nor is one axis or identity everywhere along a path that bends: tools write
@@ -128,9 +132,7 @@ def poses_of(values: Floats, rows: list[Row], path: Path) -> tuple[Floats, bool,
     wrong = np.flatnonzero(np.abs(length - 1) > 0.05)
     if len(wrong):
         i = int(wrong[0])
-        raise InputError(
-            f"{path}, line {rows[i].number}: quaternion of length {length[i]:.3g}, a rotation has length 1"
-        )
+        raise table.error(i, f"quaternion of length {length[i]:.3g}, a rotation has length 1")
     if len(q) > 2 and (q == q[0]).all() and np.count_nonzero(q[0]) == 1:
         spread_m = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
         if spread_m[1] > BENT * max(spread_m[0], np.sqrt(len(p))):

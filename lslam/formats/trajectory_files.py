@@ -16,8 +16,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from lslam.errors import InputError
-from lslam.formats.pose_rows import read_rows
 from lslam.formats.stamp_files import read_times
+from lslam.formats.text_tables import read_table
 from lslam.formats.trajectory_csv import write_euroc
 from lslam.formats.trajectory_formats import FORMATS, format_named
 from lslam.formats.trajectory_lines import find_times, write_kitti, write_tum
@@ -47,9 +47,11 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
         if not (path / "trajectory.tum").is_file():
             raise InputError(f"{path} is a folder without trajectory.tum: name a run folder or a trajectory file")
         path = path / "trajectory.tum"
-    rows, comments = read_rows(path)
+    table = read_table(path)
     forced = None if format is None else format_named(format)
-    if not rows:
+    if not table.first:
         raise InputError(f"{path} holds no poses: the file is empty or all comments")
-    kind = forced or next(kind for kind in FORMATS.values() if kind.fits(rows[0].text))
-    return kind.read(path, rows, comments, None if times is None else Path(times))
+    if not table.rows:
+        raise InputError(f"{path} has a header but no poses")
+    kind = forced or next(kind for kind in FORMATS.values() if kind.fits(table.first))
+    return kind.read(table, None if times is None else Path(times))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lslam.errors import UsageError, nearest
 
 if TYPE_CHECKING:
-    from lslam.formats.pose_rows import Row
+    from lslam.formats.text_tables import TextTable
     from lslam.types.trajectory import Trajectory
 
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class TrajectoryFormat:
     """One format; its functions are imported when they are asked for.
 
-    module : with `fits_NAME(first line)`, `read_NAME(path, rows, comments, times)` and `write_NAME(path, trajectory)`
+    module : with `fits_NAME(first line)`, `read_NAME(table, times)` and `write_NAME(path, trajectory)`
     frame : the body whose poses it holds by convention, empty where the file says
     has_stamps : whether a file holds them; is_written : whether there is `write_NAME`
     """
@@ -36,8 +36,8 @@ class TrajectoryFormat:
         return self._function("fits")
 
     @property
-    def read(self) -> Callable[[Path, list[Row], list[str], Path | None], Trajectory]:
-        """The trajectory of lines and comments; the last argument names a file of stamps."""
+    def read(self) -> Callable[[TextTable, Path | None], Trajectory]:
+        """The trajectory of a table; the last argument names a file of stamps."""
         return self._function("read")
 
     @property

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats import trajectory_csv
-from lslam.formats.pose_rows import Row, check_finite, check_increasing, pose_texts, seconds_text, write_lines
+from lslam.formats.atomic import write_text
 from lslam.formats.stamp_files import read_times
-from lslam.formats.text_tables import looks_like_header, separator_of, split_cells, text_table
+from lslam.formats.stamp_texts import seconds_text
+from lslam.formats.text_tables import TextTable, looks_like_header, separator_of, split_cells
 from lslam.formats.time_columns import find_clock
 from lslam.geometry import so3
 from lslam.remote import as_path
@@ -45,11 +46,11 @@ def _is_matrix(cells: list[str]) -> bool:
     return bool(np.isfinite(numbers).all() and so3.is_rotation(numbers.reshape(-1, 4)[None, :3, :3], 1e-2)[0])
 
 
-def read_kitti(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
+def read_kitti(table: TextTable, times: Path | None) -> Trajectory:
     """Poses of camera 0; stamps of `times`, else of the times that belong to the file."""
-    trajectory = read_matrices(path, rows)
+    trajectory = read_matrices(table)
     if not trajectory.has_stamps:
-        stamps_ns = _stamps_of_kitti(path, scans_of(trajectory), times)
+        stamps_ns = _stamps_of_kitti(table.path, scans_of(trajectory), times)
         if stamps_ns is not None:
             trajectory = replace(trajectory, stamps_ns=stamps_ns, has_stamps=True)
     return without_lost(trajectory)
@@ -69,21 +70,18 @@ def without_lost(trajectory: Trajectory) -> Trajectory:
     return replace(trajectory.select(~lost), notes=(*trajectory.notes, note))
 
 
-def read_matrices(path: Path, rows: list[Row]) -> Trajectory:
+def read_matrices(table: TextTable) -> Trajectory:
     """The poses of rows of 12 or 16 numbers, row-major, perhaps behind a number of the scan (KITTI-360) or a time.
 
     Lost poses are NaN. Without times the stamps count the scans at 10 Hz.
     Raises InputError naming the line that is short, no number, infinite, or no rotation.
     """
-    table = replace(text_table(path, rows, []), names=())
-    width = len(table.cells[0]) if len(table.cells[0]) in WIDTHS else 12
+    table, rows = replace(table, names=()), table.rows
+    width = len(rows[0].cells) if len(rows[0].cells) in WIDTHS else 12
     size = 16 if width >= 16 else 12
     table.check_widths(width, "KITTI poses")
     values = table.values(list(range(width)))
-    lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
-    if lost.all():
-        raise InputError(f"{path}: every row holds NaN: there is no pose")
-    check_finite(values[~lost], table.select(~lost).rows, path)
+    lost = table.lost_rows(values, "NaN")
     matrices = values[:, -size:]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if size == 16 and not np.nan_to_num(matrices[:, [3, 7, 11]]).any() and np.nan_to_num(matrices[:, 12:15]).any():
@@ -95,25 +93,25 @@ def read_matrices(path: Path, rows: list[Row]) -> Trajectory:
     poses[lost] = np.nan
     wrong = np.flatnonzero(~lost & ~so3.is_rotation(np.nan_to_num(poses[:, :3, :3]), 1e-2))
     if len(wrong):
-        raise InputError(f"{path}, line {rows[wrong[0]].number}: the 3x3 part is no rotation matrix")
+        raise table.error(int(wrong[0]), "the 3x3 part is no rotation matrix")
     scans = np.arange(len(rows), dtype=np.float64) if width == size else values[:, 0]
     is_number = np.all(scans == np.rint(scans)) and np.all(np.diff(scans) > 0) and 0 <= scans[0] <= scans[-1] < 1e8
     if is_number:
         how = how if width == size else f"the number of the scan, then {how}"
         stamps_ns = scans.astype(np.int64) * NOMINAL_STEP_NS
     else:
-        clock = find_clock(replace(table, cells=[cells[:1] for cells in table.cells]))
+        clock = find_clock(table, taken=[1])
         assert clock is not None
         how, stamps_ns = f"the time, then {how}", clock.stamps_ns
-        check_increasing(stamps_ns, rows, path)
+        table.check_increasing(stamps_ns)
     frame, notes = ("cam0", ()) if width == 12 else ("unknown", (how,))
-    return Trajectory(stamps_ns, poses, frame, not is_number, source=str(path), notes=notes)
+    return Trajectory(stamps_ns, poses, frame, not is_number, source=str(table.path), notes=notes)
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     """Write a KITTI file, atomically: the poses as they are; the caller brings them into camera 0 (`T_cam0_lidar`)."""
     rows = trajectory.poses[:, :3, :].reshape(-1, 12).tolist()
-    write_lines(path, [" ".join(f"{v:.12e}" for v in row) for row in rows])
+    write_text(Path(path), "".join(" ".join(f"{v:.12e}" for v in row) + "\n" for row in rows))
 
 
 def fits_tum(first: str) -> bool:
@@ -121,18 +119,18 @@ def fits_tum(first: str) -> bool:
     return not trajectory_csv.fits_csv(first) and not fits_kitti(first)
 
 
-def read_tum(path: Path, rows: list[Row], comments: list[str], times: Path | None) -> Trajectory:
+def read_tum(table: TextTable, times: Path | None) -> Trajectory:
     """Poses of the body that a comment names."""
-    return trajectory_csv.parse(path, rows, comments, scalar="last")
+    return trajectory_csv.parse(table, scalar="last")
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> None:
     """Write a TUM file, atomically: stamps with 9 decimals, xyzw, the frame in a comment; `comment` may have lines."""
     lines = ["# stamp_s tx ty tz qx qy qz qw", f"# frame: {trajectory.frame}"]
     lines += [f"# {line}" for line in comment.splitlines()]
-    for stamp, pose in zip(trajectory.stamps_ns.tolist(), pose_texts(trajectory, "xyzw"), strict=True):
+    for stamp, pose in zip(trajectory.stamps_ns.tolist(), trajectory_csv.pose_texts(trajectory, "xyzw"), strict=True):
         lines.append(" ".join([seconds_text(stamp), *pose]))
-    write_lines(path, lines)
+    write_text(Path(path), "".join(f"{line}\n" for line in lines))
 
 
 def find_times(path: str | Path) -> Path | None:

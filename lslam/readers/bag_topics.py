@@ -18,7 +18,7 @@ from lslam.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.formats.packet_makers import is_packets, maker_by_name, not_decoded
 from lslam.formats.packet_messages import packet_topics
 from lslam.formats.pointcloud2 import livox_id
-from lslam.formats.pose_rows import seconds_text
+from lslam.formats.stamp_texts import seconds_text
 from lslam.readers.bag_halves import find_halves
 from lslam.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
 from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, say_jitter, stands_still

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.oxts_files import POS_ACC, ROLL, YAW, Oxts
-from lslam.formats.pose_rows import read_rows
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
+from lslam.formats.text_tables import read_rows, read_table
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
 from lslam.geometry import geodesy, portable, se3, so3
@@ -59,9 +59,8 @@ def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | 
 def load_poses(path: Path, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice) -> Trajectory | None:
     """Poses of `path` in the frame of the file; rows without time get the stamps of the scans they belong to."""
     try:
-        lines, _ = read_rows(path)
-        is_kitti = bool(lines) and fits_kitti(lines[0].text)
-        truth = without_lost(read_matrices(path, lines)) if is_kitti else read_trajectory(path)
+        table = read_table(path)
+        truth = without_lost(read_matrices(table)) if fits_kitti(table.first) else read_trajectory(path)
         voice.notes += [f"ground truth {path}: {note}" for note in truth.notes]
         return truth if truth.has_stamps else _pair(truth, stamps_ns, files, voice)
     except InputError as error:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
-from lslam.formats.pose_rows import read_rows
+from lslam.formats.text_tables import read_rows
 from lslam.readers.clocks import Clock, agree, onto, say_jitter, stands_still
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import check_stamps, file_numbers, filled_stamps, load_stamps, rows_of

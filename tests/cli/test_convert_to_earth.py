@@ -14,8 +14,8 @@ from defusedxml import ElementTree
 from fastkml import KML
 from fastkml.utils import find_all
 
+from lslam.formats.stamp_texts import utc_of
 from lslam.formats.trajectory_files import read_trajectory, write_tum
-from lslam.formats.utc_times import utc_of
 from lslam.geometry import se3
 from lslam.geometry.geodesy import from_local
 from lslam.types.trajectory import Trajectory

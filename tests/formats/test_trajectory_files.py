@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from lslam.errors import InputError, LslamError, OutputError, UsageError
-from lslam.formats.pose_rows import seconds_text, seconds_to_ns
+from lslam.formats.stamp_texts import seconds_text, seconds_to_ns
 from lslam.formats.trajectory_files import (
     find_times,
     read_times,
@@ -252,3 +252,15 @@ def test_every_format_of_the_table_reads_what_it_writes(name: str, tmp_path: Pat
     assert again.has_stamps == one.has_stamps
     first = next(line for line in (tmp_path / "a").read_text().splitlines() if not line.startswith("#"))
     assert next(other for other in FORMATS if FORMATS[other].fits(first)) == name
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [(3 * "1 2 3 4 5 6 7 8 9 10 11 12\n", "line 2: the 3x3 part is no rotation"), ("", "no poses")],
+)
+def test_matrices_below_a_header_are_read_or_refused_in_a_sentence(rows: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("a b c d e f g h i j k l\n" + rows)
+    with pytest.raises(InputError, match=sentence):
+        read_trajectory(tmp_path / "a.txt", "kitti")
+    (tmp_path / "a.txt").write_text("a b c d e f g h i j k l\n" + 3 * "1 0 0 4 0 1 0 8 0 0 1 12\n")
+    assert read_trajectory(tmp_path / "a.txt", "kitti").positions.tolist() == 3 * [[4, 8, 12]]
