@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.formats.time_columns import UNITS_NS
 from lslam.types.scan import NO_RING, is_measured
 
 AXES = ("x", "y", "z")
@@ -35,13 +36,8 @@ TIME_NAMES = (
 )  # fmt: skip
 # FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
 _DOUBTFUL_TIMES = {"curvature": "ms"}
-_UNIT_OF = {
-    **dict.fromkeys(("s", "sec", "secs", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "millis"), "ms"),
-    **dict.fromkeys(("us", "usec", "micros", "microsec"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nsecs", "nanosec", "nanos", "nanoseconds"), "ns"),
-}
-_FINE_PER_S = {"ns": 10**9, "us": 10**6, "ms": 10**3}
+UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}  # ns
+_UNIT_OF = {word: unit for word, ns in UNITS_NS.items() for unit in UNITS if UNITS[unit] == ns}
 # Before `_sec` and `_nsec`, where it is none of `TIME_NAMES`.
 _CLOCKS = ("", "lidar", "sensor", "point", "utc", "gps", "header", "epoch")
 ORGANISED = "(shorter side)"
@@ -216,7 +212,7 @@ def _clocks(names: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> It
     parted = {plain: _part_unit(plain) for plain in names}
     by_unit = {part: names[plain] for plain, part in parted.items()}
     for (clock, unit), name in by_unit.items():
-        fine = next((u for u in _FINE_PER_S if unit == "s" and (clock, u) in by_unit), None)
+        fine = next((u for u in ("ns", "us", "ms") if unit == "s" and (clock, u) in by_unit), None)
         if fine is not None and (clock in _CLOCKS or clock in TIME_NAMES):
             other = by_unit[clock, fine]
             yield from _seconds_and(fine, f"{name} + {other}", columns[name], columns[other])
@@ -242,9 +238,9 @@ def _part_unit(plain: str) -> tuple[str, str]:
 def _seconds_and(fine: str, name: str, seconds: NDArray[Any], parts: NDArray[Any]) -> Iterator[TimeColumn]:
     """ns from whole seconds and `parts` of a second in the unit `fine`; nothing where the values are something else."""
     whole, part = _integers(seconds), _integers(parts)
-    if whole is None or part is None or 2 * np.count_nonzero((part >= 0) & (part < _FINE_PER_S[fine])) < len(part):
+    if whole is None or part is None or 2 * np.count_nonzero((part >= 0) & (part < 10**9 // UNITS[fine])) < len(part):
         return
-    yield TimeColumn(name, whole * 10**9 + part * (10**9 // _FINE_PER_S[fine]), "ns")
+    yield TimeColumn(name, whole * 10**9 + part * UNITS[fine], "ns")
 
 
 def _two_words(name: str, values: NDArray[Any]) -> Iterator[TimeColumn]:

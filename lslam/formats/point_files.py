@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause
-from lslam.formats.array_headers import HEADERS
 from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
 from lslam.formats.pcd_files import pcd_columns, pcd_header
 from lslam.formats.ply_files import ply_columns, ply_header
 from lslam.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
 from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
+from lslam.formats.state_files import HEADERS
 from lslam.remote import RemotePath
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.untrusted import MISFIT

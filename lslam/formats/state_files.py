@@ -14,18 +14,21 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
+from threading import RLock
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.array_headers import HEADERS
 from lslam.formats.atomic import atomic_write
 from lslam.untrusted import MISFIT, parse_json
 
 # What zipfile and NumPy raise; no memory, for arrays that are said to be larger than any machine; a flag of encryption.
 DAMAGE = (*MISFIT, EOFError, SyntaxError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)
+# One thread at a time reads NumPy's headers: it parses them as Python, and CPython 3.11 counts the depth of its parser for all
+# threads together. Where a collection of garbage lets another one in, the first ends with a SystemError (CPython issue 106905).
+HEADERS = RLock()
 Arrays = dict[str, NDArray[Any]]
 Classes = Mapping[str, type]
 

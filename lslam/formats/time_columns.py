@@ -20,8 +20,8 @@ Floats = NDArray[np.float64]
 Units = dict[int, int | None]
 UNITS_NS = {
     "ns": 1, "nsec": 1, "nsecs": 1, "nanosec": 1, "nanosecs": 1, "nanosecond": 1, "nanoseconds": 1, "nanos": 1,
-    "us": 1_000, "usec": 1_000, "usecs": 1_000, "microsec": 1_000, "microsecs": 1_000, "microseconds": 1_000,
-    "ms": 1_000_000, "msec": 1_000_000, "msecs": 1_000_000, "milliseconds": 1_000_000,
+    "us": 1_000, "usec": 1_000, "micros": 1_000, "usecs": 1_000, "microsec": 1_000, "microsecs": 1_000, "microseconds": 1_000,
+    "ms": 1_000_000, "msec": 1_000_000, "millis": 1_000_000, "msecs": 1_000_000, "milliseconds": 1_000_000,
     "s": 1_000_000_000, "sec": 1_000_000_000, "secs": 1_000_000_000, "second": 1_000_000_000, "seconds": 1_000_000_000,
 }  # fmt: skip
 SECOND_NS = 1_000_000_000

@@ -71,13 +71,6 @@ def open_sequence(
     """
     if (rows is None) != (cols is None) or min(rows or 1, cols or 1) < 1:
         raise UsageError(f"rows {rows} and cols {cols} of organised clouds go together and are above 0")
-    # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
-    try:
-        folder = find_folder(name_or_path, data_root)
-        if not isinstance(folder, RemotePath):
-            folder = Path(os.path.abspath(folder))
-    except OSError as error:
-        raise _unreadable(name_or_path, error) from None
     from lslam.formats.calibration_files import read_transform
     from lslam.formats.sequence_toml import SequenceInfo, is_rate
 
@@ -92,9 +85,13 @@ def open_sequence(
         T_lidar_imu=None if extrinsics is None else read_transform(extrinsics), **topics,
     )  # fmt: skip
     try:
+        folder = find_folder(name_or_path, data_root)
+        if not isinstance(folder, RemotePath):
+            # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
+            folder = Path(os.path.abspath(folder))
         sequence = _open(folder, overrides)
     except OSError as error:
-        raise _unreadable(name_or_path, error) from None
+        raise InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}") from None
     from lslam.readers.raw_drive import with_streams
 
     given = [f"--{key.replace('_', '-')}" for key, name in topics.items() if name is not None]
@@ -107,10 +104,6 @@ def open_sequence(
 
     of_all = SequenceInfo(motion_compensated=motion_compensated)
     return with_folders(sequence, overrides, lambda path: _open(path, of_all))
-
-
-def _unreadable(name_or_path: str | Path, error: OSError) -> InputError:
-    return InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}")
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:

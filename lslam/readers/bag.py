@@ -204,7 +204,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
     }
     if len(sequence) > 1 and len(ends) == 1:
         # Better than the times of recording, where the headers stand still.
-        points = point_stamps(len(sequence), lambda k: sequence.cloud(k)[0], sequence.rate_hz)
+        points = point_stamps(range(len(sequence)), lambda k: sequence.cloud(k)[0], sequence.rate_hz)
         if points is not None:
             sequence.stamps_ns, note = onto_recording(points, index.stamps_ns)
             sequence.headers_ns = sequence.stamps_ns

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.array_headers import HEADERS
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
-from lslam.formats.state_files import DAMAGE
+from lslam.formats.state_files import DAMAGE, HEADERS
 from lslam.printable import printable
 from lslam.readers.ground_truth import Voice, load_poses
 from lslam.readers.listing import check_stamps
@@ -32,6 +31,7 @@ from lslam.types.scan import Scan, Span
 from lslam.types.trajectory import Trajectory
 
 Matrix = NDArray[np.float64]
+_PER_POINT: dict[str, Any] = {"t": np.float32, "ring": np.uint16}
 
 
 @dataclass(kw_only=True)
@@ -58,23 +58,7 @@ class FolderSequence(SequenceOnDisk):
         stamp = int(self.stamps_ns[index])
         is_kitti = path.suffix.lower() == ".bin" and self.record in (None, KITTI)
         cloud = in_metres(_split(read_bin(path)) if is_kitti else read_points(path, self.record), self.unit_m)
-        cloud, times = self._times_and_rings(path, cloud, index)
-        fault = ""
-        if self.per_point is None and self.clock is not None:
-            cloud, times, shift_ns, fault, _ = self.clock.read(cloud, stamp)
-            stamp += shift_ns
-        if self.correction_deg and len(cloud):
-            from lslam.kernels.transform import rotate_up
-
-            angle = math.radians(self.correction_deg)
-            rotate_up(cloud.points, math.sin(angle), math.cos(angle))
-        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings, fault=fault)
-
-    def _times_and_rings(
-        self, path: Path, cloud: PointCloud, index: int
-    ) -> tuple[PointCloud, NDArray[np.float32] | None]:
-        times: NDArray[np.float32] | None = None
-        rings = cloud.rings
+        times, rings, fault = None, cloud.rings, ""
         if self.per_point is not None and len(cloud):
             # Compensated scans have no times: nobody shall deskew them a second time.
             names = ("ring",) if self.motion_compensated else ("t", "ring")
@@ -85,7 +69,16 @@ class FolderSequence(SequenceOnDisk):
             if self.rows * self.cols != len(cloud):
                 raise InputError(f"{path}: {len(cloud)} points are not {self.rows} rows of {self.cols} columns")
             rings = np.repeat(np.arange(self.rows, dtype=np.uint16), self.cols)
-        return replace(cloud, rings=rings), times
+        cloud = replace(cloud, rings=rings)
+        if self.per_point is None and self.clock is not None:
+            cloud, times, shift_ns, fault, _ = self.clock.read(cloud, stamp)
+            stamp += shift_ns
+        if self.correction_deg and len(cloud):
+            from lslam.kernels.transform import rotate_up
+
+            angle = math.radians(self.correction_deg)
+            rotate_up(cloud.points, math.sin(angle), math.cos(angle))
+        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings, fault=fault)
 
 
 @dataclass
@@ -174,14 +167,10 @@ def _read_per_point(
     """Times and rings of a scan's points, (count,) each, of which `names` are read."""
     try:
         with HEADERS, path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            held = {name: file[name] for name in names if name in file}
+            held = {name: np.asarray(file[name], _PER_POINT[name]) for name in names if name in file}
     except (OSError, *DAMAGE) as error:
         raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {cause(error)}") from None
     for name, values in held.items():
         if values.shape != (count,):
             raise InputError(f"{path}: {name} has shape {values.shape} for a scan of {count} points")
-    times, rings = held.get("t"), held.get("ring")
-    return (
-        None if times is None else np.asarray(times, np.float32),
-        None if rings is None else np.asarray(rings, np.uint16),
-    )
+    return held.get("t"), held.get("ring")

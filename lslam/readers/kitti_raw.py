@@ -11,7 +11,6 @@ deg from OXTS, .14 when OXTS is taken to lag by 14 ms: its yaw is late in bends.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from lslam.formats.sequence_toml import SequenceInfo
 from lslam.readers.folder_sequence import Folder, FolderSequence
 from lslam.readers.ground_truth import find_ground_truth, oxts_truth, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps, rows_of
+from lslam.readers.lookup import DRIVE
 from lslam.readers.sidecars import calibration_over, load_streams, vertical_correction
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -32,7 +32,6 @@ from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
 KIND = "kitti-raw"
-DRIVE = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}(_sync|_extract)?$")
 # OXTS measures every 10 ms: a scan gets one of the two samples about it, mostly the nearer one.
 _OXTS_NS = 10_000_000
 _EVEN = 21

@@ -13,7 +13,7 @@ from lslam.remote import RemotePath, as_path
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
 _DRIVE_NAME = re.compile(r"(?:(?P<date>\d{4}_\d\d_\d\d)_)?(?:drive_)?(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
-_DRIVE = re.compile(r"(?P<date>\d{4}_\d\d_\d\d)_drive_(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
+DRIVE = re.compile(r"(?P<date>\d{4}_\d\d_\d\d)_drive_(?P<number>\d{4})(?P<kind>_sync|_extract)?$")
 _ROOTS = ("", "dataset", "kitti", "kitti/dataset", "raw", "kitti_raw", "kitti/raw")
 
 
@@ -91,7 +91,7 @@ def _drives(root: Path, text: str) -> list[Path]:
     return [
         path
         for path in _all_drives(root)
-        if (drive := _DRIVE.match(path.name)) and parts.items() <= drive.groupdict().items()
+        if (drive := DRIVE.match(path.name)) and parts.items() <= drive.groupdict().items()
     ]
 
 
@@ -99,7 +99,7 @@ def _all_drives(root: Path) -> list[Path]:
     places = [root, *(p for part in _ROOTS if (p := root / part).is_dir() and part)]
     days = [d for place in places for d in place.glob("[0-9]*_[0-9]*_[0-9]*") if d.is_dir()]
     candidates = [p for place in [*places, *days] for p in place.glob("*_drive_*") if p.is_dir()]
-    return sorted({p for p in candidates if _DRIVE.match(p.name)})
+    return sorted({p for p in candidates if DRIVE.match(p.name)})
 
 
 def _not_found(text: str, root: Path) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from lslam.readers.point_clock import PointClock, read_samples
 from lslam.readers.point_times import Sample, learn_rule
 
 Stamps = NDArray[np.int64]
+T = TypeVar("T")
 _OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 _SLOW_HZ = 1.0  # tried where no rate is stated and no sweep is as short as usual
 
@@ -28,18 +29,19 @@ class PointStamps(NamedTuple):
     field: str
 
 
-def point_stamps(count: int, read: Callable[[int], PointCloud], rate_hz: float | None) -> PointStamps | None:
+def point_stamps(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: float | None) -> PointStamps | None:
     """Begin of every scan by its points' own clock; None when their times are no clock's readings or do not increase.
 
     A scan whose points tell nothing gets its stamp from those beside it. All scans are read where the first few have a clock.
     """
-    clock = _clock(count, read, rate_hz)
+    count = len(scans)
+    clock = _clock(scans, read, rate_hz)
     if clock is None:
         return None
     begins: dict[int, int] = {}
-    for index in range(count):
+    for index, scan in enumerate(scans):
         with suppress(InputError):
-            begin = clock.begin_ns(read(index))
+            begin = clock.begin_ns(read(scan))
             if begin is not None:
                 begins[index] = begin
     at, stamps = np.array(list(begins), np.int64), np.array(list(begins.values()), np.int64)
@@ -48,9 +50,9 @@ def point_stamps(count: int, read: Callable[[int], PointCloud], rate_hz: float |
     return PointStamps(filled_stamps(np.arange(count), at, stamps), clock.rule.sweep_s, clock.rule.field)
 
 
-def _clock(count: int, read: Callable[[int], PointCloud], rate_hz: float | None) -> PointClock | None:
+def _clock(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: float | None) -> PointClock | None:
     """The clock of the points when its readings are absolute, by a few scans."""
-    samples = list(read_samples(count, lambda index: Sample(read(index), 0)).values())
+    samples = list(read_samples(len(scans), lambda index: Sample(read(scans[index]), 0)).values())
     for rate in (rate_hz,) if rate_hz else (DEFAULT_RATE_HZ, _SLOW_HZ):
         with suppress(InputError):
             rule = learn_rule(samples, rate)

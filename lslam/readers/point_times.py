@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.point_cloud import PointCloud, TimeColumn
+from lslam.formats.point_cloud import UNITS, PointCloud, TimeColumn
 from lslam.types.scan import Span, is_measured
 
-_UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 # A field's unit is that in which the scan lasts so many of its periods; an offset that begins later is a clock's reading.
 _SHORTEST, _LONGEST = 0.05, 3.0
 # Times fill each of so many parts of a sweep with this share of the points at least, which real curvature, small nearly
@@ -125,7 +124,7 @@ def _agree(
     words = "since scan start" if instant == "scan_start" else f"relative to the scan's {instant.removeprefix('scan_')}"
     words = "absolute" if is_absolute else words
     how = ", as stated" if unit or reference else ""
-    ns = _UNITS_NS[usual]
+    ns = UNITS[usual]
     farthest = max(max(abs(r.low), abs(r.high)) for r in readings)
     return TimeRule(
         ns, is_absolute, is_before_stamp=not is_absolute and instant == "scan_end", field=name, points=points,
@@ -143,10 +142,10 @@ def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, r
 
     def can_be(u: str) -> bool:
         low, high = limits[u]
-        is_sweep = _SHORTEST <= (high - low) * _UNITS_NS[u] / period_ns <= _LONGEST
+        is_sweep = _SHORTEST <= (high - low) * UNITS[u] / period_ns <= _LONGEST
         return is_sweep and (not clock.is_doubtful or (u == clock.unit and _is_swept(points, values, low, high)))
 
-    limits = {u: _limits(values, _LONGEST * period_ns / ns) for u, ns in _UNITS_NS.items()}
+    limits = {u: _limits(values, _LONGEST * period_ns / ns) for u, ns in UNITS.items()}
     fitting = [u for u in limits if can_be(u)]
     if unit is not None:
         fitting, limits = [unit], {unit: _limits(values, np.inf)}
@@ -160,7 +159,7 @@ def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, r
     usual = "ns" if values.dtype.kind in "iu" and "ns" in fitting else fitting[0]
     usual = clock.unit if clock.unit in fitting else usual
     low, high = limits[usual]
-    is_absolute = reference is None and low * _UNITS_NS[usual] > _LONGEST * period_ns
+    is_absolute = reference is None and low * UNITS[usual] > _LONGEST * period_ns
     instant = "scan_start" if low >= 0 else Span(low, high).instant
     return _TimeReading(usual, values.dtype, low, high, is_absolute, instant)
 

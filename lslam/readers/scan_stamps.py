@@ -58,14 +58,14 @@ def stamp_scans(
             files, own = rows_of_scans(path, own, files, voice)
             clocks, words = [Clock(str(path), own)], path.name
         except InputError as error:
-            points = None if by_name else _points(files, read, rate_hz)
+            points = None if by_name else point_stamps(files, read, rate_hz)
             if not by_name and points is None:
                 raise
             voice.problems.append(f"stamps are not used: {error}")
     if by_name:
         clocks.append(Clock("the stamps in the file names", np.array([by_name[file] for file in files], np.int64)))
     if not clocks or _is_suspicious(clocks[0].stamps_ns):
-        points = points or _points(files, read, rate_hz)
+        points = points or point_stamps(files, read, rate_hz)
     if points is not None:
         clocks.append(Clock(f"the absolute times of the points, field {points.field!r},", points.stamps_ns))
     if not clocks:
@@ -115,10 +115,6 @@ def _agreed(clocks: list[Clock], voice: Voice) -> Stamps:
 def _is_suspicious(stamps: Stamps) -> bool:
     steps = np.diff(stamps)
     return bool(len(steps)) and bool((steps <= 0).any() or steps.max() > _STEP * np.median(steps))
-
-
-def _points(files: list[Path], read: Callable[[Path], PointCloud], rate_hz: float | None) -> PointStamps | None:
-    return point_stamps(len(files), lambda index: read(files[index]), rate_hz)
 
 
 def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -> tuple[list[Path], Stamps]:
