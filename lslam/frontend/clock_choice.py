@@ -24,7 +24,7 @@ Verdict = Literal["stated", "clear", "compensated", "unclear", "standing", "unkn
 # Windows of moving scans that may be asked, and places along the recording where they are looked for.
 _MOST_WINDOWS, _PLACES = 3, 9
 # Turns of the sweep's beginning that are tried, and the finer ones about the best.
-_TURNS, _FINER = (0.25, 0.5, 0.75), (0.125, 0.0625)
+TURNS, _FINER = (0.25, 0.5, 0.75), (0.125, 0.0625)
 # Turns nearer than this are the same clock, nearly.
 _NEAR = 0.2
 # A sweep of half the length must not fit better than by so many standard deviations.
@@ -38,19 +38,23 @@ class ClockChoice:
     """The clock of a recording's points, None for no times, and how it was found.
 
     scores : mean distance of the points that were kept out from the surfaces of other scans, 0 to 1, by clock
+    later : scans from which on it no longer fits, and what they chose
     """
 
     clock: SweepClock | None
     verdict: Verdict
     sentence: str
     scores: dict[str, float] = field(default_factory=dict)
+    later: tuple[tuple[int, ClockChoice], ...] = ()
 
     def facts(self) -> dict[str, Any]:
         """As plain values, for the manifest."""
+        later = [{"scan": first, **choice.facts()} for first, choice in self.later]
         return {
             "clock": None if self.clock is None else self.clock.facts(),
             "verdict": self.verdict,
             "scores": {name: round(value, 5) for name, value in self.scores.items()},
+            **({"later": later} if later else {}),
         }
 
 
@@ -102,9 +106,9 @@ def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> Cloc
     tried: list[SweepClock | None] = [None, forward, backward]
     best = _best(windows, tried)
     if proposal.is_guess or best is None:
-        tried += [replace(clock, turn=turn) for clock in (forward, backward) for turn in _TURNS]
+        tried += [replace(clock, turn=turn) for clock in (forward, backward) for turn in TURNS]
     else:
-        tried += [replace(best, turn=turn) for turn in _TURNS]
+        tried += [replace(best, turn=turn) for turn in TURNS]
     best = _best(windows, tried)
     if best is not None and (best.turn or proposal.is_guess):
         for step in _FINER:

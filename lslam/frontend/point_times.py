@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from lslam.config import Config
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.frontend.clock_agreement import FEWEST_SCANS
+from lslam.frontend.clock_changes import later_choices
 from lslam.frontend.clock_choice import ClockChoice, choose_clock
 from lslam.kernels import jit
 from lslam.locks import one_at_a_time
@@ -19,7 +21,7 @@ from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.preprocessing.views import Clocked
 from lslam.readers.merged_lidars import MergedLidars
 from lslam.types.scan import Scan
-from lslam.types.selection import SequenceView
+from lslam.types.selection import SequenceView, select
 from lslam.types.sequence import Sequence, StatedTimes
 
 log = logging.getLogger("lslam")
@@ -62,31 +64,52 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
         return _with(sequence, _as_stated(sequence, scans, stated.kind, nominal, preprocess))
     if len(sequence) < FEWEST_SCANS:
         return sequence
-    proposal = propose_clock(scans, nominal, getattr(sequence, "rows", None))
-    if proposal is None:
-        return sequence
-    return _with(sequence, _by_agreement(sequence, proposal, scans, preprocess))
+    choice = _by_agreement(sequence, scans, nominal, preprocess)
+    return sequence if choice is None else _with(sequence, choice)
 
 
 def _by_agreement(
-    sequence: Sequence, proposal: Proposal, scans: list[Scan], preprocess: PreprocessConfig
-) -> ClockChoice:
-    """What the agreement of scans decides."""
+    sequence: Sequence, scans: list[Scan], nominal: SweepClock, preprocess: PreprocessConfig
+) -> ClockChoice | None:
+    """What the order of points proposes and the agreement of scans decides, again where it no longer fits.
+
+    None where nothing is proposed.
+    """
+    rows = getattr(sequence, "rows", None)
+
+    def decide(first: int) -> ClockChoice:
+        part = select(sequence, first)
+        samples = _samples(part) if first else scans
+        proposal = propose_clock(samples, nominal, rows)
+        if proposal is None:
+            return ClockChoice(None, "unknown", "point times: none, the sensor makes no full turns")
+        return _decided(part, proposal, samples[0], preprocess)
+
+    choice = decide(0)
+    if choice.clock is None:
+        return None if choice.verdict == "unknown" else choice
+    return replace(choice, later=tuple(later_choices(sequence, choice.clock, decide, preprocess)))
+
+
+def _decided(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
+    """As `choose_clock`, with the kernels compiled before."""
     with jit.announced(log):
         # Other processes wait while this one compiles, not while it registers.
         with one_at_a_time(jit.lock_file(), "compiles kernels"):
             create_odometry(Config()).warm_up()
-        return choose_clock(sequence, proposal, scans[0], preprocess)
+        return choose_clock(sequence, proposal, sample, preprocess)
 
 
 def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
     """The sequence with the clock of the choice, which the manifest finds as `clock_choice`."""
-    notes = [*sequence.notes, choice.sentence]
+    again = [f"from scan {first} on the clock no longer fits: {later.sentence}" for first, later in choice.later]
+    notes = [*sequence.notes, choice.sentence, *again]
     if choice.verdict == "compensated" and sequence.motion_compensated is None:
         return SequenceView(sequence, notes=notes, clock_choice=choice, motion_compensated=True)
     if choice.clock is None and choice.verdict != "stated":
         return SequenceView(sequence, notes=notes, clock_choice=choice)
-    return Clocked(sequence, choice.clock, notes=notes, clock_choice=choice)
+    clocks = [(first, later.clock) for first, later in choice.later]
+    return Clocked(sequence, choice.clock, clocks, notes=notes, clock_choice=choice)
 
 
 def _as_stated(
@@ -107,7 +130,7 @@ def _as_stated(
         proposal = azimuth_proposal(scans, nominal)
         clock = proposal.clock
         if proposal.is_guess:
-            choice = _by_agreement(sequence, proposal, scans, preprocess)
+            choice = _decided(sequence, proposal, scans[0], preprocess)
             if choice.clock is None:
                 raise InputError(
                     f"{sequence.path}: point_times = 'azimuth', and neither the order of the points nor the agreement of "

@@ -167,11 +167,14 @@ def _clocked(run: EarlierRun, opened: Sequence) -> Sequence:
     if facts is None:
         return opened
     try:
-        clock = None if facts["clock"] is None else SweepClock(**facts["clock"])
+        clock, *later = (
+            None if part["clock"] is None else SweepClock(**part["clock"]) for part in (facts, *facts.get("later", ()))
+        )
+        firsts = [int(part["scan"]) for part in facts.get("later", ())]
         is_stated = facts["verdict"] == "stated"
     except MISFIT as error:
         raise InputError(f"{run.folder / MANIFEST}: point_times: {error}; run the sequence again") from None
-    return opened if clock is None and not is_stated else Clocked(opened, clock)
+    return opened if clock is None and not is_stated else Clocked(opened, clock, zip(firsts, later, strict=True))
 
 
 def rebuild(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.preprocessing.firing_order import follow_rings, follow_sweep
 from lslam.preprocessing.rings import organised_rows, ring_seam
-from lslam.preprocessing.sweep_clock import SweepClock, azimuths
+from lslam.preprocessing.sweep_clock import SweepClock, azimuths, even_begin
 from lslam.types.scan import Scan
 
 Floats = NDArray[np.float64]
@@ -18,8 +18,6 @@ Floats = NDArray[np.float64]
 _COVERED, _BINS = 0.5, 36
 # rad; the sweeps of a sensor begin at one azimuth when most of its scans begin within this of their middle.
 _FIXED_RAD = np.radians(10.0)
-# rad; columns are even where nine in ten of the points lie so near to their azimuth, lasers being offset by some degrees.
-_EVEN_RAD = np.radians(12.0)
 # Share of the scans that must have the same order.
 _MOST = 0.8
 
@@ -53,7 +51,14 @@ def columns_clock(scans: list[Scan], nominal: SweepClock, rows: int | None) -> S
     if layout is None:
         return None
     clock = replace(nominal, kind="columns", rows=layout[0], is_columnwise=layout[1])
-    return clock if all(_is_even(clock, scan) for scan in scans) else None
+    shares = [
+        (clock.times_of(scan.points)[0] / clock.seconds + clock.is_stamp_at_end).astype(np.float64) for scan in scans
+    ]
+    for sense in (-1, 1):
+        begins = [even_begin(scan.points, share, sense) for scan, share in zip(scans, shares, strict=True)]
+        if None not in begins:
+            return replace(clock, sense=sense, begin_rad=_common(np.array(begins)))
+    return None
 
 
 def order_clock(scans: list[Scan], nominal: SweepClock) -> SweepClock | None:
@@ -85,22 +90,6 @@ def azimuth_proposal(scans: list[Scan], nominal: SweepClock) -> Proposal:
             begins.append(ring.begin_rad)
     begin = _common(np.array(begins))
     return Proposal(replace(guess, sense=sense, begin_rad=-np.pi if begin is None else begin), is_guess=begin is None)
-
-
-def _is_even(clock: SweepClock, scan: Scan) -> bool:
-    """Whether columns turn on by equal angles, as they do where none is left out."""
-    points = scan.points
-    is_used = np.isfinite(points).all(axis=1) & (points[:, :2] != 0).any(axis=1)
-    if not is_used.any():
-        return True
-    turned = clock.times_of(points)[0][is_used] * (2 * np.pi / clock.seconds)
-    angle = azimuths(points[is_used])
-    for sense in (-1, 1):
-        apart = np.exp(1j * (angle - sense * turned))
-        off = np.abs(np.angle(apart * np.conj(apart.mean())))
-        if np.percentile(off, 90) < _EVEN_RAD:
-            return True
-    return False
 
 
 def _coverage(scans: list[Scan]) -> float:

@@ -16,6 +16,10 @@ Floats = NDArray[np.float64]
 _FULL = 2 * np.pi
 # Share of a turn by which the first point of a scan may lie before the azimuth at which sweeps begin.
 _EARLY = 0.1
+# rad; columns are even where nine in ten of the points lie so near to their azimuth, lasers being offset by some degrees.
+_EVEN_RAD = np.radians(12.0)
+# Points of a scan that tell whether its columns are even.
+_LOOKED_AT = 4000
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class SweepClock:
         or by the index alone where `sense` is 0; azimuth: by the azimuth of each point
     seconds : length of a sweep, s; is_stamp_at_end : the stamp belongs to the sweep's end, not to its start
     rows, is_columnwise : of `columns`: number of rows, and whether points are stored column after column
-    sense : of `order` and `azimuth`: 1 counter-clockwise from above, -1 clockwise
+    sense : 1 counter-clockwise from above, -1 clockwise; 0 unknown
     begin_rad : azimuth at which sweeps begin; None: each with its first point
     is_reversed : the shares run backwards; turn : share of a sweep that is added, modulo 1
     """
@@ -53,12 +57,16 @@ class SweepClock:
     def _shares(self, points: NDArray[Any]) -> tuple[Floats, str]:
         n = len(points)
         if self.kind == "columns":
+            why = f"{n} points are not {self.rows} rows of equal length"
             if n % self.rows == 0:
                 index, columns = np.arange(n), n // self.rows
-                return (index // self.rows if self.is_columnwise else index % columns) / columns, ""
-            return np.arange(
-                n
-            ) / n, f"{n} points are not {self.rows} rows of equal length: the order of the points instead"
+                shares = (index // self.rows if self.is_columnwise else index % columns) / columns
+                if not self.sense or even_begin(points, shares, self.sense) is not None:
+                    return shares, ""
+                why = "its columns do not turn as those of the other scans"
+            if self.begin_rad is None:
+                return np.arange(n) / max(n, 1), f"{why}: the order of the points instead"
+            return _turned(azimuths(points), self.begin_rad, self.sense), f"{why}: the azimuth of each instead"
         if self.kind == "azimuth":
             return _turned(azimuths(points), self.begin_rad or 0.0, self.sense), ""
         if not self.sense:
@@ -111,6 +119,22 @@ def azimuths(points: NDArray[Any]) -> Floats:
     """(N,) rad, counter-clockwise from x; 0 for points that are not finite."""
     angle = np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
     return np.where(np.isfinite(angle), angle, 0.0)
+
+
+def even_begin(points: NDArray[Any], shares: Floats, sense: int) -> float | None:
+    """Azimuth, rad, at which points (N, 3) begin that turn evenly in this sense with `shares` (N,) of the sweep.
+
+    None where they do not; 0 for points of which none is usable.
+    """
+    step = len(points) // _LOOKED_AT | 1  # odd: rows are even in number
+    points, shares = points[::step], shares[::step]
+    is_used = np.isfinite(points).all(axis=1) & (points[:, :2] != 0).any(axis=1)
+    if not is_used.any():
+        return 0.0
+    apart = np.exp(1j * (azimuths(points[is_used]) - sense * _FULL * shares[is_used]))
+    middle = apart.mean()
+    off = np.abs(np.angle(apart * np.conj(middle)))
+    return float(np.angle(middle)) if np.percentile(off, 90) < _EVEN_RAD else None
 
 
 def _turned(angle: Floats, begin_rad: float, sense: int) -> Floats:

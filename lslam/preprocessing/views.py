@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -23,20 +23,27 @@ _LOOKED_AT = 5
 
 
 class Clocked(SequenceView):
-    """The sequence with the times of its points by `clock`, without any where that is None; all else is the sequence's own."""
+    """The sequence with the times of its points by `clock`, without any where that is None; all else is the sequence's own.
 
-    def __init__(self, whole: Sequence, clock: SweepClock | None, **own: Any) -> None:
+    later : scans from which on another clock tells them
+    """
+
+    def __init__(
+        self, whole: Sequence, clock: SweepClock | None, later: Iterable[tuple[int, SweepClock | None]] = (), **own: Any
+    ) -> None:
         super().__init__(whole, **own)
         self.sweep_clock = clock
+        self._clocks = [(0, clock), *later]
 
     def scan(self, index: int) -> Scan:
         """Read scan `index`; says so where its points break the rule. Raises InputError as the sequence does."""
         scan = self.whole.scan(index)
-        if self.sweep_clock is None:
+        clock = next(clock for first, clock in reversed(self._clocks) if first <= index)
+        if clock is None:
             return replace(scan, times=None)
         if not len(scan):
             return replace(scan, times=np.zeros(0, np.float32))
-        times, why = self.sweep_clock.times_of(scan.points)
+        times, why = clock.times_of(scan.points)
         if why:
             log.warning("scan %d: point times: %s", scan.index, why)
         return replace(scan, times=times)

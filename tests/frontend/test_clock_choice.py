@@ -14,7 +14,11 @@ import pytest
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
+from lslam.frontend.clock_changes import later_choices
+from lslam.frontend.clock_choice import ClockChoice
 from lslam.frontend.point_times import with_point_times
+from lslam.preprocessing.clock_proposals import Proposal
+from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.readers.merged_lidars import MergedLidars
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -170,3 +174,61 @@ def test_what_is_stated_and_not_there_is_refused(kind: str, why: str) -> None:
     untimed = Untimed(columns_first, stated_times=StatedTimes(kind))
     with pytest.raises(InputError, match=why):
         with_point_times(untimed, PREPROCESS)  # type: ignore[arg-type]
+
+
+class Windows:
+    """What `read_window` gives of a recording whose scans agree under a clock of which the last index is `until`."""
+
+    def __init__(self, clocks: list[tuple[int, SweepClock | None]], first: int) -> None:
+        self.scans = [Scan(np.random.default_rng(0).normal(size=(64, 3)).astype(np.float32), 0, first)]
+        self.is_moving = True
+        self._right = [next(clock for end, clock in clocks if i < end) for i in range(first, first + 10)]
+
+    def is_astray(self, clock: SweepClock | None) -> bool:
+        return False
+
+    def scores(self, clock: SweepClock | None) -> Any:
+        return np.array([0.1 if clock == right else 0.2 for right in self._right]) + 0.001 * np.arange(10)
+
+
+def test_a_clock_that_no_longer_fits_is_decided_again_from_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SweepClock("azimuth", SECONDS, sense=1, begin_rad=0.0)
+    reverse, elsewhere = replace(clock, is_reversed=True), replace(clock, is_reversed=True, turn=0.5)
+    true = [(950, clock), (1700, None), (2300, reverse), (9999, elsewhere)]
+    asked: list[int] = []
+
+    def read(sequence: Any, first: int, preprocess: PreprocessConfig) -> Windows:
+        asked.append(first)
+        return Windows(true, first)
+
+    def decide(first: int) -> ClockChoice:
+        right = next(clock for end, clock in true if first + 5 < end)
+        return ClockChoice(right, "clear", "")
+
+    monkeypatch.setattr("lslam.frontend.clock_changes.read_window", read)
+    later = later_choices(range(3000), clock, decide, PREPROCESS)  # type: ignore[arg-type]
+    assert [choice.clock for _, choice in later] == [None, reverse, elsewhere]
+    assert [first for first, _ in later] == pytest.approx([950, 1700, 2300], abs=8)
+    assert len(asked) < 7 + 3 * 8
+    assert later_choices(range(800), clock, decide, PREPROCESS) == []  # type: ignore[arg-type]
+
+
+def test_scans_after_a_change_have_the_times_of_another_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    choices = {0: 1, 9: -1}
+    untimed = Untimed(columns_first)
+
+    def choose(sequence: Any, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
+        first = COUNT - len(sequence)
+        return ClockChoice(replace(proposal.clock, is_reversed=choices[first] < 0), "clear", f"told at {first}")
+
+    monkeypatch.setattr("lslam.frontend.point_times.choose_clock", choose)
+    monkeypatch.setattr(
+        "lslam.frontend.point_times.later_choices",
+        lambda sequence, clock, decide, preprocess: [(9, decide(9))],
+    )
+    sequence: Any = with_point_times(untimed, PREPROCESS)  # type: ignore[arg-type]
+    assert sequence.notes == ["told at 0", "from scan 9 on the clock no longer fits: told at 9"]
+    forward, backward = sequence.scan(8).times, sequence.scan(9).times
+    assert np.median(np.diff(forward)) > 0 > np.median(np.diff(backward))
+    facts = json.loads(json.dumps(sequence.clock_choice.facts()))
+    assert (facts["later"][0]["scan"], facts["later"][0]["clock"]["is_reversed"]) == (9, True)

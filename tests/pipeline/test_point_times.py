@@ -69,6 +69,15 @@ def test_a_run_takes_the_clock_and_its_folder_keeps_it(folder: Path, tmp_path: P
     times = again.scan(5).times
     assert times is not None
     assert np.ptp(times) == pytest.approx(0.1, abs=0.002)
+    # Nor where another clock was chosen for later scans.
+    facts["later"] = [{"scan": 6, "clock": {**facts["clock"], "is_reversed": True}, "verdict": "clear", "scores": {}}]
+    (tmp_path / "run" / "manifest.json").write_text(json.dumps(manifest))
+    changed = open_scans(read_run(tmp_path / "run"))
+    np.testing.assert_array_equal(changed.scan(5).times, times)  # type: ignore[arg-type]
+    later, before = changed.scan(6).times, again.scan(6).times
+    assert later is not None
+    assert before is not None
+    np.testing.assert_allclose(later, 0.1 - before, atol=2e-3)
     # The same clock stated gives the same bytes.
     stated = ran(folder, point_times="order")
     assert stated.trajectory.poses.tobytes() == record.trajectory.poses.tobytes()

@@ -126,7 +126,8 @@ def test_stated_rows_are_stored_row_after_row() -> None:
     scans[0].points[::7] = np.nan
     proposal = propose_clock(scans, NOMINAL, ROWS)
     assert proposal is not None
-    assert proposal.clock == SweepClock("columns", SECONDS, rows=ROWS)
+    assert replace(proposal.clock, begin_rad=None) == SweepClock("columns", SECONDS, rows=ROWS, sense=-1)
+    assert proposal.clock.begin_rad == pytest.approx(0, abs=0.02)
     assert wrong_share(proposal.clock, scans[0]) == 0
 
 
@@ -192,3 +193,22 @@ def test_the_sentence_names_where_a_sweep_begins() -> None:
     )
     assert "from azimuth 90 deg" in str(replace(clock, turn=0.75))
     assert "counter-clockwise" in str(replace(clock, is_reversed=True))
+
+
+def twice_the_rows(scan: Scan) -> Scan:
+    """Every row twice, each after the other, as a driver with another resolution might write them."""
+    return scan.select(np.arange(len(scan)).reshape(ROWS, COLUMNS).repeat(2, axis=0).ravel())
+
+
+@pytest.mark.parametrize("change", [shuffled, twice_the_rows, lambda scan: scan.select(slice(None, None, -1))])
+def test_columns_of_another_layout_are_timed_by_azimuth_and_named(change: object) -> None:
+    """64 rows divide the points of 128 rows too: what columns they would make does not turn evenly."""
+    scans = [rows_first(spun(45.0, True, seed)) for seed in range(3)]
+    proposal = propose_clock(scans, NOMINAL, None)
+    assert proposal is not None
+    assert proposal.clock.kind == "columns"
+    other = change(scans[2])  # type: ignore[operator]
+    times, why = proposal.clock.times_of(other.points)
+    assert why == "its columns do not turn as those of the other scans: the azimuth of each instead"
+    assert other.times is not None
+    assert (np.abs(times - other.times) > 0.002).mean() < 0.02
