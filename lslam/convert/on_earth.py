@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from lslam.convert.convert_trajectory import change_frame
+from lslam.convert.gpx_files import write_gpx
+from lslam.convert.kml_files import write_kml
 from lslam.errors import InputError, OutputExistsError, UsageError
-from lslam.formats.gpx_files import write_gpx
-from lslam.formats.kml_files import write_kml
 from lslam.formats.stamp_texts import utc_of
 from lslam.maps.georeference import to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json

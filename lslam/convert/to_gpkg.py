@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.convert.gpkg_files import GeoLayer, write_gpkg
 from lslam.convert.on_earth import georeference_beside
 from lslam.convert.output import staged
 from lslam.errors import InputError, OutputExistsError, UsageError
-from lslam.formats.gpkg_files import GeoLayer, write_gpkg
 from lslam.formats.stamp_texts import utc_of
 from lslam.geometry.geodesy import from_local
 from lslam.maps.georeference import to_lat_lon

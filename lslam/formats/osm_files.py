@@ -126,24 +126,17 @@ def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
     for event, element in iterparse(stream, events=("start", "end"), forbid_dtd=True):
         if root is None:
             root = element
-            _check_root(path, root)
-            _take_attribution(data, root)
+            if root.tag != "osm":
+                what = f"it begins with <{root.tag}>, not with <osm>"
+                raise InputError(f"{path} is XML but no OpenStreetMap extract: {what}")
+            # Whatever does not say that lslam made it up comes from OpenStreetMap.
+            if root.get("generator") == GENERATOR and not root.get("attribution"):
+                data.attribution = None
         elif event == "end" and element.tag in ("node", "way", "relation"):
             _add_xml(data, element)
             root.clear()
     data.number_drawn()
     return data
-
-
-def _check_root(path: Path, root: Element) -> None:
-    if root.tag != "osm":
-        raise InputError(f"{path} is XML but no OpenStreetMap extract: it begins with <{root.tag}>, not with <osm>")
-
-
-def _take_attribution(data: OsmData, root: Element) -> None:
-    """Whatever does not say that lslam made it up comes from OpenStreetMap."""
-    if root.get("generator") == GENERATOR and not root.get("attribution"):
-        data.attribution = None
 
 
 def _add_xml(data: OsmData, element: Element) -> None:

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lslam.errors import InputError
+from lslam.errors import InputError, UsageError, nearest
 from lslam.formats.stamp_files import read_times
 from lslam.formats.text_tables import read_table
 from lslam.formats.trajectory_csv import write_euroc
-from lslam.formats.trajectory_formats import FORMATS, format_named
+from lslam.formats.trajectory_formats import FORMATS
 from lslam.formats.trajectory_lines import find_times, write_kitti, write_tum
 from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
@@ -48,10 +48,11 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
             raise InputError(f"{path} is a folder without trajectory.tum: name a run folder or a trajectory file")
         path = path / "trajectory.tum"
     table = read_table(path)
-    forced = None if format is None else format_named(format)
+    if format is not None and format not in FORMATS:
+        raise UsageError(f"no trajectory format {format!r}; {nearest(format, FORMATS)}")
     if not table.first:
         raise InputError(f"{path} holds no poses: the file is empty or all comments")
     if not table.rows:
         raise InputError(f"{path} has a header but no poses")
-    kind = forced or next(kind for kind in FORMATS.values() if kind.fits(table.first))
+    kind = FORMATS[format] if format else next(kind for kind in FORMATS.values() if kind.fits(table.first))
     return kind.read(table, None if times is None else Path(times))

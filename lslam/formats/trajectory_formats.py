@@ -8,8 +8,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lslam.errors import UsageError, nearest
-
 if TYPE_CHECKING:
     from lslam.formats.text_tables import TextTable
     from lslam.types.trajectory import Trajectory
@@ -61,10 +59,3 @@ FORMATS = {
     )
 }
 WRITTEN = tuple(name for name, one in FORMATS.items() if one.is_written)
-
-
-def format_named(name: str) -> TrajectoryFormat:
-    """The format of this name. Raises UsageError with the nearest name when there is none."""
-    if name not in FORMATS:
-        raise UsageError(f"no trajectory format {name!r}; {nearest(name, FORMATS)}")
-    return FORMATS[name]

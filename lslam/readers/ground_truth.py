@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.oxts_files import POS_ACC, ROLL, YAW, Oxts
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
-from lslam.formats.text_tables import read_rows, read_table
+from lslam.formats.text_tables import read_table
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
 from lslam.geometry import geodesy, portable, se3, so3
@@ -83,12 +83,11 @@ def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
     scans, and when it has as many poses as there are scans, but of other numbers: one of them is numbered from elsewhere.
     """
     numbers_of_files = file_numbers(files)
-    rows, _ = read_rows(as_path(truth.source))
-    if numbers_of_files is None or rows[0].text.split(",")[0].strip().lower() not in _NUMBER_COLUMNS:
+    table = read_table(as_path(truth.source))
+    if numbers_of_files is None or not table.names or table.names[0].lower() not in _NUMBER_COLUMNS:
         return None
-    cells = [row.text.split(",")[0].strip() for row in rows[1:]]
-    row_of = {whole_number(c): k for k, c in enumerate(cells)}
-    if len(cells) != len(truth) or None in row_of:
+    row_of = {whole_number(row.cells[0]): k for k, row in enumerate(table.rows)}
+    if len(table.rows) != len(truth) or None in row_of:
         return None
     found = np.array([row_of.get(int(n), -1) for n in numbers_of_files])
     have = found >= 0

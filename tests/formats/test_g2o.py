@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from formats.g2o_reader import read_g2o
 
 from lslam.errors import InputError, OutputError
-from lslam.formats.g2o import read_g2o, write_g2o
+from lslam.formats.g2o import write_g2o
 from lslam.geometry import noise, se3
 from lslam.types.constraint import Constraint
 

@@ -17,7 +17,6 @@ from lslam.config.study import read_batch, read_study
 from lslam.errors import LslamError
 from lslam.evaluation.timing import read_timing
 from lslam.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
-from lslam.formats.g2o import read_g2o
 from lslam.formats.geojson import read_line
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
@@ -64,11 +63,6 @@ _IMU = "stamp_ns,accel_x,accel_y,accel_z,gyro_x,gyro_y,gyro_z\n0,0,0,9.81,0,0,0\
 _GNSS = "time,lat,lon,alt\n0.0,49,8.4,110\n0.1,49.00001,8.4,110\n"
 _CALIB = "P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27\n"
 _MCD = "body:\n  os_sensor:\n    T:\n    - [1, 0, 0, 0]\n    - [0, 1, 0, 0]\n    - [0, 0, 1, 0]\n    - [0, 0, 0, 1]\n"
-_G2O = (
-    "VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\nVERTEX_SE3:QUAT 1 1 0 0 0 0 0 1\nFIX 0\nEDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 "
-    + " ".join("1" if k in (0, 6, 11, 15, 18, 20) else "0" for k in range(21))
-    + "\n"
-)
 _STUDY = """summary = "a study"
 methods = ["icp"]
 seeds = [1, 2]
@@ -245,7 +239,6 @@ PARSERS = [
     _text_parser("MCD calibration", "a_calib.yaml", read_mcd_extrinsics, _MCD),
     _text_parser("transform", "T.txt", lambda p: read_transform(str(p)), "1 0 0 0 0 1 0 0 0 0 1 0\n", "0,0,0,0,0,0,1", _CALIB),
     Parser("OXTS", read_oxts, _oxts, tables=("timestamps.txt", "data/0000000001.txt")),
-    _text_parser("g2o", "graph.g2o", read_g2o, _G2O),
     _text_parser("timing.csv", "timing.csv", read_timing, _TIMING),
     Parser("results.csv", lambda f: read_study_csv(f / "results.csv"), _results, tables=("results.csv",)),
     Parser("named pairs", lambda f: read_named_pairs(f / "a.csv"), _named_pairs, tables=("a.csv",)),

@@ -13,9 +13,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+from formats.g2o_reader import read_g2o
 
 from lslam.config import Config
-from lslam.formats.g2o import read_g2o
 from lslam.formats.osm_files import read_osm
 from lslam.formats.point_files import read_cloud
 from lslam.formats.state_files import read_state

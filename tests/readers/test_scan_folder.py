@@ -208,14 +208,20 @@ def test_real_ouster_folder(recordings: Callable[[str], Path]) -> None:
     assert (np.diff(means) < 0).all()
 
 
-@pytest.mark.parametrize("missing", [(0, 1), (5,), (0, 3, 7), (6, 7)])
-def test_scans_without_a_pose_keep_the_others_truth_and_stamps(tmp_path: Path, missing: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("missing", "before", "between"),
+    [((0, 1), "", ","), ((5,), "", ";"), ((0, 3, 7), "# ", ","), ((6, 7), "", ",")],
+)
+def test_scans_without_a_pose_keep_the_others_truth_and_stamps(
+    tmp_path: Path, missing: tuple[int, ...], before: str, between: str
+) -> None:
     folder = scans(tmp_path / "kth", 8, ".pcd")
     poses = lidar_poses(8)[:, :3, 3]
     rows = [
         f"{k},{1670403902.2 + k / 10:.1f},{x},{y},{z},0,0,0,1" for k, (x, y, z) in enumerate(poses) if k not in missing
     ]
-    (folder / "pose_inW.csv").write_text("\n".join(["num,t,x,y,z,qx,qy,qz,qw", *rows]) + "\n")
+    table = "\n".join([f"{before}num,t,x,y,z,qx,qy,qz,qw", *rows]) + "\n"
+    (folder / "pose_inW.csv").write_text(table.replace(",", between))
     s = open_sequence(folder)
     np.testing.assert_array_equal(s.stamps_ns, 1670403902200000000 + np.arange(8) * 100_000_000)
     assert s.ground_truth is not None

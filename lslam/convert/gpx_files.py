@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
+from lslam.convert.kml_files import Place
 from lslam.extras import install_hint
 from lslam.foreign import importing
 from lslam.formats.atomic import write_text
-from lslam.formats.kml_files import Place
 from lslam.version import __version__
 
 
