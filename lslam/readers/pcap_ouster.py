@@ -101,7 +101,7 @@ def _whole(count: Integers, voice: Voice) -> Integers:
     """Which frames are scans: where a capture begins or ends within a revolution, that one is not."""
     keep = np.ones(len(count), bool)
     if len(count) > 2:
-        keep[[0, -1]] = count[[0, -1]] == count[1:-1].max()
+        keep[[0, -1]] = count[[0, -1]] == count.max()
     if not keep.all():
         voice.notes.append(f"{int((~keep).sum())} revolutions at the ends of the capture are not whole and no scans")
     return np.flatnonzero(keep)

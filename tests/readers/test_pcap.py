@@ -190,6 +190,15 @@ def test_revolutions_that_are_not_whole_are_no_scans(tmp_path: Path) -> None:
     assert any("2 revolutions at the ends" in note for note in sequence.notes)
 
 
+def test_whole_revolutions_at_the_ends_are_scans_where_packets_between_are_lost(tmp_path: Path) -> None:
+    """Four packets a revolution: of the second and the third two are there."""
+    spec = OusterSpec()
+    frames, _ = ouster(spec, 4)
+    sequence = open_sequence(write_ouster(tmp_path, spec, [*frames[:6], *frames[10:]]))
+    assert [len(sequence.scan(k)) for k in range(len(sequence))] == [512, 256, 256, 512]
+    assert ((sequence.stamps_ns - sequence.stamps_ns[0]) // 10**6).tolist() == [0, 100, 250, 300]
+
+
 def test_what_cannot_be_read_is_one_sentence_with_the_file(tmp_path: Path) -> None:
     frames, _ = velodyne("VLP-16", 1.2)
     spec = OusterSpec()
