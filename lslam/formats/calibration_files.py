@@ -55,10 +55,7 @@ def read_raw_cam0_lidar(folder: str | Path) -> Floats:
 
 
 def read_cam0_lidar(path: str | Path) -> Floats:
-    """`T_cam0_lidar` from whichever file holds it: odometry `calib.txt`, raw `calib_velo_to_cam.txt`, or a raw day's folder.
-
-    Raises InputError when it holds none.
-    """
+    """`T_cam0_lidar` of `calib.txt`, of a raw `calib_velo_to_cam.txt` or of a raw day's folder. Raises InputError without any."""
     path = as_path(path)
     if path.is_dir():
         return read_raw_cam0_lidar(path)

@@ -38,10 +38,7 @@ _BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
 def check_las(stream: BinaryIO) -> tuple[int, int]:
-    """Bytes of a point and of the points of the largest chunk, decompressed, of a LAS or LAZ file.
-
-    Raises ValueError saying what contradicts what in the sizes of its header and its chunks.
-    """
+    """Bytes of a point and of the largest chunk, decompressed. Raises ValueError saying which sizes contradict each other."""
     size = os.fstat(stream.fileno()).st_size
     head = stream.read(393)
     if head[:4] != b"LASF":
@@ -167,10 +164,7 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
 
 
 def read_las(path: Path) -> tuple[ArrayCloud, str]:
-    """The points, m, and 16-bit intensities of a LAS or LAZ file, and its coordinate reference system as WKT or "".
-
-    Raises InputError naming the file when it is missing or damaged.
-    """
+    """The points, m, 16-bit intensities and WKT, or "", of a LAS or LAZ file. Raises InputError naming one that is damaged."""
     with importing("laspy", _WAY_OUT):
         import laspy
         import lazrs  # noqa: F401

@@ -43,10 +43,7 @@ class _Header:
 
 
 def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """The points of a PCD file by field; they stay in the order and the frame of the file (VIEWPOINT is not applied, as in PCL).
-
-    Raises InputError naming the file and the place: a header that lies, data that end early.
-    """
+    """The points of a PCD file by field, in its own frame (without VIEWPOINT, as PCL). Raises InputError naming the place."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -31,10 +31,7 @@ class _Element:
 
 
 def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """The vertices of a PLY file by property; faces and other elements after them are ignored.
-
-    Raises InputError naming the file and the line: no PLY, a bad header, data that end early.
-    """
+    """The vertices of a PLY file by property, without faces behind them. Raises InputError naming the file and the line."""
     try:
         data = path.read_bytes()
     except OSError as error:

@@ -50,7 +50,7 @@ _FEWEST_RINGS, _MOST_RINGS, _TOO_SMALL = 4, 300, 100
 class TimeColumn:
     """A field, or two together, that may hold per-point times.
 
-    name : in the file; values : (N,) as stored, of any type; unit : `s`, `ms`, `us` or `ns` where the name says it, else empty
+    name : in the file; values : (N,) as stored; unit : `s`, `ms`, `us` or `ns`, empty where the name says none
     is_doubtful : other software uses the name for something else
     """
 
@@ -105,10 +105,7 @@ def organised(rows: int, cols: int) -> dict[str, NDArray[Any]]:
 def packed_columns(
     path: Path, kind: str, names: Sequence[str], dtype: np.dtype[Any], count: int, data: memoryview, at: int = 0
 ) -> dict[str, NDArray[Any]]:
-    """One array per field of `count` points that lie one behind the other from byte `at`; the fields of `dtype` are numbered.
-
-    Raises InputError when the data end early.
-    """
+    """One array per field, numbered in `dtype`, of `count` points from byte `at` on. Raises InputError when data end early."""
     record = dtype.itemsize
     room = max(len(data) - at, 0)
     if room < count * record:
@@ -145,9 +142,7 @@ def cloud_from_fields(
 ) -> PointCloud:
     """Collect x, y, z and the fields known by name from one array per field, (N,) or, where a field repeats, (N, K).
 
-    kind : of the points: float32 for scans, float64 for maps
-
-    Raises InputError naming the file and the fields it has when x, y or z is missing.
+    kind : of the points: float32 for scans, float64 for maps. Raises InputError naming the fields where x, y or z is missing.
     """
     columns = {name: values for name, values in columns.items() if values.ndim == 1 or values.shape[1]}
     names: dict[str, str] = {}

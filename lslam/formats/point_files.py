@@ -36,9 +36,7 @@ log = logging.getLogger("lslam")
 def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
     """Read one point file, chosen by its suffix; NaN, Inf and zero points are kept as they are.
 
-    record : of the points of a `.bin` file or of a plain NumPy array; None recognises it by the values
-
-    Raises InputError naming the file and the place when it is missing, truncated or of another kind.
+    record : of a `.bin` file or of a plain NumPy array; None recognises it. Raises InputError naming the file and the place.
     """
     return cloud_from_fields(path, _read_columns(path, record))
 
@@ -69,10 +67,7 @@ def read_bytes(path: Path) -> NDArray[np.uint8]:
 
 
 def read_bin(path: Path) -> NDArray[np.float32]:
-    """(N, 4) float32 x, y, z (m) and intensity of a KITTI `.bin` file.
-
-    Raises InputError naming the file and its size when that is no multiple of 16 bytes.
-    """
+    """(N, 4) float32 x, y, z (m) and intensity of a KITTI `.bin` file. Raises InputError when it is no multiple of 16 bytes."""
     raw = read_bytes(path)
     check_size(path, raw, KITTI)
     return raw.view("<f4").reshape(-1, 4)
@@ -180,9 +175,7 @@ _COLUMNS = {".pcd": pcd_columns, ".ply": ply_columns, ".txt": _text_columns}
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
     """Write a cloud, m, atomically and without holding it in memory: .ply and .pcd hold float32, .las and .laz millimetres.
 
-    comment : goes into PLY headers; wkt : coordinate reference system of the points, for LAS and LAZ
-
-    Raises UsageError on another suffix, OutputError when the file cannot be written.
+    comment : for PLY headers; wkt : coordinate reference system, for LAS. Raises UsageError on another suffix, OutputError.
     """
     suffix = path.suffix.lower()
     if suffix in (".las", ".laz"):
@@ -198,9 +191,8 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
 
 
 def read_cloud(path: Path) -> ArrayCloud:
-    """Read any map or point file whole, its points as float64, m, with all the digits that the file has.
+    """Read any map or point file whole as float64, m; coordinates far from the origin in coarse steps are warned about.
 
-    Coordinates far from the origin in coarse steps are warned about.
     Raises InputError naming the file when it is missing, damaged or of another kind.
     """
     if path.suffix.lower() in (".las", ".laz"):

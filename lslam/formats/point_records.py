@@ -98,10 +98,9 @@ KITTI = parse_record("x y z intensity")
 
 @dataclass(frozen=True)
 class Recognition:
-    """What the bytes of files are.
+    """What the bytes of files are: `record` of their points, None where none fits or several do, and which are `fitting`.
 
-    record : of their points, None where none fits or several do; reason : why it is not KITTI's, empty where it is
-    fitting : records that the values allow
+    reason : why it is not KITTI's, empty where it is
     """
 
     record: PointRecord | None
@@ -111,10 +110,7 @@ class Recognition:
 
 @np.errstate(all="ignore")
 def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
-    """The record of the points in these files, decided on all of them together.
-
-    KITTI's is taken unless the sizes of most files or the values contradict it. Few points decide nothing.
-    """
+    """The record of all the files: KITTI's unless their sizes or values contradict it. Few points decide nothing."""
     files = [raw for raw in files if len(raw) >= KITTI.size]
     if not files:
         return Recognition(KITTI)

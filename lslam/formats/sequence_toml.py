@@ -130,10 +130,7 @@ class SequenceInfo:
 
 
 def read_sequence_toml(path: Path) -> SequenceInfo:
-    """Read `path`, a `sequence.toml`.
-
-    Raises InputError naming the file, the key and the nearest known key or the values allowed.
-    """
+    """Read such a file. Raises InputError naming the file, the key and the nearest known key or the values allowed."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

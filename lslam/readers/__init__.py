@@ -61,7 +61,7 @@ def open_sequence(
     lidar_topic, imu_topic, gnss_topic : which topics of a bag are read, where it has several
     lidar_frame : which of the LiDARs that share a topic, by the frame of their messages, or `all`
     point_times : what tells the times of points: field, columns, order, azimuth or none; None and auto find out
-    extrinsics : T_lidar_imu, as numbers or a file (see `transform_text`)
+    extrinsics : T_lidar_imu, as numbers or a file (see `read_transform`)
         What is given wins over `sequence.toml`, which wins over what the layout implies.
     imu, gnss : the stream is asked for: where the recording has none it is sought, as in the raw drive of a KITTI sequence
 

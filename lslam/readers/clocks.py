@@ -101,10 +101,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
 
 
 def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Voice) -> Stamps:
-    """Stamps (N,) of a stream without a second clock, moved as `repaired` (M,) from `scans` (M,), where it steps as these did.
-
-    A stream that does not step at the same instants by the same amount is on another clock and stays.
-    """
+    """Stamps (N,) moved as `repaired` (M,) from `scans` (M,) where they step with these; otherwise as they are."""
     interval = float(np.median(np.diff(repaired))) if len(scans) > 1 else 0.0
     removed = np.diff(scans) - np.diff(repaired)
     at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
@@ -151,10 +148,7 @@ def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
-    """The interval between messages, ns, and by how much faster `w` runs; by the windows in which the clocks agree best.
-
-    The interval is 0 where one of them does not go on.
-    """
+    """The interval, ns, 0 where a clock does not go on, and by how much faster `w` runs, by the windows that agree best."""
     best = (np.inf, 0.0, 0.0)
     for length in _WINDOWS:
         if len(h) < 2 * length:

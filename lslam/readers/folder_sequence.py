@@ -83,10 +83,7 @@ class FolderSequence(SequenceOnDisk):
 
 @dataclass
 class Folder:
-    """A folder of scans while it is opened: its scan files, what is stated about it, and where sentences go.
-
-    has_toml : whether there is a `sequence.toml`; record : of the points, where the files do not name their fields
-    """
+    """A folder of scans while it is opened: its files and their `record`, what is stated about it, where sentences go."""
 
     path: Path
     kind: str

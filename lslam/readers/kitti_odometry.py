@@ -24,10 +24,7 @@ KIND = "kitti-odometry"
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """The sequence folder in or at `folder` and why it is one; None when this is no KITTI odometry layout.
-
-    Raises InputError listing the sequences when `folder` is a root that holds several.
-    """
+    """The sequence folder in or at `folder` and why it is one, else None. Raises InputError listing them where several are."""
     if (folder / "velodyne").is_dir():
         return folder, "it has velodyne/, as KITTI odometry sequences do"
     for sequences in (folder / "sequences", folder / "dataset" / "sequences"):

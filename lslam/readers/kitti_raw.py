@@ -40,10 +40,7 @@ AT_START, AHEAD = 0.0, 0.5
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """The drive in or at `folder` and why it is one; None when this is no KITTI raw layout.
-
-    Raises InputError listing the drives when `folder` is a day that holds several.
-    """
+    """The drive in or at `folder` and why it is one, else None. Raises InputError listing the drives of a day of several."""
     if (folder / "velodyne_points").is_dir():
         return folder, "it has velodyne_points/, as KITTI raw drives do"
     if (folder / "oxts").is_dir():
@@ -120,10 +117,7 @@ def _oxts(folder: Folder) -> Oxts | None:
 
 
 def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[NDArray[np.int64], float, float | None]:
-    """Stamps of the LiDAR; of OXTS by index where a shared excerpt leaves them out; else nominal.
-
-    And the share of the sweep that is over by then, where that is known.
-    """
+    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the share of the sweep that is over by then."""
     info, voice = folder.info, folder.voice
     compensated = bool(info.motion_compensated)
     passed = {"timestamps.txt": AHEAD, "timestamps_start.txt": AT_START}

@@ -19,10 +19,7 @@ Stamps = NDArray[np.int64]
 
 
 def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:
-    """Point files of `folder` in natural order (scan2 before scan10), and notes about what was left out.
-
-    Only files of the most frequent suffix count: a map beside the scans is no scan.
-    """
+    """Point files of the most frequent suffix in natural order (scan2 before scan10), and notes about what was left out."""
     try:
         files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     except OSError as error:
@@ -94,10 +91,7 @@ def load_stamps(path: Path, problems: list[str]) -> Stamps | None:
 def check_stamps(
     stamps: Stamps, rate_hz: float | None, source: Path | str, problems: list[str]
 ) -> tuple[Stamps, float]:
-    """The stamps if they increase, else nominal ones from the first, and the rate (stated, else from the median step).
-
-    What is wrong is added to `problems` with the line it is on.
-    """
+    """The stamps if they increase, else, which is a problem, nominal ones from the first; the rate, stated or measured."""
     steps = np.diff(stamps)
     rate = rate_hz or measured_rate(stamps)
     wrong = np.flatnonzero(steps <= 0)

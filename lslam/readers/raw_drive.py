@@ -78,10 +78,7 @@ def _is_cut(sequence: Sequence) -> bool:
 
 
 def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what: str, file: str) -> Sequence:
-    """The sequence with a stream of its raw drive, on its own clock.
-
-    Raises InputError that names `what` is missing and the `file` that would have it; for a bag as `why_none`.
-    """
+    """The sequence with a stream of its raw drive. Raises InputError naming `what` is missing and the `file` with it."""
     if not isinstance(sequence, FolderSequence):
         raise why_none(sequence.bag, kind)  # type: ignore[attr-defined]
     date, number, first = DRIVES[sequence_number(sequence.path.name)]

@@ -16,10 +16,7 @@ _LOOKED_AT = 3
 
 
 def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRecord | None:
-    """The record of `.bin` files and plain NumPy arrays; None where files name their fields.
-
-    Raises InputError when no record fits the values, or several do.
-    """
+    """The record of `.bin` files and plain arrays, None where fields have names. Raises InputError when none or several fit."""
     suffix = files[0].suffix.lower()
     if suffix not in (".bin", ".npy"):
         return None

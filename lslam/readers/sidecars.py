@@ -46,10 +46,7 @@ def compensation_note(info: SequenceInfo) -> list[str]:
 
 
 def stated_times(info: SequenceInfo) -> StatedTimes:
-    """What `sequence.toml` or the user states about the times of points.
-
-    Raises InputError where scans are also stated to be motion compensated: their points have no times.
-    """
+    """What is stated about the times of points. Raises InputError where scans are stated to be compensated: they have none."""
     if info.motion_compensated and info.point_times not in (None, "none"):
         raise InputError(
             f"point_times = {info.point_times!r} and motion_compensated = true contradict each other: state one of them"
