@@ -6,9 +6,10 @@ unwritable, 4 done but a gate the user set failed, 130 interrupted.
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 # Nobody reads a word of so many characters; paths may have some hundreds.
 _FLOOD = re.compile(r"\S{1000,}")
@@ -105,6 +106,17 @@ def cause(error: BaseException) -> str:
     'no number'
     """
     return getattr(error, "strerror", None) or str(error)
+
+
+@contextlib.contextmanager
+def input_errors(place: object, *kinds: type[Exception], as_what: str = "") -> Iterator[None]:
+    """Turn an OSError, or one of further `kinds`, of the block into an InputError: `place` cannot be read, `as_what`, and why."""
+    caught: tuple[type[Exception], ...] = (OSError, *kinds)
+    try:
+        yield
+    except caught as error:
+        how = f" as {as_what}" if as_what else ""
+        raise InputError(f"{place} cannot be read{how}: {cause(error)}") from None
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from zlib import error as zlib_error
 
-from lslam.errors import InputError, OutputError, UsageError, cause
+from lslam.errors import InputError, OutputError, UsageError, cause, input_errors
 from lslam.formats.bag_chunks import zstd
 from lslam.formats.bag_listing import packing_of
 from lslam.kernels.cache import cache_folder
@@ -57,11 +57,8 @@ def _kind(path: Path) -> str:
     """How it is compressed: by its first bytes, whatever its name; a name that they contradict is refused."""
     if isinstance(path, RemotePath):
         return packing_of(path)
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(8)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
+    with input_errors(path), path.open("rb") as stream:
+        head = stream.read(8)
     kind = next((kind for magic, kind in _MAGIC.items() if head.startswith(magic)), "")
     if not kind and (packing := packing_of(path)):
         fact = f"begins with {head!r}" if head else "has 0 bytes"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, LslamError, UsageError, cause
+from lslam.errors import InputError, LslamError, UsageError, cause, input_errors
 from lslam.geometry import se3, so3
 from lslam.remote import as_path
 from lslam.untrusted import is_file
@@ -124,10 +124,8 @@ def read_mcd_extrinsics(path: Path, sensor: str = "os_sensor") -> Floats | None:
 
     Raises InputError naming file and line when the block below the name is not a rigid 4x4 `T`.
     """
-    try:
+    with input_errors(path, UnicodeDecodeError):
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     begin = next((k for k, line in enumerate(lines) if line.strip() == f"{sensor}:"), None)
     if begin is None:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import PointCloud
 from lslam.geometry import se3
 from lslam.types.imu import ImuStream
@@ -100,10 +100,8 @@ def read_metadata(path: Path) -> OusterSensor:
 
     Raises InputError naming the file when it is unreadable, lacks something or names a layout lslam does not know.
     """
-    try:
+    with input_errors(path):
         return parse_metadata(path.read_bytes(), str(path))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 def parse_metadata(text: str | bytes, where: str) -> OusterSensor:

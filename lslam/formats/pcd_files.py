@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import AXES, organised, packed_columns, text_columns
 from lslam.untrusted import whole_number
 
@@ -44,10 +44,8 @@ class _Header:
 
 def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
     """The points of a PCD file by field, in its own frame (without VIEWPOINT, as PCL). Raises InputError naming the place."""
-    try:
+    with input_errors(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     header = _read_header(path, data)
     body = memoryview(data)[header.size :]
     if header.encoding == "binary" or not header.points:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError, input_errors
 from lslam.formats.atomic import atomic_write
 from lslam.formats.point_cloud import packed_columns, text_columns
 from lslam.untrusted import whole_number
@@ -32,10 +32,8 @@ class _Element:
 
 def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
     """The vertices of a PLY file by property, without faces behind them. Raises InputError naming the file and the line."""
-    try:
+    with input_errors(path):
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     encoding, elements, size = _read_header(path, data)
     order = _ORDERS[encoding]
     body = memoryview(data)[size:]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError, cause
+from lslam.errors import InputError, UsageError, input_errors
 from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
 from lslam.formats.pcd_files import pcd_columns, pcd_header
@@ -57,13 +57,11 @@ def _read_columns(path: Path, record: PointRecord | None = None) -> Mapping[str,
 
 def read_bytes(path: Path) -> NDArray[np.uint8]:
     """All bytes of a file. Raises InputError naming it when it cannot be read."""
-    try:
+    with input_errors(path):
         if isinstance(path, RemotePath):
             return np.frombuffer(bytearray(path.read_bytes()), np.uint8)
         with path.open("rb") as stream:
             return np.fromfile(stream, np.uint8)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 def read_bin(path: Path) -> NDArray[np.float32]:
@@ -119,11 +117,9 @@ def write_bin(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None =
 
 def read_array(path: Path) -> NDArray[Any]:
     """An array of points: structured and flat, or numbers (N, K). Raises InputError when it is something else."""
-    try:
-        with HEADERS, path.open("rb") as stream:
-            table = np.lib.format.read_array(stream, allow_pickle=False)
-    except (OSError, *MISFIT, EOFError, SyntaxError, MemoryError, TokenError) as error:
-        raise InputError(f"{path} cannot be read as a NumPy array: {error}") from None
+    kinds = (*MISFIT, EOFError, SyntaxError, MemoryError, TokenError)
+    with input_errors(path, *kinds, as_what="a NumPy array"), HEADERS, path.open("rb") as stream:
+        table = np.lib.format.read_array(stream, allow_pickle=False)
     if table.dtype.names:
         flat: NDArray[Any] = table.ravel()
         return flat
@@ -159,11 +155,9 @@ def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
 
 def _text_columns(path: Path) -> dict[str, NDArray[Any]]:
     """KITTI raw `extract` scans: x y z intensity, one point per line."""
-    try:
+    with input_errors(path, ValueError, as_what="lines of x y z intensity"):
         text = path.read_text(encoding="ascii")
         table = np.loadtxt(text.splitlines(), np.float32, ndmin=2) if text.strip() else np.zeros((0, 4), np.float32)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as lines of x y z intensity: {error}") from None
     if table.shape[1] != 4:
         raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
     return dict(zip(KITTI.names, table.T, strict=True))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, nearest
+from lslam.errors import InputError, input_errors, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.point_records import parse_record
 from lslam.geometry import so3
@@ -131,19 +131,15 @@ class SequenceInfo:
 
 def read_sequence_toml(path: Path) -> SequenceInfo:
     """Read such a file. Raises InputError naming the file, the key and the nearest known key or the values allowed."""
-    try:
+    with input_errors(path, UnicodeDecodeError, as_what="TOML"):
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as TOML: {error}") from None
     return parse_sequence_toml(text, path)
 
 
 def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
     """The same from text that was found at `path`."""
-    try:
+    with input_errors(path, tomllib.TOMLDecodeError, as_what="TOML"):
         tree = parse_toml(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} cannot be read as TOML: {error}") from None
     extrinsics, lidars = tree.pop("extrinsics", {}), tree.pop("lidars", {})
     for key, table, row in (
         ("extrinsics", extrinsics, "T_lidar_imu = [...]"), ("lidars", lidars, '"FOLDER" = [T_lidar_other, 12 numbers]'),

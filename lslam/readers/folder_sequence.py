@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_bin, read_points
 from lslam.formats.point_records import KITTI, PointRecord
@@ -162,11 +162,11 @@ def _read_per_point(
     path: Path, count: int, names: tuple[str, ...]
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
     """Times and rings of a scan's points, (count,) each, of which `names` are read."""
-    try:
-        with HEADERS, path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            held = {name: np.asarray(file[name], _PER_POINT[name]) for name in names if name in file}
-    except (OSError, *DAMAGE) as error:
-        raise InputError(f"{path}, named by per_point of sequence.toml, cannot be read: {cause(error)}") from None
+    with (
+        input_errors(f"{path}, named by per_point of sequence.toml,", *DAMAGE), HEADERS, path.open("rb") as stream,
+        np.load(stream, allow_pickle=False) as file,
+    ):  # fmt: skip
+        held = {name: np.asarray(file[name], _PER_POINT[name]) for name in names if name in file}
     for name, values in held.items():
         if values.shape != (count,):
             raise InputError(f"{path}: {name} has shape {values.shape} for a scan of {count} points")

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError, input_errors
 from lslam.formats.calibration_files import read_raw_cam0_lidar, read_rigid
 from lslam.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.formats.point_files import SUFFIXES
@@ -45,10 +45,8 @@ def locate(folder: Path) -> tuple[Path, str] | None:
         return folder, "it has velodyne_points/, as KITTI raw drives do"
     if (folder / "oxts").is_dir():
         raise InputError(f"{folder} is a KITTI raw drive without velodyne_points/: fetch its velodyne data")
-    try:
+    with input_errors(folder):
         drives = sorted(p for p in folder.iterdir() if DRIVE.match(p.name) and (p / "velodyne_points").is_dir())
-    except OSError as error:
-        raise InputError(f"{folder} cannot be read: {cause(error)}") from None
     if len(drives) > 1:
         raise InputError(f"{folder} holds {len(drives)} drives ({', '.join(p.name for p in drives)}): name one")
     return (drives[0], f"{folder} holds this single KITTI raw drive") if drives else None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, cause
+from lslam.errors import InputError, input_errors
 from lslam.formats.point_files import SUFFIXES
 from lslam.formats.stamp_files import read_stamps
 
@@ -20,10 +20,8 @@ Stamps = NDArray[np.int64]
 
 def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:
     """Point files of the most frequent suffix in natural order (scan2 before scan10), and notes about what was left out."""
-    try:
+    with input_errors(folder):
         files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
-    except OSError as error:
-        raise InputError(f"{folder} cannot be read: {cause(error)}") from None
     kinds = Counter(p.suffix.lower() for p in files)
     if not kinds:
         return [], []
