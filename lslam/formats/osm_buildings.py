@@ -1,4 +1,4 @@
-"""Buildings of an OpenStreetMap extract: which elements count, their outlines in metres, their heights; and the way back."""
+"""Buildings of an OpenStreetMap extract: which elements count, their outlines in metres, their heights."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.osm_data import DECIMALS, AreaMaker, OsmData, Place, Relation, Way
+from lslam.formats.osm_data import OsmData, Relation, Way
 from lslam.formats.osm_files import read_osm
 from lslam.formats.osm_rings import footprints_from_rings, join_rings
-from lslam.geometry.geodesy import from_local, to_local
+from lslam.geometry.geodesy import to_local
 from lslam.types.building import Building, Footprint, footprint_polygon
 
 Floats = NDArray[np.float64]
@@ -118,21 +118,6 @@ def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: flo
     return near
 
 
-def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attribution: str | None) -> OsmData:
-    """An extract of `buildings` (local frame at `origin`), degrees rounded to 7 decimals: what a file of it reads back as.
-
-    Nodes, and rings of multipolygons, get negative numbers, which no element of OpenStreetMap has.
-    """
-    data = OsmData(attribution=attribution)
-    names = [(kind, int(number)) for kind, number in (building.osm_id.split("/") for building in buildings)]
-    maker = AreaMaker(data, {number for _, number in names}, shares_nodes=False)
-    for name, building in zip(names, buildings, strict=True):
-        polygons = [[_places(ring, origin) for ring in footprint.rings] for footprint in building.footprints]
-        tags = _written_tags(building)
-        maker.add(name, polygons, tags, {"type": "multipolygon", **tags})
-    return data
-
-
 def middle_of(data: OsmData) -> Floats:
     """(3,) lat, lon (deg) of the middle of the box round all buildings' nodes, as --origin takes them; height 0."""
     ways = [way for way in data.ways.values() if "building" in way.tags]
@@ -213,20 +198,6 @@ def _relation_footprints(
 def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str, str]) -> Building:
     own = {key: value for key, value in tags.items() if key != "type"}
     return Building(osm_id, footprints, height_of(tags), base_of(tags), own)
-
-
-def _places(ring: Floats, origin: NDArray[Any]) -> list[Place]:
-    """Corners (K, 2), m, in degrees as a file has them."""
-    fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
-    return [(round(lat, DECIMALS), round(lon, DECIMALS)) for lat, lon, _ in fixes.tolist()]
-
-
-def _written_tags(building: Building) -> dict[str, str]:
-    """The building's tags, its height among them where the tags say another or none."""
-    tags = {"building": "yes", **building.tags}
-    if building.height is not None and height_of(tags) != building.height:
-        tags["height"] = f"{building.height:.10g}"
-    return tags
 
 
 def _is_swapped(data: OsmData, origin: Floats) -> bool:

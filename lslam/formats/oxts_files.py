@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.formats.stamp_files import read_stamps
+from lslam.formats.time_columns import read_stamps
 from lslam.untrusted import whole_number
 
 # Columns, in the order of the devkit's dataformat.txt.

@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.errors import InputError
 from lslam.formats.stamp_texts import date_to_ns, seconds_to_ns
-from lslam.formats.text_tables import TextTable
+from lslam.formats.text_tables import Row, TextTable, read_rows, text_table
+from lslam.remote import as_path
 
 Floats = NDArray[np.float64]
 # The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
@@ -68,6 +72,34 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
         note = f"the time is {' and '.join(table.names[k] for k in chosen)}; "
         note += f"left out: {', '.join(table.names[k] for k in sorted(others))}"
     return RowTimes(_stamps(table, chosen, default_ns), note, others.union(chosen))
+
+
+def read_times(path: str | Path) -> NDArray[np.int64]:
+    """Stamps (N,) int64 ns that increase, as of KITTI's `times.txt`. Raises InputError for a file without any."""
+    stamps = read_stamps(as_path(path), must_increase=True)
+    if not len(stamps):
+        raise InputError(f"{path} holds no times")
+    return stamps
+
+
+def read_stamps(path: Path, must_increase: bool = False) -> NDArray[np.int64]:
+    """(N,) int64 ns of a text file, one stamp a line.
+
+    The time is in the column that a header names, else in the first one or two; an index before it and columns behind it
+    are left out. Seconds may be decimal or scientific (KITTI's times.txt), whole numbers of nanoseconds, or dates such as
+    `2011-09-26 13:04:32.349659964` (KITTI raw, taken as UTC), which keep all nine digits.
+    Raises InputError naming file and line.
+    """
+    rows, comments = read_rows(path)
+    table = text_table(path, [Row(k, text) for k, line, _ in rows if (text := line.split("#")[0].strip())], comments)
+    if not table.rows:
+        return np.zeros(0, np.int64)
+    clock = find_clock(table) or find_clock(replace(table, names=()))
+    if clock is None:
+        raise table.error(0, "no column is a time (s, ns or date)")
+    if must_increase:
+        table.check_increasing(clock.stamps_ns)
+    return clock.stamps_ns
 
 
 def is_index(values: Floats) -> bool:

@@ -16,8 +16,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from lslam.errors import InputError, UsageError, nearest
-from lslam.formats.stamp_files import read_times
 from lslam.formats.text_tables import read_table
+from lslam.formats.time_columns import read_times
 from lslam.formats.trajectory_csv import write_euroc
 from lslam.formats.trajectory_formats import FORMATS
 from lslam.formats.trajectory_lines import find_times, write_kitti, write_tum

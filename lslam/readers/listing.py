@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, input_errors
 from lslam.formats.point_files import SUFFIXES
-from lslam.formats.stamp_files import read_stamps
+from lslam.formats.time_columns import read_stamps
 
 DEFAULT_RATE_HZ = 10.0
 Stamps = NDArray[np.int64]

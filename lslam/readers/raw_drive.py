@@ -12,7 +12,7 @@ import numpy as np
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_rigid
 from lslam.formats.oxts_files import read_oxts
-from lslam.formats.stamp_files import read_stamps
+from lslam.formats.time_columns import read_stamps
 from lslam.readers.bag_topics import GNSS, IMU, Companion, why_none
 from lslam.readers.folder_sequence import FolderSequence
 from lslam.readers.kitti_odometry import KIND

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
-from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
+from lslam.formats.osm_buildings import buildings_of, height_of
+from lslam.formats.osm_data import DECIMALS, AreaMaker, OsmData, Place
 from lslam.formats.osm_files import write_osm
+from lslam.geometry.geodesy import from_local
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_perturb import MapFaults, Perturbation, draw_perturbation, perturb, write_perturbation
@@ -73,6 +76,21 @@ def write_extracts(
     return extracts
 
 
+def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attribution: str | None) -> OsmData:
+    """An extract of `buildings` (local frame at `origin`), degrees rounded to 7 decimals: what a file of it reads back as.
+
+    Nodes, and rings of multipolygons, get negative numbers, which no element of OpenStreetMap has.
+    """
+    data = OsmData(attribution=attribution)
+    names = [(kind, int(number)) for kind, number in (building.osm_id.split("/") for building in buildings)]
+    maker = AreaMaker(data, {number for _, number in names}, shares_nodes=False)
+    for name, building in zip(names, buildings, strict=True):
+        polygons = [[_places(ring, origin) for ring in footprint.rings] for footprint in building.footprints]
+        tags = _written_tags(building)
+        maker.add(name, polygons, tags, {"type": "multipolygon", **tags})
+    return data
+
+
 def city_buildings(city: City) -> list[Building]:
     """The buildings of a city, m in its frame; those of a generated one get numbers below zero and heights to 0.1 m."""
     from shapely import Polygon
@@ -85,6 +103,20 @@ def city_buildings(city: City) -> list[Building]:
         Building(f"way/-{k}", footprints_of(Polygon(outline)), height, tags={"building": "house"})
         for k, (outline, height) in enumerate(zip(city.footprints, heights, strict=True), 1)
     ]
+
+
+def _places(ring: NDArray[np.float64], origin: NDArray[Any]) -> list[Place]:
+    """Corners (K, 2), m, in degrees as a file has them."""
+    fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
+    return [(round(lat, DECIMALS), round(lon, DECIMALS)) for lat, lon, _ in fixes.tolist()]
+
+
+def _written_tags(building: Building) -> dict[str, str]:
+    """The building's tags, its height among them where the tags say another or none."""
+    tags = {"building": "yes", **building.tags}
+    if building.height is not None and height_of(tags) != building.height:
+        tags["height"] = f"{building.height:.10g}"
+    return tags
 
 
 def _streets(city: City) -> Any:

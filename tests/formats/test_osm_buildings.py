@@ -17,7 +17,6 @@ from lslam.formats.osm_buildings import (
     BuildingExtract,
     buildings_near,
     buildings_of,
-    osm_from_buildings,
     read_buildings,
 )
 from lslam.formats.osm_data import ATTRIBUTION
@@ -26,6 +25,7 @@ from lslam.formats.point_files import read_bin
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.osm.overpass_reply import from_overpass
+from lslam.simulation.osm_extract import osm_from_buildings
 from lslam.types.building import Building, Footprint, footprint_polygon
 
 CLOSE = 1e-4  # m: the projection there and back is far better than a file's centimetre

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_mcd_extrinsics
 from lslam.formats.oxts_files import POS_ACC, read_oxts
-from lslam.formats.stamp_files import read_stamps
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv, write_gnss_csv, write_imu_csv
+from lslam.formats.time_columns import read_stamps
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 

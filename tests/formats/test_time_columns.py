@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from lslam.errors import InputError
-from lslam.formats.stamp_files import read_stamps, read_times
 from lslam.formats.stamp_texts import date_to_ns
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
+from lslam.formats.time_columns import read_stamps, read_times
 
 NS = 1_700_000_000_950_000_007 + np.arange(30) * 97_000_000
 STAMPS = NS.tolist()

@@ -21,9 +21,9 @@ from lslam.formats.geojson import read_line
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.oxts_files import read_oxts
 from lslam.formats.sequence_toml import read_sequence_toml
-from lslam.formats.stamp_files import read_stamps
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.formats.state_files import read_state, write_state
+from lslam.formats.time_columns import read_stamps
 from lslam.formats.trajectory_files import read_times, read_trajectory
 from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_corrected

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 import lslam
 from lslam.config.load import load_config
-from lslam.formats.osm_buildings import osm_from_buildings, read_buildings
+from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.osm_files import write_osm
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import geodesy, se2
 from lslam.osm.buildings_geojson import read_corrected
+from lslam.simulation.osm_extract import osm_from_buildings
 from lslam.simulation.osm_perturb import Change, Perturbation, map_errors, perturb
 
 Floats = NDArray[np.float64]

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.osm_buildings import osm_from_buildings
 from lslam.formats.osm_data import ATTRIBUTION, OsmData, Way
 from lslam.formats.osm_files import write_osm
 from lslam.geometry.geodesy import from_local
+from lslam.simulation.osm_extract import osm_from_buildings
 from lslam.types.building import Building, Footprint
 
 ORIGIN = np.array([49.0112, 8.4229, 0.0])

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from shapely import LineString, MultiPolygon, STRtree, affinity, get_num_coordinates, union_all
 
 from lslam.errors import InputError, OutputError
-from lslam.formats.osm_buildings import buildings_of, osm_from_buildings
+from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_data import ATTRIBUTION
 from lslam.formats.osm_files import read_osm, write_osm
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import build_osm_city
-from lslam.simulation.osm_extract import Extracts, city_buildings, write_extracts
+from lslam.simulation.osm_extract import Extracts, city_buildings, osm_from_buildings, write_extracts
 from lslam.simulation.osm_perturb import (
     Change,
     MapFaults,
