@@ -35,6 +35,7 @@ class Fixes:
     stamps_ns : (F,); positions : (F, 3) east, north, up from `origin` (3,) lat, lon, height; sigmas : (F, 3)
     antenna : (F, 3) in the world of odometry; slack : (F,) one sigma of odometry's drift
     is_stated : whether the sigmas are those of the recording
+    is_refuted : whether fixes scatter by more than was stated, east or north; the sigmas are those of their scatter
     """
 
     stamps_ns: NDArray[np.int64]
@@ -45,6 +46,7 @@ class Fixes:
     origin: Floats
     given: int
     is_stated: bool
+    is_refuted: bool = False
 
     @property
     def has_height(self) -> NDArray[np.bool_]:
@@ -115,7 +117,8 @@ def with_actual_sigmas(
         "are weighted by their scatter"
     )
     facts = {"stated": np.round(stated, 3).tolist(), "scatter": np.round(actual, 3).tolist()}
-    return replace(fixes, sigmas=sigmas), faults.and_another(said, fix_sigma_m=facts)
+    is_refuted = bool((factors[:2] > 1.0).any())
+    return replace(fixes, sigmas=sigmas, is_refuted=is_refuted), faults.and_another(said, fix_sigma_m=facts)
 
 
 def aligned(

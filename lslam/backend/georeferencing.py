@@ -129,7 +129,7 @@ def place(
     )  # fmt: skip
     fix_noise, walk = None, 0.0
     if config.gnss.mode == "graph":
-        fix_noise, walk = _fix_noise(fixes, found, keyframes, graph, config.graph)
+        fix_noise, walk = _fix_noise(fixes, found, keyframes, graph, config)
     factors = _as_factors(fixes, found, shift, results, keyframes, arm, fix_noise)
     problem = _elsewhere(found) or contradicted(found, fixes)
     return Placement(georeference, factors, fix_noise, walk, problem, faults=faults)
@@ -271,32 +271,33 @@ def contradicted(found: GnssAlignment, fixes: Fixes) -> str:
 
 
 def _fix_noise(
-    fixes: Fixes, found: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: GraphConfig
+    fixes: Fixes, found: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: Config
 ) -> tuple[GaussMarkovNoise | None, float]:
     """Correlated noise of the fixes and the factor on odometry's drift, from the inliers.
 
     Neither where the recording states no sigmas.
     """
     good = found.inliers
-    if not fixes.is_stated:
+    if not (fixes.is_stated or fixes.is_refuted):
         return None, 0.0
-    known, unit = (noise.rotated(chain, found.T_enu_world[:3, :3]) for chain in chains(graph, config))
-    metre = drift_covariance(1.0, config)
+    known, unit = (noise.rotated(chain, found.T_enu_world[:3, :3]) for chain in chains(graph, config.graph))
+    metre = drift_covariance(1.0, config.graph)
     places = se3.apply(found.T_enu_world, graph.poses[:, :3, 3])
     drift = DriftOfFixes(known + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])
     fix_noise, walk = fit_gauss_markov(
         1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), found.residuals[good], fixes.sigmas[good],
-        (fixes.positions - found.residuals)[good], config.probability, drift,
+        (fixes.positions - found.residuals)[good], config.graph.probability, drift,
+        config.gnss.max_sigma if fixes.is_refuted else None,
     )  # fmt: skip
     if fix_noise is not None:
         log.info(
-            "GNSS: fixes scatter by less than their sigmas; correlated noise of %.2f m over %.0f s is estimated",
+            "GNSS: errors of fixes are correlated: noise of %.2f m over %.0f s is estimated",
             fix_noise.sigma[0], fix_noise.memory,
         )  # fmt: skip
     if walk > 0:
         log.info(
             "GNSS: odometry drifts by more than its covariances, by about %.2f m after 100 m",
-            np.sqrt(walk * drift_covariance(100.0, config)[0, 0]),
+            np.sqrt(walk * drift_covariance(100.0, config.graph)[0, 0]),
         )  # fmt: skip
     return fix_noise, walk
 

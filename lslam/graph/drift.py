@@ -58,7 +58,9 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
         return 0.0
     known, drift = chains(graph, config)
     by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
-    by_fixes = _of_fixes(graph.poses, graph.fixes, 3, known, drift, config.probability)
+    # Where the noise of fixes was estimated, odometry's drift was beside it: `graph.walk`.
+    fixes = graph.fixes if graph.fix_noise is None else ()
+    by_fixes = _of_fixes(graph.poses, fixes, 3, known, drift, config.probability)
     by_map = _of_fixes(graph.poses, on_map, 2, known, drift)
     return max(by_loops, by_fixes, by_map, _of_ups(graph, known, drift, config))
 

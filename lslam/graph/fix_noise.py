@@ -3,12 +3,17 @@
 Orbits, ionosphere and multipath change over minutes: the error is a first-order Gauss-Markov process beside white noise
 (Rankin 1994, GPS and differential GPS: an error model for sensor simulation), so that a thousand fixes are hardly more accurate
 than one. Odometry's drift looks similar; correlated residuals belong to the fixes up to their stated sigma, and to odometry
-beyond.
+beyond. Fixes that scatter by more than they state have told nothing of the correlated part either: it is as large as it fits
+best, and only what no such process explains is odometry's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,17 +24,18 @@ from lslam.graph.fix_errors import NO_HEIGHT
 Floats = NDArray[np.float64]
 
 # Size of the covariance: more fixes are averaged in groups.
-MOST = 100
-# Factors on odometry's drift that are tried.
-FACTORS = np.concatenate([[0.0], np.geomspace(1e-3, 1e5, 17)])
+MOST = 60
+# Factors on odometry's drift that are tried, and refined.
+FACTORS = np.geomspace(1e-3, 1e5, 9)
 # Window of the median filter against outliers that the alignment accepts.
 AROUND = 7
 # Instants of the error in the graph, at most; a fix has that of the nearest.
 INSTANTS = 2000
 # Least white share of the variance, against singular covariances of perfect fixes.
 LEAST_WHITE = 1e-4
-# Correlation times tried, up to so many times the duration: beyond, an error is a constant.
-TRIED, LONGEST = 24, 10.0
+# Correlation times that are tried, up to so many times the duration: beyond, an error is a constant. Variances likewise, from
+# a share of the white one, where they are unknown.
+MEMORIES, LONGEST, VARIANCES, LEAST_SLOW = 8, 10.0, 7, 0.01
 
 
 @dataclass(frozen=True)
@@ -58,18 +64,20 @@ class DriftOfFixes:
 
 
 def fit_gauss_markov(
-    seconds: Floats, residuals: Floats, sigmas: Floats, antenna: Floats, probability: float, drift: DriftOfFixes
-) -> tuple[GaussMarkovNoise | None, float]:
+    seconds: Floats, residuals: Floats, sigmas: Floats, antenna: Floats, probability: float, drift: DriftOfFixes,
+    largest: float | None = None,
+) -> tuple[GaussMarkovNoise | None, float]:  # fmt: skip
     """Correlated noise of the fixes, and the factor on odometry's drift beside it.
 
     None where fixes scatter by their stated sigmas, so that their errors may be independent.
 
     Differences of successive fixes contain neither correlated noise nor drift: they give the white share of the stated variance.
     The time constant of the rest and the drift factor maximise the restricted likelihood, since position and heading were
-    fitted.
+    fitted. Where the statement is refuted the variance of the correlated part is estimated as well.
 
     seconds : (F,) ascending; residuals : (F, 3) m, east, north, up, of fixes minus trajectory, aligned to them
     sigmas : (F, 3) m, stated; antenna : (F, 3) m, east, north, up; probability : of the chi-square test for white noise
+    largest : m, of the correlated part where `sigmas` are of the scatter, as the statement is refuted; None where it is believed
     """
     scaled = residuals / sigmas
     good = _near_neighbours(scaled[:, :2], probability)
@@ -81,13 +89,18 @@ def fit_gauss_markov(
     white = float(0.5 * (np.diff(scaled[:, :2], axis=0)[near] ** 2).mean())
     # Adjacent differences share an error, which leaves two of three degrees of freedom. Two axes.
     free = max(round(2 * near.sum() / 1.5), 1)
-    if white > quantile(1 - probability, free) / free:
+    if largest is None and white > quantile(1 - probability, free) / free:
         return None, 0.0
     white = max(white, LEAST_WHITE)
+    typical = np.nanmedian(np.where(sigmas < NO_HEIGHT, sigmas, np.nan), axis=0)
+    slow = np.array([1.0 - white])
+    if largest is not None:
+        slow = np.geomspace(LEAST_SLOW * white, max((largest / typical[:2].max()) ** 2, 4 * white), VARIANCES)
     drift = replace(drift, keyframes=drift.keyframes[good])
-    memory, factor = _likeliest(seconds, scaled, sigmas, antenna, white, drift)
-    sigma = np.sqrt(1.0 - white) * np.nanmedian(np.where(sigmas < NO_HEIGHT, sigmas, np.nan), axis=0)
-    return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], sigma, memory), factor
+    memory, variance, factor = _likeliest(seconds, scaled, sigmas, antenna, white, slow, drift, probability)
+    if variance * len(seconds) < white:
+        return None, factor
+    return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], np.sqrt(variance) * typical, memory), factor
 
 
 def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
@@ -99,16 +112,17 @@ def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
 
 
 def _likeliest(
-    seconds: Floats, scaled: Floats, sigmas: Floats, antenna: Floats, white: float, drift: DriftOfFixes
-) -> tuple[float, float]:
-    """Time constant, s, of residuals `scaled` (F, 3) of unit variance beside their `white` part, and drift factor.
+    seconds: Floats, scaled: Floats, sigmas: Floats, antenna: Floats, white: float, slow: Floats, drift: DriftOfFixes,
+    probability: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Time constant, s, and variance of what residuals `scaled` (F, 3) have beside their `white` part, and drift factor.
 
-    Drift is a random walk or a constant rate with equal prior probability and equal variance at the end of the way. It is
-    accepted where the likelihood, marginal over time constants, gains more than its one parameter (Akaike 1974).
+    slow : (V,) variances that are tried; a single one is known
+    Drift is a random walk, or a constant rate of equal variance at the end of the way. Fixes whose statement is refuted are
+    the first to be suspected: drift must gain more likelihood beside their noise than it does by chance.
     """
     groups = np.array_split(np.arange(len(seconds)), min(len(seconds), MOST))
     t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, scaled, antenna, sigmas))
-    own = np.repeat([white / len(group) for group in groups], 3)
     keyframes = drift.keyframes[[group[len(group) // 2] for group in groups]]
     places, weights = drift.places[keyframes], (1.0 / s).ravel()
     known, walk, rate = (
@@ -119,6 +133,7 @@ def _likeliest(
             _lasting(drift.metre, a),
         )
     )
+    known += np.diag(np.repeat([white / len(group) for group in groups], 3))
     # Nuisance parameters of the alignment: position, heading and tilt.
     about = a - a.mean(axis=0)
     about /= max(float(np.abs(about).max()), 1e-9)
@@ -126,17 +141,48 @@ def _likeliest(
     axes, moves, _ = np.linalg.svd(weights[:, None] * fitted.reshape(-1, 6), full_matrices=False)
     # Rotations about a straight way are unobservable.
     sides = np.column_stack([r.ravel(), axes[:, moves > 1e-9 * moves[0]]])
-    gap = float(np.median(np.diff(seconds)))
-    tried = np.geomspace(gap, LONGEST * max(t[-1] - t[0], gap), TRIED)
     apart = np.abs(t[:, None] - t)
-    bases = [np.kron((1 - white) * np.exp(-apart / memory), np.eye(3)) + np.diag(own) + known for memory in tried]
-    likelihoods = np.logaddexp(
-        *(np.stack([_likelihoods(base, unit, sides) for base in bases], axis=1) for unit in (walk, rate))
-    )
-    of_factor = np.logaddexp.reduce(likelihoods, axis=1)
-    best = int(np.argmax(of_factor))
-    best = best if of_factor[best] - of_factor[0] > 1.0 else 0
-    return float(tried[int(np.argmax(likelihoods[best]))]), float(FACTORS[best])
+    gap = float(np.median(np.diff(seconds)))
+    memories = np.geomspace(gap, LONGEST * max(t[-1] - t[0], gap), MEMORIES)
+    nothing = np.zeros(1)
+
+    def likelihood(unit: Floats, memory: float, variance: float, factor: float) -> float:
+        correlated = np.kron(variance * np.exp(-apart / memory), np.eye(3))
+        return _log_likelihood(known + correlated + factor * unit, sides)
+
+    found = [
+        _maximum(partial(likelihood, unit), (memories, slow, factors))
+        for unit, factors in ((walk, nothing), (walk, FACTORS), (rate, FACTORS))
+    ]
+    best = max(found[1:], key=lambda one: one[0])
+    memory, variance, factor = (best if best[0] - found[0][0] > 0.5 * quantile(probability, 1) else found[0])[1]
+    return memory, variance, factor
+
+
+def _maximum(of: Callable[..., float], tried: tuple[Floats, ...]) -> tuple[float, list[float]]:
+    """The maximum of a function of positive numbers, and where it is: of all `tried`, refined where there are several."""
+    from scipy.optimize import minimize
+
+    best = max(product(*tried), key=lambda at: of(*at))
+    free = [i for i, values in enumerate(tried) if len(values) > 1]
+
+    def at(logarithms: Floats) -> list[float]:
+        moved = [float(value) for value in best]
+        for i, logarithm in zip(free, logarithms, strict=True):
+            moved[i] = float(np.exp(np.clip(logarithm, np.log(tried[i][0]), np.log(tried[i][-1]))))
+        return moved
+
+    if not free:
+        return of(*best), at(np.zeros(0))
+    options: Any = {"xatol": 0.05, "fatol": 0.05, "maxfev": 150}
+
+    def cost(logarithms: Floats) -> float:
+        return -of(*at(logarithms))
+
+    found = minimize(cost, np.log([best[i] for i in free]), method="Nelder-Mead", options=options)
+    # Rounded, so that another machine's last bits do not show.
+    refined = at(np.round(found.x, 2))
+    return of(*refined), refined
 
 
 def _lasting(metre: Floats, places: Floats) -> Floats:
@@ -154,27 +200,19 @@ def _lasting(metre: Floats, places: Floats) -> Floats:
     return np.asarray(effects @ metre @ effects.T / max(way[-1], 1e-9))
 
 
-def _likelihoods(base: Floats, unit: Floats, sides: Floats) -> Floats:
-    """(len(FACTORS),) logarithms of the restricted likelihood of `base` + factor x `unit` (N, N), both covariances.
+def _log_likelihood(covariance: Floats, sides: Floats) -> float:
+    """Logarithm of the restricted likelihood of a covariance (N, N).
 
     sides : (N, 1 + P) residuals, and Jacobians of the nuisance parameters
     """
     from scipy.linalg import solve_triangular
 
-    root = np.linalg.cholesky(base)
-    half = solve_triangular(root, unit, lower=True)
-    # Along these axes both are diagonal.
-    values, axes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
-    turned = axes.T @ solve_triangular(root, sides, lower=True)
-    out = np.empty(len(FACTORS))
-    for i, factor in enumerate(FACTORS):
-        spread = 1.0 + factor * np.maximum(values, 0.0)
-        r, k = turned[:, 0], turned[:, 1:]
-        information = k.T @ (k / spread[:, None])
-        right = k.T @ (r / spread)
-        squared = float(r @ (r / spread) - right @ np.linalg.solve(information, right))
-        out[i] = -0.5 * (squared + np.log(spread).sum() + np.linalg.slogdet(information)[1])
-    return np.asarray(out - np.log(np.diag(root)).sum())
+    root = np.linalg.cholesky(covariance)
+    whitened = solve_triangular(root, sides, lower=True)
+    r, k = whitened[:, 0], whitened[:, 1:]
+    information, right = k.T @ k, k.T @ r
+    squared = float(r @ r - right @ np.linalg.solve(information, right))
+    return float(-0.5 * (squared + np.linalg.slogdet(information)[1]) - np.log(np.diag(root)).sum())
 
 
 def _shared(chain: Floats, places: Floats) -> Floats:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from stub_sequences import Stub
@@ -36,19 +38,47 @@ RESULTS = [ScanResult(i, int(STAMPS[i]), T) for i, T in enumerate(se3.inverse(PO
 KEYFRAMES = [Keyframe(n, i, int(STAMPS[i]), RESULTS[i].T_world_lidar) for n, i in enumerate(range(0, COUNT, 10))]
 
 
-def placed(late: float = 0.0, noise: float = 0.5, stated: float = 0.5, climb: float = 0.0, seed: int = 0) -> Placement:
-    """By 5 fixes a second, of which those of the last 15 s are higher by `climb`, m."""
+def wandering(count: int, memory: float, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3) errors of variance 1, mostly a Gauss-Markov process of time constant `memory`, s, at 5 Hz."""
+    slow, lasting = rng.normal(size=(count, 3)), np.exp(-0.2 / memory)
+    for i in range(1, count):
+        slow[i] = lasting * slow[i - 1] + np.sqrt(1 - lasting**2) * slow[i]
+    return np.asarray(0.94 * slow + 0.35 * rng.normal(size=(count, 3)))
+
+
+def placed(
+    late: float = 0.0, noise: float = 0.5, stated: float = 0.5, climb: float = 0.0, seed: int = 0, memory: float = 0.0,
+    run_off: float = 0.0,
+) -> Placement:  # fmt: skip
+    """By 5 fixes a second, of which those of the last 15 s are higher by `climb`, m.
+
+    memory : s, of errors that are correlated; run_off : m/m by which odometry drifts, which states a millimetre after a metre
+    """
     taken = SECONDS[2:-2:2]
-    error = noise * np.random.default_rng(seed).normal(size=(len(taken), 3)) * [1, 1, 1.8]
+    rng = np.random.default_rng(seed)
+    error = noise * (wandering(len(taken), memory, rng) if memory else rng.normal(size=(len(taken), 3))) * [1, 1, 1.8]
     error[taken > 25, 2] += climb
     fixes = geodesy.from_local(at(taken)[:, :3, 3] + error, ORIGIN)
     stream = GnssStream(np.round(1e9 * (taken + late)).astype(np.int64), fixes, np.full(len(taken), stated))
     config = Config.model_validate({"gnss": {"mode": "graph"}})
+    results = drifting(run_off) if memory else RESULTS
+    keyframes = [replace(k, T_world_lidar=results[k.scan].T_world_lidar) for k in KEYFRAMES]
     graph = PoseGraph(
-        np.stack([k.T_world_lidar for k in KEYFRAMES]), odometry_constraints(KEYFRAMES, RESULTS, config.graph)
+        np.stack([k.T_world_lidar for k in keyframes]), odometry_constraints(keyframes, results, config.graph)
     )
     sequence = Stub(["none"] * COUNT, calibration=Calibration(T_lidar_gnss=np.eye(4)), gnss=stream)
-    return place(sequence, RESULTS, KEYFRAMES, None, graph, config)
+    return place(sequence, results, keyframes, None, graph, config)
+
+
+def drifting(run_off: float) -> list[ScanResult]:
+    """Odometry that runs off ahead and to the left by `run_off` m/m, and states a millimetre after a metre."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(POSES[:, :3, 3], axis=0), axis=1)))
+    out = []
+    for result, m in zip(RESULTS, way.tolist(), strict=True):
+        T = result.T_world_lidar.copy()
+        T[:2, 3] += run_off * m
+        out.append(replace(result, T_world_lidar=T, covariance=m * np.diag([1e-6] * 3 + [1e-9] * 3)))
+    return out
 
 
 def apart(found: Placement) -> np.ndarray:
@@ -104,3 +134,20 @@ def test_heights_of_another_datum_do_not_cost_east_and_north(seed: int) -> None:
     assert np.abs(apart(found)[:, :2]).max() < 0.3
     # Half of the heights leave the tilt less sure.
     assert np.abs(apart(found)[:, 2]).max() < 3.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("noise", "memory"), [(0.5, 20.0), (2.0, 100.0)])
+def test_wandering_fixes_that_state_too_little_are_no_drift_of_odometry(noise: float, memory: float, seed: int) -> None:
+    found = placed(noise=noise, stated=0.02, memory=memory, seed=seed)
+    assert found.faults.problems
+    assert found.walk == 0.0
+    assert found.fix_noise is not None
+    assert found.fix_noise.sigma[0] > 0.2 * noise
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_odometry_that_runs_off_farther_than_fixes_wander_drifts_all_the_same(seed: int) -> None:
+    """By 20 m over a way of 290 m, beside fixes of half a metre."""
+    found = placed(stated=0.02, memory=20.0, run_off=0.05, seed=seed)
+    assert found.walk > 1.0
