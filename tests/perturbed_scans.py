@@ -7,11 +7,15 @@ Drives that tests simulate in other processes, and rays that they trace themselv
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+
+if TYPE_CHECKING:
+    from lslam.simulation.scenarios import SimulatedDrive
 
 SHIFT = 2**31  # keeps these seeds apart from the numbers of visits
 
@@ -56,3 +60,10 @@ def draw_other_noise(seed: int) -> None:
         return (*seeds_of(visit, town), SHIFT + seed)
 
     Visit.seeds = seeds  # type: ignore[method-assign]
+
+
+def with_other_noise(drive: SimulatedDrive, seed: int) -> SimulatedDrive:
+    """The same drive, whose scans have other noise."""
+    other = copy(drive)
+    other._seeds = (*drive._seeds, SHIFT + seed)
+    return other

@@ -158,8 +158,11 @@ def held_by_non_ground(
         starts.append(_likeliest(non_ground, seen, T_prior, c.start_reach))
     aligned = max(map(placed, starts), key=lambda result: np.count_nonzero(agreeing(result)))
     place, most = aligned.T_world_lidar, agreeing(aligned)
-    is_drawn = found.ok and is_at_rest(place, r.recent[-1][1])
-    if is_drawn or not is_much_more(most, agreeing(found)):
+    last = r.recent[-1][1]
+    is_drawn = found.ok and is_at_rest(place, last)
+    # What rings draw there is no evidence that it is there.
+    margin = CLEARLY if is_at_rest(found.T_world_lidar, last) else MUCH
+    if is_drawn or not is_much_more(most, agreeing(found), margin):
         return found
     near = r.alignment.refine(points, place, width, c.start_iterations, r.alignment.coarse_maps(points, place))
     judged = r.judged(near, place)
@@ -211,13 +214,13 @@ def is_at_rest(pose: Floats, last: Floats) -> bool:
     return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(AT_REST_DEG))
 
 
-def is_much_more(ours: Flags, others: Flags) -> bool:
-    """Whether much more of the points agrees at one pose than at the other, and not by chance: flags (S,) of the same.
+def is_much_more(ours: Flags, others: Flags, margin: float = MUCH) -> bool:
+    """Whether `margin` times as many points agree at one pose as at the other, and not by chance: flags (S,) of the same.
 
     McNemar's test of paired shares at two sigma, on the points that agree at one of the poses only.
     """
     won, lost = np.count_nonzero(ours & ~others), np.count_nonzero(others & ~ours)
-    return bool(np.count_nonzero(ours) > MUCH * np.count_nonzero(others) and won - lost > 2 * np.sqrt(won + lost))
+    return bool(np.count_nonzero(ours) > margin * np.count_nonzero(others) and won - lost > 2 * np.sqrt(won + lost))
 
 
 def distinct(results: list[RegistrationResult], known: Floats) -> list[RegistrationResult]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from copy import copy
 from functools import cache
 
+from perturbed_scans import with_other_noise
+
 from lslam.simulation.lidar_models import lidar_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
@@ -14,8 +16,8 @@ def driven(scenario: str, seed: int) -> SimulatedDrive:
     return simulate(scenario, seed=seed, motion_compensated=True)
 
 
-def seen_by(lidar: str, scenario: str, seed: int = 0) -> SimulatedDrive:
-    """The same drive with another LiDAR: to build the town takes longer than what is asked here."""
-    drive = copy(driven(scenario, seed))
+def seen_by(lidar: str, scenario: str, seed: int = 0, noise: int = 0) -> SimulatedDrive:
+    """The same drive with another LiDAR, and other noise: to build the town takes longer than what is asked here."""
+    drive = with_other_noise(driven(scenario, seed), noise) if noise else copy(driven(scenario, seed))
     drive.lidar = lidar_named(lidar)
     return drive
