@@ -17,7 +17,7 @@ from lslam.formats.osm_data import OsmData, Relation, Way
 from lslam.formats.osm_files import read_osm
 from lslam.formats.osm_rings import footprints_from_rings, join_rings
 from lslam.geometry.geodesy import to_local
-from lslam.types.building import Building, Footprint, footprint_polygon
+from lslam.types.building import Building, Footprint
 
 Floats = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract
     at = np.asarray(origin, np.float64)
     where = _Positions(data, at)
     if data.nodes and not (away := where.distance()) < FARTHEST:
-        far = "more than a continent" if not np.isfinite(away) else _far(away)
-        raise InputError(f"{source} lies {far} away from the origin: {_way_out(at, _is_swapped(data, at))}")
+        far = "more than a continent" if not np.isfinite(away) else distance_text(away)
+        raise InputError(f"{source} lies {far} away from the origin: {right_place(at, _is_swapped(data, at))}")
     skipped: Counter[str] = Counter()
     of_relations: list[Building] = []
     outlines: set[int] = set()
@@ -96,26 +96,6 @@ def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract
         if footprints:
             buildings.append(_building(f"way/{way.id}", footprints, way.tags))
     return BuildingExtract(buildings + of_relations, dict(skipped), at, data.attribution, source)
-
-
-def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: float) -> list[Building]:
-    """The buildings that come within `reach` m of one of the `positions` (N, 2), m in the extract's frame.
-
-    Raises InputError saying how far away the extract is when there are none.
-    """
-    from shapely import STRtree, points
-
-    shapes = [(k, footprint_polygon(f)) for k, b in enumerate(extract.buildings) for f in b.footprints]
-    tree = STRtree(points(np.asarray(positions, np.float64)[:, :2]))
-    (rows, _), distance = tree.query_nearest([shape for _, shape in shapes], return_distance=True, all_matches=False)
-    wanted = {shapes[row][0] for row, away in zip(rows, distance, strict=True) if away <= reach}
-    near = [building for k, building in enumerate(extract.buildings) if k in wanted]
-    if not near:
-        raise InputError(
-            f"{extract.source} has no building within {reach:g} m of the path, the nearest is "
-            f"{_far(float(distance.min()))} away: {_way_out(extract.origin)}"
-        )
-    return near
 
 
 def middle_of(data: OsmData) -> Floats:
@@ -205,7 +185,8 @@ def _is_swapped(data: OsmData, origin: Floats) -> bool:
     return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST
 
 
-def _way_out(origin: Floats, is_swapped: bool = False) -> str:
+def right_place(origin: Floats, is_swapped: bool = False) -> str:
+    """What to do about an extract of another place, for messages."""
     if is_swapped:
         return (
             f"latitude and longitude are swapped, in --origin ({origin[0]:.5f},{origin[1]:.5f}; latitude first) or in the file "
@@ -214,7 +195,8 @@ def _way_out(origin: Floats, is_swapped: bool = False) -> str:
     return f"check --origin ({origin[0]:.5f},{origin[1]:.5f}) or fetch the extract of that place"
 
 
-def _far(distance: float) -> str:
+def distance_text(distance: float) -> str:
+    """A distance, m, for messages."""
     return f"{distance / 1000:.1f} km" if distance > 1000 else f"{distance:.0f} m"
 
 

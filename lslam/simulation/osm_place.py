@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
-from lslam.formats.osm_buildings import BuildingExtract, buildings_near, read_buildings
+from lslam.formats.osm_buildings import BuildingExtract, distance_text, read_buildings, right_place
 from lslam.formats.osm_data import OsmData
 from lslam.geometry import portable
 from lslam.simulation.curve import smooth_curve
@@ -23,7 +23,7 @@ from lslam.simulation.routes import TIGHTEST, Route, beside, given_route
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.waypoints import WayPoints
-from lslam.types.building import Building
+from lslam.types.building import Building, footprint_polygon
 
 log = logging.getLogger("lslam")
 
@@ -103,6 +103,26 @@ def city_of_map(
     return build_osm_city(
         buildings, terrain, rng, [*driven, *roads], layout, found.attribution, Path(found.source).name
     )
+
+
+def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: float) -> list[Building]:
+    """The buildings that come within `reach` m of one of the `positions` (N, 2), m in the extract's frame.
+
+    Raises InputError saying how far away the extract is when there are none.
+    """
+    from shapely import STRtree, points
+
+    shapes = [(k, footprint_polygon(f)) for k, b in enumerate(extract.buildings) for f in b.footprints]
+    tree = STRtree(points(np.asarray(positions, np.float64)[:, :2]))
+    (rows, _), distance = tree.query_nearest([shape for _, shape in shapes], return_distance=True, all_matches=False)
+    wanted = {shapes[row][0] for row, away in zip(rows, distance, strict=True) if away <= reach}
+    near = [building for k, building in enumerate(extract.buildings) if k in wanted]
+    if not near:
+        raise InputError(
+            f"{extract.source} has no building within {reach:g} m of the path, the nearest is "
+            f"{distance_text(float(distance.min()))} away: {right_place(extract.origin)}"
+        )
+    return near
 
 
 def keep_out_of_walls(movers: list[Mover], city: OsmCity, duration: float) -> list[Mover]:

@@ -15,7 +15,6 @@ from lslam.errors import InputError
 from lslam.formats.calibration_files import read_mcd_extrinsics
 from lslam.formats.osm_buildings import (
     BuildingExtract,
-    buildings_near,
     buildings_of,
     read_buildings,
 )
@@ -204,25 +203,6 @@ def test_the_error_about_an_extract_without_buildings_lists_its_elements(tmp_pat
         InputError, match=r"roads\.osm holds no building outline \(1 ways, 0 relations; left out: 1 x open"
     ):
         read_buildings(path, ORIGIN)
-
-
-def test_buildings_far_from_the_path_are_an_error_that_says_how_far() -> None:
-    maker = ExtractMaker()
-    maker.square(1, 100, 0, 10, building="yes")
-    maker.square(2, -20, -400, 800, building="yes")  # its corners are far, its west wall is near
-    maker.square(3, 0, 3000, 10, building="yes")
-    extract = extract_of(maker)
-    path = np.array([[-50.0, 0, 1.7], [-45, 0, 1.7]])
-    assert [b.osm_id for b in buildings_near(extract, path, 26)] == ["way/2"]
-    assert [b.osm_id for b in buildings_near(extract, path, 146)] == ["way/1", "way/2"]
-    with pytest.raises(
-        InputError, match=r"no building within 20 m of the path, the nearest is 25 m away: check --origin"
-    ):
-        buildings_near(extract, path, 20)
-    with pytest.raises(InputError, match=r"the nearest is 7\.0 km away"):
-        buildings_near(extract, path - [0, 7400, 0], 100)
-    # Inside a building is near it.
-    assert len(buildings_near(extract, np.array([[300.0, 100]]), 1)) == 1
 
 
 @pytest.mark.parametrize("origin", [[51.0, 8.4, 0], [-33.9, 151.2, 0], [49.0, -171.6, 0], [90.0, 0.0, 0]])

@@ -8,16 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from formats.osm_builders import ExtractMaker
 from osm_village import MAIN, ORIGIN, SIDE, houses, village, write_village
 from shapely import LineString, MultiPolygon, Point, contains_xy, distance, points
 
 from lslam.errors import InputError, UsageError
+from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_data import ATTRIBUTION
 from lslam.formats.osm_files import read_osm, write_osm
 from lslam.geometry.geodesy import from_local, to_local
+from lslam.osm.overpass_reply import from_overpass
 from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
-from lslam.simulation.osm_place import read_extract
+from lslam.simulation.osm_place import buildings_near, read_extract
 from lslam.simulation.osm_streets import DRIVABLE, WALKABLE, find_route, highways
 from lslam.simulation.record import record
 from lslam.simulation.scenario_files import scenario_named
@@ -248,3 +251,22 @@ def test_the_real_extract_is_driven_through(recordings: Callable[[str], Path]) -
     assert len(made.scan(20)) > 0.6 * made.lidar.rays
     assert len(city_of(made).buildings) > 30
     assert len(made.city.streets) > 5
+
+
+def test_buildings_far_from_the_path_are_an_error_that_says_how_far() -> None:
+    maker = ExtractMaker()
+    maker.square(1, 100, 0, 10, building="yes")
+    maker.square(2, -20, -400, 800, building="yes")  # its corners are far, its west wall is near
+    maker.square(3, 0, 3000, 10, building="yes")
+    extract = buildings_of(from_overpass(maker.tree()), ORIGIN)
+    path = np.array([[-50.0, 0, 1.7], [-45, 0, 1.7]])
+    assert [b.osm_id for b in buildings_near(extract, path, 26)] == ["way/2"]
+    assert [b.osm_id for b in buildings_near(extract, path, 146)] == ["way/1", "way/2"]
+    with pytest.raises(
+        InputError, match=r"no building within 20 m of the path, the nearest is 25 m away: check --origin"
+    ):
+        buildings_near(extract, path, 20)
+    with pytest.raises(InputError, match=r"the nearest is 7\.0 km away"):
+        buildings_near(extract, path - [0, 7400, 0], 100)
+    # Inside a building is near it.
+    assert len(buildings_near(extract, np.array([[300.0, 100]]), 1)) == 1
