@@ -64,13 +64,6 @@ def read_bytes(path: Path) -> NDArray[np.uint8]:
             return np.fromfile(stream, np.uint8)
 
 
-def read_bin(path: Path) -> NDArray[np.float32]:
-    """(N, 4) float32 x, y, z (m) and intensity of a KITTI `.bin` file. Raises InputError when it is no multiple of 16 bytes."""
-    raw = read_bytes(path)
-    check_size(path, raw, KITTI)
-    return raw.view("<f4").reshape(-1, 4)
-
-
 def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
     """Raise InputError when the bytes of a file are no multiple of those of a point."""
     if len(raw) % record.size:

@@ -51,16 +51,6 @@ def deskew(
 
 
 @kernel
-def split(raw: Floats, points: Floats, intensity: Floats) -> None:
-    """Copy (N, 4) records into points (N, 3) and intensity (N,)."""
-    for i in range(raw.shape[0]):
-        points[i, 0] = raw[i, 0]
-        points[i, 1] = raw[i, 1]
-        points[i, 2] = raw[i, 2]
-        intensity[i] = raw[i, 3]
-
-
-@kernel
 def rotate_up(points: Any, sine: float, cosine: float) -> None:
     """Rotate every point (N, 3) about p x z, in place, by the angle of `sine` and `cosine`; positive lifts the point.
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import PointCloud
-from lslam.formats.point_files import read_bin, read_points
+from lslam.formats.point_files import read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.formats.state_files import DAMAGE, HEADERS
@@ -56,8 +56,7 @@ class FolderSequence(SequenceOnDisk):
         """Raises InputError naming the file also where it contradicts `sequence.toml`."""
         path = self.files[index]
         stamp = int(self.stamps_ns[index])
-        is_kitti = path.suffix.lower() == ".bin" and self.record in (None, KITTI)
-        cloud = in_metres(_split(read_bin(path)) if is_kitti else read_points(path, self.record), self.unit_m)
+        cloud = in_metres(read_points(path, self.record), self.unit_m)
         times, rings, fault = None, cloud.rings, ""
         if self.per_point is not None and len(cloud):
             # Compensated scans have no times: nobody shall deskew them a second time.
@@ -147,15 +146,6 @@ class Folder:
             "notes": self.voice.notes, "problems": problems, **parts,
         })  # fmt: skip
         return settle_unit(sequence)
-
-
-def _split(raw: NDArray[np.float32]) -> PointCloud:
-    from lslam.kernels.transform import split
-
-    points = np.empty((len(raw), 3), np.float32)
-    intensity = np.empty(len(raw), np.float32)
-    split(raw, points, intensity)
-    return PointCloud(points, intensity)
 
 
 def _read_per_point(

@@ -20,7 +20,6 @@ from lslam.formats.osm_buildings import (
 )
 from lslam.formats.osm_data import ATTRIBUTION
 from lslam.formats.osm_files import read_osm, write_osm
-from lslam.formats.point_files import read_bin
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.osm.overpass_reply import from_overpass
@@ -266,7 +265,7 @@ def _walls_of_first_scan(folder: Path) -> Any:
     T_body_lidar = read_mcd_extrinsics(folder / "hhs_calib.yaml")
     assert T_body_lidar is not None
     T_world_lidar = read_trajectory(folder / "pose_inW.csv").poses[0] @ T_body_lidar
-    scan = read_bin(folder / "data" / "0000000011.bin")[:, :3].astype(np.float64)
+    scan = np.fromfile(folder / "data" / "0000000011.bin", "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
     local = se3.apply(T_world_lidar, scan[np.linalg.norm(scan, axis=1) > 2])
     local -= [64.3932532565158, 66.4832330946657, 38.514]
     cells = np.unique(np.floor(local[:, :2] / 0.3), axis=0, return_inverse=True)[1].ravel()

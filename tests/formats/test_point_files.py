@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from point_writers import ENCODINGS, write_pcd, write_points
 
 from lslam.errors import InputError, OutputError, UsageError
-from lslam.formats.point_files import read_bin, read_points
+from lslam.formats.point_files import read_points
+from lslam.formats.point_records import KITTI
 
 CLOUDS = hnp.arrays(
     np.float32,
@@ -227,6 +228,14 @@ def test_bad_ply_names_the_file_and_the_place(case: str, tmp_path: Path) -> None
     assert said in str(error.value)
 
 
+def test_records_are_points_and_their_intensities(tmp_path: Path) -> None:
+    raw = np.random.default_rng(0).random((50, 4)).astype(np.float32)
+    raw.tofile(tmp_path / "a.bin")
+    back = read_points(tmp_path / "a.bin", KITTI)
+    assert back.intensity is not None
+    np.testing.assert_array_equal(np.column_stack([back.points, back.intensity]), raw)
+
+
 @pytest.mark.parametrize(
     ("size", "said"), [(17, "after point 1"), (60, "records are of 12, 15, 20, 30, 60 bytes"), (3, "point 0")]
 )
@@ -234,7 +243,7 @@ def test_truncated_bin_says_size_and_what_it_could_be(size: int, said: str, tmp_
     path = tmp_path / "000007.bin"
     path.write_bytes(bytes(size))
     with pytest.raises(InputError, match="000007") as error:
-        read_bin(path)
+        read_points(path, KITTI)
     assert f"{size} bytes" in str(error.value)
     assert said in str(error.value)
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
-from lslam.kernels.transform import rotate_up, split
+from lslam.kernels.transform import rotate_up
 
 ANGLE = math.radians(0.205)
 
@@ -46,10 +46,3 @@ def test_points_without_an_axis_stay_and_nan_stays() -> None:
     out = lifted(p)
     np.testing.assert_array_equal(out[:2], p[:2])
     assert np.isnan(out[2, 0])
-
-
-def test_split_copies_all_columns() -> None:
-    raw = np.random.default_rng(0).random((50, 4)).astype(np.float32)
-    p, i = np.empty((50, 3), np.float32), np.empty(50, np.float32)
-    split(raw, p, i)
-    np.testing.assert_array_equal(np.column_stack([p, i]), raw)
