@@ -20,7 +20,7 @@ SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
 EARTH = ("kml", "gpx")
 BAGS = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 OF_RUNS = ("no_clouds", "voxel", "sequence")
-NOT_OF_RUNS = ("deskewed", "start", "count", "skip_frames", "frame", "from_frame", "calib", "times")
+NOT_OF_RUNS = ("deskewed", "lidars", "start", "count", "skip_frames", "frame", "from_frame", "calib", "times")
 BY_SUFFIX = {suffix: kind for kind, suffix in BAGS.items()} | {f".{kind}": kind for kind in (*EARTH, "gpkg", "tum")}
 EPILOG = """\b
 Examples:
@@ -58,6 +58,10 @@ Examples:
 @click.option(
     "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="RUN to a bag: the raw scans, when they moved."
 )
+@click.option(
+    "--lidars", type=click.Choice(["merged", "topics", "frames"]),
+    help="Several LiDARs to a bag: each on a topic of its own, or all on one  [merged into one].",
+)  # fmt: skip
 @options.scan_range
 @click.option(
     "--frame", metavar="BODY", help="Trajectory: lidar, cam0 or imu [default: what the format usually holds]."
@@ -150,7 +154,8 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     with progress("convert", len(sequence)) as advance:
         done = convert_sequence(
             sequence, kind, out,
-            is_zstd=given["is_zstd"], overwrite=given["overwrite"], trajectory=trajectory, on_scan=advance,
+            is_zstd=given["is_zstd"], overwrite=given["overwrite"], trajectory=trajectory, lidars=given["lidars"] or "merged",
+            on_scan=advance,
         )  # fmt: skip
     left = f", {done.skipped} that could not be read left out" if done.skipped else ""
     values = {"scans": done.scans, "skipped": done.skipped}

@@ -124,7 +124,7 @@ def command(
     """Simulate a drive or a flight with exact ground truth; SCENARIO is a name of --list, or a .toml file.
 
     With --plan the scene is drawn, and recorded only with --out as well. With --osm and without --path the whole extract is
-    drawn.
+    drawn. Further LiDARs of a vehicle are the scenario's `lidars`, see `lslam simulate two-lidars --show`.
     """
     if show_list:
         _print_list(as_json)

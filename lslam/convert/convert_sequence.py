@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import heapq
 import logging
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from lslam.convert import bag_messages
 from lslam.convert.bag_writer import BagWriter
 from lslam.convert.convert_trajectory import change_frame
 from lslam.convert.output import check_beside, check_output, staged
-from lslam.errors import InputError
+from lslam.errors import InputError, UsageError
 from lslam.formats.bag_files import INFO_TOPIC
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
 from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
@@ -25,12 +27,14 @@ from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
+from lslam.readers.merged_lidars import MergedLidars
 from lslam.types.scan import Scan
 from lslam.types.sequence import Calibration, Sequence
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 
+LIDARS = ("merged", "topics", "frames")
 NUMBER = "00"  # of the one sequence in KITTI's layout
 TRUTH_FILE, IMU_FILE, GNSS_FILE = "ground_truth.tum", "imu.csv", "gnss.csv"
 
@@ -52,6 +56,7 @@ def convert_sequence(
     is_zstd: bool = False,
     overwrite: bool = False,
     trajectory: Trajectory | None = None,
+    lidars: str = "merged",
     on_scan: Callable[[], None] = lambda: None,
 ) -> Converted:
     """Write `sequence` to `out`, whole or not at all.
@@ -61,13 +66,20 @@ def convert_sequence(
     kind : `bag` (ROS 1, one file), `mcap` or `sqlite` (ROS 2, a folder, or a file when `out` ends in .mcap or .db3), `kitti`
     is_zstd : compress mcap and sqlite
     trajectory : LiDAR poses along which scans with per-point times are deskewed on the way; None leaves them as they are
+    lidars : of several, one of `LIDARS`: as merged, or in a bag each on a topic of its own, or all on one, told apart by frames
 
     Raises
     ------
-    OutputExistsError, OutputError : as named. UsageError : `out` does not suit `kind`. InputError : no scan can be read.
+    OutputExistsError, OutputError : as named. UsageError : `out` or `lidars` does not suit. InputError : no scan can be read.
     """
     check_output(kind, out, is_zstd, overwrite)
     source = _Source(sequence, trajectory, on_scan)
+    if lidars != "merged":
+        if kind == "kitti" or trajectory is not None or not isinstance(sequence, MergedLidars):
+            raise UsageError(
+                f"--lidars {lidars} is for whole recordings of several LiDARs, to a bag and not --deskewed"
+            )
+        source.take_apart(sequence, lidars == "frames")
     check_beside(out, sequence.path, "the sequence")
     with staged(out) as made:
         if kind == "kitti":
@@ -77,29 +89,61 @@ def convert_sequence(
     return Converted(out, source.written, source.skipped)
 
 
+@dataclass(frozen=True)
+class _Lidar:
+    """Scans that go to a topic of a bag, the frame of their messages, and where it sits, `T_lidar_other` (4, 4)."""
+
+    scans: Sequence
+    topic: str = "/points"
+    frame: str = "lidar"
+    T_lidar_other: Any = None
+
+
 class _Source:
-    """Scans of a sequence in order, deskewed when asked for, counted, those that are damaged left out and said."""
+    """Scans of a sequence in order, deskewed when asked for, counted, those that are damaged left out and said.
+
+    lidars : what a bag is given, the leading one first
+    """
 
     def __init__(self, sequence: Sequence, trajectory: Trajectory | None, on_scan: Callable[[], None]) -> None:
         self.sequence, self.trajectory, self.on_scan = sequence, trajectory, on_scan
+        self.lidars, self.keys = [_Lidar(sequence)], SequenceInfo()
         self.written = self.skipped = 0
         self.sweep = None if trajectory is None else sweep_of(sequence)
         if trajectory is not None:
             self.trajectory = self._check(trajectory)
 
-    def scans(self) -> Iterator[Scan]:
-        for k in range(len(self.sequence)):
+    def take_apart(self, merged: MergedLidars, on_one_topic: bool) -> None:
+        """Write the scans of each LiDAR that was merged, and which of them are merged when the bag is read."""
+        others = merged.further_lidars
+        names = [re.sub(r"\W+", "_", other.name).strip("_") for other in others]
+        if len(set(names)) < len(names):
+            names = [str(number) for number in range(2, len(names) + 2)]
+        frames = ["lidar", *(f"lidar_{name}" for name in names)]
+        topics = ["/points" if on_one_topic else f"/{frame}/points" for frame in frames]
+        parts = [(merged.whole, None), *((other.scans, other.T_lidar_other) for other in others)]
+        self.lidars = [
+            _Lidar(scans, topic, frame, T) for (scans, T), topic, frame in zip(parts, topics, frames, strict=True)
+        ]
+        of_frames, of_topics = SequenceInfo(lidar_frame=",".join(frames)), SequenceInfo(lidar_topic=",".join(topics))
+        self.keys = of_frames if on_one_topic else of_topics
+
+    def scans(self, lidar: _Lidar | None = None) -> Iterator[Scan]:
+        lidar = lidar or self.lidars[0]
+        skipped = 0
+        for k in range(len(lidar.scans)):
             try:
-                scan = self._deskewed(self.sequence.scan(k))
+                scan = self._deskewed(lidar.scans.scan(k))
             except InputError as error:
                 log.warning("left out: %s", error)
-                self.skipped += 1
+                skipped += 1
             else:
-                self.written += 1
                 yield scan
-            self.on_scan()
-        if not self.written:
-            raise InputError(f"{self.sequence.path}: none of its {len(self.sequence)} scans can be read")
+            if lidar is self.lidars[0]:
+                self.on_scan()
+        if skipped == len(lidar.scans):
+            raise InputError(f"{lidar.scans.path}: none of its {skipped} scans can be read")
+        self.written, self.skipped = self.written + len(lidar.scans) - skipped, self.skipped + skipped
 
     def _check(self, trajectory: Trajectory) -> Trajectory:
         """The trajectory as LiDAR poses. Raises InputError when there is nothing to deskew, or nothing to deskew along."""
@@ -128,7 +172,8 @@ class _Source:
 
     def info(self) -> SequenceInfo:
         is_deskewed = self.trajectory is not None
-        return SequenceInfo(
+        return replace(
+            self.keys,
             name=self.sequence.name,
             sensor=getattr(self.sequence, "sensor", None),
             rings=getattr(self.sequence, "rings", None),
@@ -142,11 +187,11 @@ class _Source:
 
 
 def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
-    sequence = source.sequence
     with BagWriter(out, kind, is_zstd) as writer:
-        begin = _first_stamp(sequence)
+        begin = _first_stamp(source)
         writer.write(INFO_TOPIC, begin, bag_messages.text(writer.store, sequence_toml_text(source.info())))
         transforms = _transforms(source.calibration)
+        transforms |= {("lidar", one.frame): one.T_lidar_other for one in source.lidars[1:]}
         if transforms:
             writer.write("/tf_static", begin, bag_messages.transforms(writer.store, begin, transforms))
         for stamp, _, topic, message in heapq.merge(*_messages(source, writer.store), key=lambda m: m[:2]):
@@ -158,10 +203,7 @@ def _messages(source: _Source, store: Any) -> list[Iterator[tuple[int, int, str,
     sequence, make = source.sequence, bag_messages
     imu, gnss, truth = sequence.imu, sequence.gnss, sequence.ground_truth
     topics: list[Iterator[tuple[int, int, str, Callable[[], Any]]]] = [
-        (
-            (scan.stamp_ns, 3, "/points", lambda scan=scan: make.cloud(store, scan, "lidar"))  # type: ignore[misc]
-            for scan in source.scans()
-        )
+        _clouds(source, lidar, rank, store) for rank, lidar in enumerate(source.lidars, 3)
     ]
     if imu is not None:
         rows = zip(imu.stamps_ns.tolist(), imu.accel, imu.gyro, strict=True)
@@ -178,10 +220,16 @@ def _messages(source: _Source, store: Any) -> list[Iterator[tuple[int, int, str,
     return topics
 
 
-def _first_stamp(sequence: Sequence) -> int:
+def _clouds(source: _Source, lidar: _Lidar, rank: int, store: Any) -> Iterator[tuple[int, int, str, Callable[[], Any]]]:
+    for scan in source.scans(lidar):
+        yield scan.stamp_ns, rank, lidar.topic, partial(bag_messages.cloud, store, scan, lidar.frame)
+
+
+def _first_stamp(source: _Source) -> int:
+    sequence = source.sequence
     streams = (sequence.imu, sequence.gnss, sequence.ground_truth)
     starts = [int(s.stamps_ns[0]) for s in streams if s is not None and len(s)]
-    return min([int(sequence.stamps_ns[0]), *starts])
+    return min([*(int(lidar.scans.stamps_ns[0]) for lidar in source.lidars), *starts])
 
 
 def _transforms(calibration: Calibration) -> dict[tuple[str, str], Any]:

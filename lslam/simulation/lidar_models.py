@@ -8,9 +8,11 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from lslam.config.section import Section
 from lslam.errors import UsageError, nearest
-from lslam.geometry import portable
+from lslam.geometry import portable, se3, so3
 
 Floats = NDArray[np.float64]
 
@@ -190,6 +192,25 @@ LIDARS = {
         ),
     )
 }  # fmt: skip
+
+
+class LidarMount(Section):
+    """A LiDAR beside the leading one, in whose frame it sits.
+
+    name : of its folder; lidar : a name of `LIDARS`, by default the leading one's
+    place : x, y, z, m; rpy_deg : roll, pitch, yaw; offset_ms : its sweeps begin so much after those of the leading one
+    """
+
+    name: str = Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$")
+    lidar: str | None = None
+    place: tuple[float, float, float]
+    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset_ms: float = Field(0.0, ge=0)
+
+    @property
+    def T_lidar_other(self) -> Floats:
+        """(4, 4) from its frame to that of the leading LiDAR."""
+        return se3.make(so3.from_euler_rpy(np.radians(self.rpy_deg)), np.array(self.place))
 
 
 def lidar_named(name: str) -> LidarModel:

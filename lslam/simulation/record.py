@@ -10,9 +10,9 @@ import math
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,7 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
         "seed": drive.seed,
         "visit": asdict(drive.visit),
         "lidar": asdict(drive.lidar),
+        **_further(drive),
         "scans": len(drive),
         "rate_hz": drive.rate_hz,
         "motion_compensated": drive.motion_compensated,
@@ -90,6 +91,11 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
     }
 
 
+def _further(drive: SimulatedDrive) -> dict[str, Any]:
+    mounts = zip(drive.scenario.lidars, drive.further, strict=True)
+    return {"further_lidars": {mount.name: asdict(other.lidar) for mount, other in mounts}} if drive.further else {}
+
+
 def _plain(value: Any) -> Any:
     """The same as JSON has it: arrays as lists, what is not finite (no limit at all) as null."""
     if isinstance(value, dict):
@@ -109,6 +115,7 @@ def fingerprint(drive: SimulatedDrive) -> str:
         "version": __version__,
         "scenario": drive.scenario.model_dump(mode="json"),
         "lidar": asdict(drive.lidar),
+        **_further(drive),
         "seed": drive.seed,
         "visit": asdict(drive.visit),
         "scans": len(drive),
@@ -135,36 +142,47 @@ def write_mark(folder: Path, drive: SimulatedDrive) -> None:
     write_text(folder / MARK, json.dumps({"fingerprint": fingerprint(drive)}))
 
 
+def lidars_of(drive: SimulatedDrive, folder: Path) -> list[tuple[SimulatedDrive, Path]]:
+    """The LiDARs of a drive and the folders of their scans: the leading one's `folder`, and in it those of the others."""
+    mounts = zip(drive.further, drive.scenario.lidars, strict=True)
+    return [(drive, folder), *((other, folder / mount.name) for other, mount in mounts)]
+
+
 def write_scans(drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None) -> int:
     """Write every scan that is not in `folder` yet, as KITTI's .bin with times and rings beside; the number of points of all.
 
-    `on_scan` is called with the index of every scan, in order, when it is on disk.
+    `on_scan` is called with the index of every scan, in order, when it is on disk, and those of further LiDARs beside it.
     """
-    missing = [index for index in range(len(drive)) if not scan_files(folder, index)[1].is_file()]
-    fresh = _traced(drive, missing)
+    jobs = [
+        (lidar, index, scan_files(place, index)[1])
+        for index in range(len(drive))
+        for lidar, place in lidars_of(drive, folder)
+        if index < len(lidar)
+    ]
+    fresh = _traced([(lidar, index) for lidar, index, beside in jobs if not beside.is_file()])
     total = 0
-    for index in range(len(drive)):
-        points, beside = scan_files(folder, index)
+    for (_, index, beside), following in zip(jobs, [*jobs[1:], None], strict=True):
+        place = beside.parents[1]
         if beside.is_file():
-            total += points.stat().st_size // 16
+            total += scan_files(place, index)[0].stat().st_size // 16
         else:
             scan = next(fresh)
             total += len(scan)
             # All rays of a compensated scan were fired at its stamp.
             times = np.zeros(len(scan), np.float32) if scan.times is None else scan.times
-            write_scan(folder, index, scan.points, scan.intensity, times, scan.rings)
-        if on_scan is not None:
+            write_scan(place, index, scan.points, scan.intensity, times, scan.rings)
+        if on_scan is not None and (following is None or following[1] != index):
             on_scan(index)
     return total
 
 
-def _traced(drive: SimulatedDrive, indices: list[int]) -> Iterator[Scan]:
+def _traced(jobs: Iterable[tuple[SimulatedDrive, int]]) -> Iterator[Scan]:
     """Scans in order, a few of them traced ahead; each has its own seed, so the order of tracing changes nothing."""
     waiting: deque[Future[Scan]] = deque()
     pool = ThreadPoolExecutor(TRACERS, thread_name_prefix="trace")
     try:
-        for index in indices:
-            waiting.append(pool.submit(drive.scan, index))
+        for lidar, index in jobs:
+            waiting.append(pool.submit(lidar.scan, index))
             if len(waiting) > AHEAD:
                 yield waiting.popleft().result()
         while waiting:
@@ -212,7 +230,8 @@ def record(
         elif read_mark(part) != fingerprint(drive):
             done = True
             raise OutputExistsError(f"{part} was begun with other settings: give the same ones, or --overwrite it")
-        for folder in (part / POINTS, part / PER_POINT, poses.parent):
+        places = [place / name for _, place in lidars_of(drive, part) for name in (POINTS, PER_POINT)]
+        for folder in (*places, poses.parent):
             folder.mkdir(parents=True, exist_ok=True)
         _check_space(out, part, drive)
         write_mark(part, drive)
@@ -239,16 +258,18 @@ def record(
 
 def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:
     """Say how much disk it takes, and refuse at once what will not fit, instead of failing hours later."""
-    left = len(drive) - sum(1 for _ in (part / PER_POINT).glob("*.npz"))
+    lidars = lidars_of(drive, part)
+    left = [len(lidar) - sum(1 for _ in (place / PER_POINT).glob("*.npz")) for lidar, place in lidars]
+    rays = sum(lidar.lidar.rays for lidar, _ in lidars)
     beside = _SIDES * drive.end + _HOUSE * len(drive.city.footprints)
-    needed = left * drive.lidar.rays * (16 + 2) + beside
+    needed = sum(n * lidar.lidar.rays for n, (lidar, _) in zip(left, lidars, strict=True)) * (16 + 2) + beside
     free = shutil.disk_usage(out).free
     if needed > free:
         raise OutputError(
             f"{out} needs up to {_size(needed)}, the disk has {_size(free)} left: use fewer scans (--scans)"
         )
-    kept = f", {len(drive) - left} of them are there already" if left < len(drive) else ""
-    log.info("%d scans of up to %d points%s: at most %.1f MB", len(drive), drive.lidar.rays, kept, needed / 1e6)
+    kept = f", {len(drive) - left[0]} of them are there already" if left[0] < len(drive) else ""
+    log.info("%d scans of up to %d points%s: at most %.1f MB", len(drive), rays, kept, needed / 1e6)
 
 
 def _size(amount: float) -> str:
@@ -278,12 +299,28 @@ def _write_sides(drive: SimulatedDrive, folder: Path) -> None:
 
 
 def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
-    """times.txt, calib.txt and sequence.toml."""
-    T_cam0_lidar = drive.calibration.T_cam0_lidar
-    assert T_cam0_lidar is not None
-    write_times(folder, drive.stamps_ns)
-    write_calib(folder, T_cam0_lidar)
-    info = SequenceInfo(
+    """times.txt, calib.txt and sequence.toml, of further LiDARs in their folders."""
+    info = replace(
+        _info(drive),
+        ground_truth=f"../../poses/{NUMBER}.txt",
+        ground_truth_frame="cam0",
+        imu=None if drive.imu is None else IMU_FILE,
+        gnss=None if drive.gnss is None else GNSS_FILE,
+        T_lidar_imu=drive.calibration.T_lidar_imu,
+        T_lidar_gnss=drive.calibration.T_lidar_gnss,
+        lidars={mount.name: mount.T_lidar_other for mount in drive.scenario.lidars} or None,
+    )
+    for lidar, place in lidars_of(drive, folder):
+        T_cam0_lidar = lidar.calibration.T_cam0_lidar
+        assert T_cam0_lidar is not None
+        write_times(place, lidar.stamps_ns)
+        write_calib(place, T_cam0_lidar)
+        write_sequence_toml(place / FILE_NAME, info if lidar is drive else _info(lidar))
+
+
+def _info(drive: SimulatedDrive) -> SequenceInfo:
+    """What the scans of a LiDAR are."""
+    return SequenceInfo(
         name=drive.name,
         sensor=f"simulated {drive.lidar.name}",
         rings=drive.lidar.rings,
@@ -292,12 +329,5 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
         compensated_to="scan_start" if drive.motion_compensated else None,
         vertical_correction_deg=0.0,
         per_point=PER_POINT,
-        ground_truth=f"../../poses/{NUMBER}.txt",
-        ground_truth_frame="cam0",
-        imu=None if drive.imu is None else IMU_FILE,
-        gnss=None if drive.gnss is None else GNSS_FILE,
-        T_cam0_lidar=T_cam0_lidar,
-        T_lidar_imu=drive.calibration.T_lidar_imu,
-        T_lidar_gnss=drive.calibration.T_lidar_gnss,
+        T_cam0_lidar=drive.calibration.T_cam0_lidar,
     )
-    write_sequence_toml(folder / FILE_NAME, info)

@@ -15,12 +15,13 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.config.section import Section
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
+from lslam.formats.kitti_layout import PER_POINT, POINTS
 from lslam.geometry import portable
 from lslam.printable import toml_text
 from lslam.simulation.city import Layout
 from lslam.simulation.imu import ImuFaults
 from lslam.simulation.kinematics import Vibration
-from lslam.simulation.lidar_models import LIDARS
+from lslam.simulation.lidar_models import LIDARS, LidarMount
 from lslam.simulation.returns import Returns
 from lslam.untrusted import parse_toml
 
@@ -207,6 +208,7 @@ class Scenario(Section):
         greatest thrust; roof : m behind, ahead, aside and below the LiDAR that the car's own roof takes up, or nothing;
         roof_returns : whether the roof is seen, or what it is in the way of is only missing
     overlap : distance beyond one lap of a closed line, m
+    lidars : further LiDARs that ride along
     """
 
     name: str
@@ -222,6 +224,7 @@ class Scenario(Section):
     rate_hz: float = Field(10.0, ge=1, le=100)
     overlap: float = Field(0.0, ge=0, le=1000)
     motion_compensated: bool = False
+    lidars: tuple[LidarMount, ...] = ()
     path: PathSection = PathSection()
     world: WorldSection = WorldSection()
     layout: Layout = Layout()
@@ -245,8 +248,14 @@ class Scenario(Section):
             raise ValueError(
                 f"path.shape = {shape!r} in a world.kind = {self.world.kind!r}: expected {expected!r} there"
             )
-        if self.lidar not in LIDARS:
-            raise ValueError(f"lidar = {self.lidar!r}; {nearest(self.lidar, LIDARS)}")
+        for lidar in (self.lidar, *(mount.lidar or self.lidar for mount in self.lidars)):
+            if lidar not in LIDARS:
+                raise ValueError(f"lidar = {lidar!r}; {nearest(lidar, LIDARS)}")
+        names = [POINTS, PER_POINT, *(mount.name for mount in self.lidars)]
+        if len(set(names)) < len(names):
+            raise ValueError(f"lidars: the names of folders differ, {POINTS} and {PER_POINT} are taken")
+        if any(mount.offset_ms * self.rate_hz >= 1000 for mount in self.lidars):
+            raise ValueError(f"lidars: an offset_ms is shorter than a sweep, {1000 / self.rate_hz:g} ms")
         if self.carrier != "drone" and min(self.path.heights) < 0.3:
             raise ValueError(f"path.heights = {list(self.path.heights)}: at least 0.3 m above the ground")
         return self
@@ -312,7 +321,7 @@ def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()
         return Scenario.model_validate({**merged, "name": name})
     except ValidationError as error:
         said = [
-            f"{'.'.join(str(p) for p in e['loc'][:2])}: {e['msg'].removeprefix('Value error, ')}"
+            f"{'.'.join(str(p) for p in e['loc'][:3])}: {e['msg'].removeprefix('Value error, ')}"
             for e in error.errors()
         ]
         raise ConfigError(f"{where}: " + "; ".join(text.removeprefix(": ") for text in said)) from None

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +16,9 @@ from lslam.geometry import portable, se3, so3
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
 from lslam.simulation.imu import ImuModel, imu_named
-from lslam.simulation.kinematics import PosePath, shaking, smooth_motion, standing_start
+from lslam.simulation.kinematics import Motion, PosePath, shaking, smooth_motion, standing_start
 from lslam.simulation.lidar import Roof, trace
-from lslam.simulation.lidar_models import LidarModel, lidar_named
+from lslam.simulation.lidar_models import LidarModel, LidarMount, lidar_named
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.ray_scene import RayScene
@@ -34,6 +36,19 @@ FASTEST = 40.0  # m/s
 LONGEST_STAND = 600.0  # s
 SPARE_REACH = 10.0  # m that anything may get nearer while a scan is taken
 _SHAKING_SEED = 2**32 - 13  # of the generator of the LiDAR's vibration
+_MOUNT_SEED = 2**32 - 17  # of those of further LiDARs
+
+
+@dataclass(frozen=True)
+class Mounted:
+    """The motion of what sits at `T_lidar_other` (4, 4) of the LiDAR that `motion` moves."""
+
+    motion: Motion
+    T_lidar_other: NDArray[np.float64]
+
+    def poses(self, times: NDArray[Any]) -> NDArray[np.float64]:
+        """(M, 4, 4) T_city_other at `times` (M,), s."""
+        return portable.product(self.motion.poses(times), self.T_lidar_other)
 
 
 class SimulatedDrive(Scans):
@@ -41,6 +56,8 @@ class SimulatedDrive(Scans):
 
     `ground_truth` is T_world_lidar at the scans' stamps, world = LiDAR at the first scan; `T_city_world` carries it into
     the frame of `city`. Scans are traced when asked for, each with its own seed: any order gives the same bytes.
+
+    further : the scans of other LiDARs on the same vehicle, in the order of the scenario, with truth and extrinsics of their own
     """
 
     kind = "simulated"
@@ -63,6 +80,7 @@ class SimulatedDrive(Scans):
         self.scenario, self.city, self.lidar, self.movers = scenario, city, lidar, list(movers)
         # One function of time for the rays, the truth and all other sensors.
         self.vehicle = smooth_motion(path)
+        self._motion: Motion | Mounted = self.vehicle
         self.seed, self.visit = seed, visit
         self._seeds = visit.seeds(seed)
         self.name = f"{scenario.name}-{seed}" + (f"-visit{visit.number}" if visit.number else "")
@@ -91,6 +109,7 @@ class SimulatedDrive(Scans):
         self._shaking = shaking(scenario.vibration, np.random.default_rng([*self._seeds, _SHAKING_SEED]))
         self._roof = None if scenario.roof is None else Roof(*scenario.roof, scenario.roof_returns)
         self.scene = RayScene(city.mesh) if scene is None else scene
+        self.further = [self._beside(mount, number) for number, mount in enumerate(scenario.lidars)]
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -101,17 +120,41 @@ class SimulatedDrive(Scans):
     @property
     def city_poses(self) -> NDArray[np.float64]:
         """(N, 4, 4) T_city_lidar at the scans' stamps."""
-        return self.vehicle.poses(self.stamps_ns / 1e9)
+        return self._motion.poses(self.stamps_ns / 1e9)
+
+    def _beside(self, mount: LidarMount, number: int) -> SimulatedDrive:
+        """The same drive as another LiDAR sees it, which has noise of its own and no roof in its way."""
+        other, T, late_ns = copy.copy(self), mount.T_lidar_other, round(1e6 * mount.offset_ms)
+        other.name, other.path = f"{self.name}-{mount.name}", Path(f"{self.name}-{mount.name}")
+        other.lidar = self.lidar if mount.lidar is None else _calibrated(lidar_named(mount.lidar), self.scenario)
+        # A last sweep that begins late would end after the drive.
+        other.stamps_ns = self.stamps_ns[: len(self) - (late_ns > 0)] + late_ns
+        if not len(other.stamps_ns):
+            raise UsageError(
+                f"{mount.name} begins its sweeps {mount.offset_ms:g} ms late: at least two scans are needed"
+            )
+        other._motion, other._roof, other._seeds = Mounted(self.vehicle, T), None, (*self._seeds, _MOUNT_SEED, number)
+        other._shaking = shaking(self.scenario.vibration, np.random.default_rng([*other._seeds, _SHAKING_SEED]))
+        poses = other.city_poses
+        other.T_city_world = poses[0]
+        other.ground_truth = Trajectory(
+            other.stamps_ns, se3.relative(poses[0], poses), "lidar", source=f"simulation of {other.name}"
+        )
+        known = self.calibration
+        inner = [None if S is None else se3.relative(T, S) for S in (known.T_lidar_imu, known.T_lidar_gnss)]
+        assert known.T_cam0_lidar is not None
+        other.calibration = Calibration(portable.product(known.T_cam0_lidar, T), *inner)
+        return other
 
     def scan(self, index: int) -> Scan:
         """Trace scan `index`, 0 <= index < len."""
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")
         start, period = self.stamps_ns[index] / 1e9, 1 / self.rate_hz
-        poses = self.vehicle.poses(np.array([start]))[0]
+        poses = self._motion.poses(np.array([start]))[0]
         fired = start + np.arange(self.lidar.columns) * (period / self.lidar.columns)
         if not self.motion_compensated:
-            poses = self.vehicle.poses(fired)
+            poses = self._motion.poses(fired)
         if self._shaking is not None:
             poses = self._shaking.shaken(poses, fired)
         rng = np.random.default_rng([*self._seeds, index])
@@ -168,7 +211,7 @@ def simulate(
     """
     chosen = scenario_named(scenario, settings) if isinstance(scenario, str) else scenario
     model = chosen.lidar if lidar is None else lidar
-    model = lidar_named(model) if isinstance(model, str) else model
+    model = _calibrated(lidar_named(model) if isinstance(model, str) else model, chosen)
     cruise = chosen.speed if speed is None else speed
     begin = (
         (cruise if chosen.carrier == "drone" and chosen.start_speed else min(chosen.start_speed, cruise))
@@ -178,11 +221,6 @@ def simulate(
     _check(seed, count, cruise, begin)
     if not 0 <= static_start <= LONGEST_STAND:
         raise UsageError(f"--static-start {static_start:g} is out of range: 0 to {LONGEST_STAND:g} s")
-    model = replace(
-        model,
-        ring_bias=chosen.returns.calibration * model.ring_bias,
-        ring_tilt_deg=chosen.returns.calibration * model.ring_tilt_deg,
-    )
     measuring = imu_named(imu) if isinstance(imu, str) else imu
     sensors = Sensors(None if measuring is None else chosen.imu.of(measuring), gnss)
     chosen = chosen.model_copy(update={"speed": cruise, "start_speed": begin})
@@ -230,6 +268,12 @@ def kitti_like_cam0() -> NDArray[np.float64]:
     return se3.make(
         portable.product(so3.from_euler_rpy(np.radians([0.45, -0.4, 0.02])), axes), np.array([-0.012, -0.06, -0.28])
     )
+
+
+def _calibrated(model: LidarModel, scenario: Scenario) -> LidarModel:
+    """The model with the errors that calibration leaves in a scenario."""
+    share = scenario.returns.calibration
+    return replace(model, ring_bias=share * model.ring_bias, ring_tilt_deg=share * model.ring_tilt_deg)
 
 
 def _check(seed: int, count: int | None, speed: float, start_speed: float) -> None:

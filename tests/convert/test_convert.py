@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from stub_sequences import StampedInTheMiddle, sample
+from two_lidars import two_lidars
 
 from lslam.config import load_config
 from lslam.convert import bag_messages
@@ -22,9 +23,11 @@ from lslam.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.geometry import se3
 from lslam.pipeline.rebuild import EarlierRun
 from lslam.readers import open_sequence
+from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import GnssModel
 from lslam.types.scan import Scan
+from lslam.types.selection import select
 from lslam.types.sequence import Calibration, Sequence
 
 NAMES = {"bag": "a.bag", "mcap": "a.mcap", "sqlite": "a"}
@@ -248,3 +251,26 @@ def test_a_sequence_is_not_written_over_itself(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds the sequence itself"):
         convert_sequence(open_sequence(done.path), "bag", done.path, overwrite=True)
     assert len(open_sequence(done.path)) == 2
+
+
+@pytest.mark.parametrize("way", ["topics", "frames"])
+def test_merged_lidars_are_written_each_by_itself_and_read_as_merged(tmp_path: Path, way: str) -> None:
+    """In a bag of other tools every LiDAR keeps its scans; the bag says which of them lslam merges."""
+    drive = two_lidars("block", 4, 50.0)
+    record(drive, tmp_path / "drive")
+    merged = open_sequence(tmp_path / "drive")
+    done = convert_sequence(merged, "mcap", tmp_path / "a.mcap", lidars=way)
+    assert (done.scans, done.skipped) == (7, 0)
+    again = open_sequence(done.path)
+    np.testing.assert_array_equal(again.stamps_ns, merged.stamps_ns)
+    for k in range(4):
+        before, after = merged.scan(k), again.scan(k)
+        np.testing.assert_array_equal(after.points, before.points)
+        np.testing.assert_array_equal(after.times, before.times)
+        np.testing.assert_array_equal(after.rings, before.rings)
+    chosen = {"lidar_topic": "/lidar_rear/points"} if way == "topics" else {"lidar_frame": "lidar_rear"}
+    rear = open_sequence(done.path, **chosen)
+    np.testing.assert_array_equal(rear.scan(1).points, drive.further[0].scan(1).points)
+    for kind, part in (("kitti", merged), ("mcap", select(merged, 1)), ("mcap", drive)):
+        with pytest.raises(UsageError, match=f"--lidars {way} is for whole recordings of several LiDARs"):
+            convert_sequence(part, kind, tmp_path / "b.mcap" if kind == "mcap" else tmp_path / "b", lidars=way)
