@@ -88,7 +88,7 @@ def noise(seed: int, count: int = 5000) -> NDArray[np.float32]:
 class StampedInTheMiddle:
     """The same scans stamped half a sweep of 0.1 s later, with times about that."""
 
-    HALF_NS = 50_000_000
+    LATER_NS = 50_000_000
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence = sequence
@@ -101,12 +101,20 @@ class StampedInTheMiddle:
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        return self.sequence.stamps_ns + self.HALF_NS
+        return self.sequence.stamps_ns + self.LATER_NS
 
     def scan(self, index: int) -> Scan:
         scan = self.sequence.scan(index)
         assert scan.times is not None
-        return replace(scan, stamp_ns=scan.stamp_ns + self.HALF_NS, times=scan.times - np.float32(1e-9 * self.HALF_NS))
+        return replace(
+            scan, stamp_ns=scan.stamp_ns + self.LATER_NS, times=scan.times - np.float32(1e-9 * self.LATER_NS)
+        )
+
+
+class StampedAtTheEnd(StampedInTheMiddle):
+    """The same scans stamped where their sweeps end."""
+
+    LATER_NS = 100_000_000
 
 
 class Standstill:

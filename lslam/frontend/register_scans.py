@@ -17,17 +17,21 @@ from lslam.errors import InputError
 from lslam.frontend.checkpoints import OdometryCheckpoints
 from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.tracker import Loaded, Tracker
+from lslam.geometry import se3
+from lslam.geometry.interpolate import poses_at
 from lslam.integrity.monitor import IntegrityMonitor
-from lslam.odometry.base import Odometry
+from lslam.odometry.base import Deskewing, Odometry
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
-from lslam.registration.constant_velocity import MotionModel
+from lslam.registration.constant_velocity import ConstantVelocity, MotionModel
 from lslam.types.scan import FARTHEST_M, Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.selection import Selection
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
+
+Floats = NDArray[np.float64]
 
 # Scans with points that say when sweeps begin and end.
 _LOOKED_AT = 3
@@ -62,7 +66,10 @@ def estimate(
     for loaded in read_ahead(sequence, odometry.prepare, threads, first=len(results)):
         if failures >= max_failures:
             break
+        middle = tracker.middle
         result = tracker.track(loaded)
+        if results:
+            results[-1] = told_by_next(results[-1], result, tracker, middle)
         stages = {"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages}
         if keyframing is not None:
             began = time.perf_counter()
@@ -118,6 +125,24 @@ def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
     return given_up or sum(r.status == "ok" for r in results) < max(1, len(results) // 2)
 
 
+def told_by_next(result: ScanResult, following: ScanResult, tracker: Tracker, middle: tuple[int, Floats]) -> ScanResult:
+    """The result with its pose at the stamp between the middles of its sweep and the next one, where it lies there.
+
+    middle : instant, ns, and pose of the middle of its own sweep; that of the following is the tracker's
+
+    From its own middle a stamp at the end of a sweep is extrapolated, where one at the start lies between two: the error of the
+    speed within a sweep that changes its direction is as large as a step.
+    """
+    (begin_ns, begin), (end_ns, end) = middle, tracker.middle
+    is_alone = not isinstance(tracker.odometry, Deskewing) or not isinstance(tracker.motion, ConstantVelocity)
+    is_placed = all(r.status == "ok" and not r.is_stationary for r in (result, following))
+    # No farther from the next middle than a sweep is long: where scans are missing, its own is nearer.
+    if is_alone or not is_placed or not 0 < end_ns - result.stamp_ns <= 2 * (result.stamp_ns - begin_ns):
+        return result
+    pose = poses_at(np.array([begin_ns, end_ns]), np.stack([begin, end]), np.array([result.stamp_ns]))[0]
+    return replace(result, stamp_offset=se3.relative(result.T_world_lidar, pose))
+
+
 def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
     """The poses of all scans, with covariances when the method has them; a skipped scan adds `PRIOR_COVARIANCE` to the last."""
     known = any(r.covariance is not None for r in results)
@@ -127,7 +152,7 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
         covariances.append(before + PRIOR_COVARIANCE if result.covariance is None else result.covariance)
     return Trajectory(
         stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
-        poses=np.stack([r.T_world_lidar for r in results]),
+        poses=np.stack([r.at_stamp.T_world_lidar for r in results]),
         covariances=np.stack(covariances) if known else None,
         source=method,
     )

@@ -50,7 +50,7 @@ def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionChec
 
 
 def _alerts(results: list[ScanResult], checks: list[MotionCheck]) -> list[Alert]:
-    positions = np.stack([r.T_world_lidar[:3, 3] for r in results])
+    positions = np.stack([r.at_stamp.T_world_lidar[:3, 3] for r in results])
     return alerts(checks, positions, np.array([r.stamp_ns for r in results]))
 
 

@@ -91,6 +91,7 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
     For the thread that reads, since merging takes as long as reading and deskewing together.
     """
     ego_box = config.map.ego_box or config.preprocess.ego_box
+    results = [result.at_stamp for result in results]
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
     registered = {result.index: result for result in results if result.status == "ok"}

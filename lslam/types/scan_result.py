@@ -44,6 +44,7 @@ class ScanResult:
     gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
     inertial : the state of the IMU that a smoother found, for the motion model, which takes it off
     imu : what was known of the IMU after the scan; None without one, and once it was refused
+    stamp_offset : (4, 4) pose at the stamp as the next scan tells it, seen from `T_world_lidar`; None where it tells none
     fault : what was wrong with the scan though it was of use; empty: nothing
     stages : seconds per stage, by name, in the order they ran
     """
@@ -75,8 +76,16 @@ class ScanResult:
     gravity: GravityDirection | None = None
     inertial: MotionState | None = None
     imu: ImuState | None = None
+    stamp_offset: NDArray[np.float64] | None = None
     fault: str = ""
     stages: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def at_stamp(self) -> ScanResult:
+        """The result with the pose that the next scan tells; for what keeps no points as `T_world_lidar` saw them."""
+        if self.stamp_offset is None:
+            return self
+        return replace(self, T_world_lidar=self.T_world_lidar @ self.stamp_offset, stamp_offset=None)
 
     @property
     def by_points(self) -> ScanResult:

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from stub_sequences import StampedInTheMiddle, Stub
+from stub_sequences import StampedAtTheEnd, StampedInTheMiddle, Stub
 
 from lslam.config import load_config
 from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
+from lslam.geometry.interpolate import poses_at
 from lslam.pipeline.run import run
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -70,6 +71,34 @@ def test_poses_are_as_good_wherever_the_stamp_lies(method: str, use_imu: bool) -
     assert turn_error_deg(late, middle) < 1.25 * turn_error_deg(early, start)
     # and the sentinel, that they do not belong to the starts, at least 3.9 times the error.
     assert turn_error_deg(late, start) > 2 * turn_error_deg(late, middle)
+
+
+def test_stamped_at_the_end_the_trajectory_is_that_of_the_starts() -> None:
+    """The same sweeps: poses at their ends lie on the trajectory of their starts, which a lone sweep would overshoot."""
+    config = load_config(None, ["input.count=16", "loops.use=false", "map.write=false"], {})
+    early, late = (run(made, config).record for made in (walked(False), StampedAtTheEnd(walked(False))))
+    assert [r.stamp_offset is None for r in late.results] == [True, *[False] * 14, True]
+    assert all(r.stamp_offset is None for r in early.results)
+    instants = early.trajectory.stamps_ns[3:-1]
+    steps = [
+        se3.relative(poses[:-1], poses[1:])
+        for poses in (
+            early.trajectory.poses[3:-1],
+            poses_at(late.trajectory.stamps_ns, late.trajectory.poses, instants),
+            poses_at(late.trajectory.stamps_ns, np.stack([r.T_world_lidar for r in late.results]), instants),
+        )
+    ]
+    m, rad = zip(*(apart(se3.relative(steps[0], other)) for other in steps[1:]), strict=True)
+    # Over seeds 0 to 4 at most 0.18 and 0.65 of what poses extrapolated by each scan alone are off.
+    assert rad[0] < 0.35 * rad[1]
+    assert m[0] < 0.8 * m[1]
+
+
+def apart(between: Floats) -> tuple[float, float]:
+    """Root mean squares of translations, m, and angles, rad, of (N, 4, 4)."""
+    squares = np.sum(between[:, :3, 3] ** 2, axis=1), so3.angle(between[:, :3, :3]) ** 2
+    m, rad = (float(np.sqrt(np.mean(square))) for square in squares)
+    return m, rad
 
 
 def test_what_is_written_belongs_to_the_middle(tmp_path: Path) -> None:
