@@ -19,15 +19,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.bag_chunks import LARGEST, Topic, damage, unpack
-from lslam.formats.bag_listing import (
-    SUFFIXES,
-    copies_among,
-    left_out,
-    list_bag_files,
-    missing_parts,
-    shown,
-    suffix_of,
-)
+from lslam.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, shown, suffix_of
 from lslam.formats.bag_records import ChunkedBag
 from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.bag_unpacking import unpacked
@@ -109,7 +101,7 @@ class Bag:
         self.losses = left_out(path, files) + missing_parts(path, files)
         self.notes: list[str] = []
         every = _recordings(files, self.notes, self.losses)
-        copies = copies_among([recording.topics for recording in every])
+        copies = _copies([recording.topics for recording in every])
         recordings = [recording for k, recording in enumerate(every) if k not in copies]
         self.losses += [recording.loss for recording in recordings if recording.loss]
         self.notes += [
@@ -196,6 +188,33 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
             f"{shown(packed)} {are} compressed as a whole: unpacked in the user's cache for as long as the recording is read"
         )
     return recordings
+
+
+def _copies(files: list[list[Topic]]) -> dict[int, int]:
+    """Which files, by their topics, hold nothing but what another one holds, and which that is; of equal ones the first stays.
+
+    A copy is made by converting, compressing, indexing or filtering: it keeps names of topics and times of recording.
+    """
+    counts = [sum(map(len, topics)) for topics in files]
+    copies: dict[int, int] = {}
+    fuller: list[int] = []
+    for k in sorted(range(len(files)), key=lambda k: -counts[k]):
+        whole = next((n for n in fuller if counts[k] and _is_within(files[k], files[n])), None)
+        if whole is None:
+            fuller.append(k)
+        else:
+            copies[k] = whole
+    return copies
+
+
+def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
+    """Whether every message is among the others, by topic and time; where one begins or ends outside, no more is compared."""
+
+    def has_all(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> bool:
+        is_around = len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1]
+        return is_around and bool(np.isin(wanted, stamps).all())
+
+    return all(any(o.name == t.name and has_all(o.stamps_ns, t.stamps_ns) for o in others) for t in topics if len(t))
 
 
 def _check_encodings(path: Path, topics: list[BagTopic]) -> None:

@@ -5,13 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from lslam.formats.bag_chunks import Topic
+from typing import Any
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
 # Endings of files that were compressed as a whole, as recorders and people do.
@@ -89,37 +83,6 @@ def parts_beside(path: Path) -> list[Path]:
         return []
     beside = (p for p in path.parent.iterdir() if suffix_of(p) and p != path and p.is_file())
     return sorted((p for p in beside if (m := _numbered(p)) and m[0] == own[0] and m[1] != own[1]), key=_natural)
-
-
-def copies_among(files: Sequence[list[Topic]]) -> dict[int, int]:
-    """Which files, by their topics, hold nothing but what another one holds, and which that is; of equal ones the first stays.
-
-    A copy is made by converting, compressing, indexing or filtering: it keeps names of topics and times of recording.
-    """
-    counts = [sum(map(len, topics)) for topics in files]
-    copies: dict[int, int] = {}
-    fuller: list[int] = []
-    for k in sorted(range(len(files)), key=lambda k: -counts[k]):
-        whole = next((n for n in fuller if counts[k] and _is_within(files[k], files[n])), None)
-        if whole is None:
-            fuller.append(k)
-        else:
-            copies[k] = whole
-    return copies
-
-
-def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
-    """Whether every message is among the others, by topic and time."""
-    return all(any(o.name == t.name and _has_all(o.stamps_ns, t.stamps_ns) for o in others) for t in topics if len(t))
-
-
-def _has_all(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> bool:
-    """Where one begins or ends outside, no more is compared."""
-    import numpy as np  # late: a name is looked up without it
-
-    return (
-        len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1] and bool(np.isin(wanted, stamps).all())
-    )
 
 
 def suffix_of(path: Path) -> str:

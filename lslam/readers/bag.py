@@ -18,7 +18,7 @@ from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
 from lslam.geometry import portable, se3
 from lslam.printable import printable
-from lslam.readers.bag_halves import Halves, read_whole
+from lslam.readers.bag_halves import Halves, put_together
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
 from lslam.readers.bag_links import Links, places_of
 from lslam.readers.bag_packets import open_packets
@@ -93,7 +93,8 @@ class BagSequence(SequenceOnDisk):
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
         """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
-        cloud, shift = read_whole(self.bag, self.topic, int(self.messages[index]), self.halves)
+        k = int(self.messages[index])
+        cloud, shift, _ = put_together(self.bag, self.topic, (k, *self.halves.get(k, ())))
         return in_metres(cloud, self.unit_m), shift
 
 

@@ -45,10 +45,20 @@ def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
     return cloud, shift if abs(shift) < 10**9 else 0
 
 
-def read_whole(bag: Bag, topic: BagTopic, k: int, halves: Halves) -> tuple[PointCloud, int]:
-    """As `read_cloud`, with what the other messages of its stamp add."""
-    cloud, shift, _ = _put_together(bag, topic, (k, *halves.get(k, ())))
-    return cloud, shift
+def put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[PointCloud, int, tuple[int, ...]]:
+    """The cloud of messages of one stamp, ns from it to the base of their times, and which messages add to the first.
+
+    Raises InputError when one is damaged.
+    """
+    cloud, shift = read_cloud(bag, topic, group[0])
+    parts = []
+    for k in group[1:]:
+        more, base = read_cloud(bag, topic, k)
+        whole = join(cloud, more, base - shift)
+        if whole is not None and len(more):
+            cloud = whole
+            parts.append(k)
+    return cloud, shift, tuple(parts)
 
 
 def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, frames: list[str], voice: Voice) -> Halves:
@@ -66,7 +76,7 @@ def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, fra
     for n in np.unique(np.linspace(0, len(groups) - 1, min(len(groups), _LOOKED_AT)).round().astype(int)).tolist():
         parts[n] = ()
         with suppress(InputError):
-            parts[n] = _put_together(bag, topic, groups[n])[2]
+            parts[n] = put_together(bag, topic, groups[n])[2]
     if not any(parts.values()):
         return {}
     halves = {group[0]: others for n, group in enumerate(groups) if (others := parts.get(n, group[1:]))}
@@ -94,30 +104,16 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
     if a.times is not None and b.times is not None and _when(b.times)[1] < _when(a.times)[1]:
         first, last = b, a
     of_last = {clock.name: clock.values for clock in last.clocks}
-    return replace(
-        first,
-        points=np.concatenate([first.points, last.points]),
-        intensity=_both(first.intensity, last.intensity),
-        rings=_both(first.rings, last.rings),
-        clocks=tuple(
-            replace(clock, values=np.concatenate([clock.values, of_last[clock.name]]))
-            for clock in first.clocks
-            if clock.name in of_last
-        ),
+    clocks = (
+        replace(clock, values=np.concatenate([clock.values, of_last[clock.name]]))
+        for clock in first.clocks
+        if clock.name in of_last
     )
-
-
-def _put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[PointCloud, int, tuple[int, ...]]:
-    """The cloud of messages of one stamp, ns from it to the base of their times, and which messages add to the first."""
-    cloud, shift = read_cloud(bag, topic, group[0])
-    parts = []
-    for k in group[1:]:
-        more, base = read_cloud(bag, topic, k)
-        whole = join(cloud, more, base - shift)
-        if whole is not None and len(more):
-            cloud = whole
-            parts.append(k)
-    return cloud, shift, tuple(parts)
+    columns = {name: (getattr(first, name), getattr(last, name)) for name in ("points", "intensity", "rings")}
+    joined: dict[str, Any] = {
+        name: None if x is None or y is None else np.concatenate([x, y]) for name, (x, y) in columns.items()
+    }
+    return replace(first, clocks=tuple(clocks), **joined)
 
 
 def _moved(cloud: PointCloud, later_ns: int) -> PointCloud:
@@ -154,7 +150,3 @@ def _when(times: NDArray[Any]) -> tuple[float, float, float]:
     values = values[np.isfinite(values)]
     begin, middle, end = np.percentile(values, (1, 50, 99)) if len(values) else (0.0, 0.0, 0.0)
     return float(begin), float(middle), float(end)
-
-
-def _both(a: NDArray[Any] | None, b: NDArray[Any] | None) -> NDArray[Any] | None:
-    return None if a is None or b is None else np.concatenate([a, b])

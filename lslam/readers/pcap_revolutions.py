@@ -26,29 +26,23 @@ class Packets(Protocol):
     @property
     def stamps_ns(self) -> Integers:
         """(N,) when each arrived."""
-        ...
 
     @property
     def sizes(self) -> Integers:
         """(N,) bytes."""
-        ...
 
     @property
     def sources(self) -> Integers:
         """(N,) whose they are."""
-        ...
 
     def __len__(self) -> int:
         """Number of packets."""
-        ...
 
     def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
         """(K, P) the bytes at `positions` of the packets `which`, which are so long."""
-        ...
 
     def payloads(self, which: Integers) -> NDArray[np.uint8]:
         """(K, size) the packets `which`, which are of one size."""
-        ...
 
 
 class Revolutions(Protocol):
@@ -57,11 +51,9 @@ class Revolutions(Protocol):
     @property
     def stamps_ns(self) -> Integers:
         """(N,) when the first point of each was measured."""
-        ...
 
     def read(self, index: int) -> tuple[PointCloud, Integers]:
         """Points of revolution `index` in the order they were measured, and when each was, ns."""
-        ...
 
 
 @dataclass(frozen=True)
