@@ -60,24 +60,22 @@ class BagTopic:
     def __len__(self) -> int:
         return sum(len(topic) for _, topic in self.parts)
 
-    @cached_property
+    @property
     def stamps_ns(self) -> NDArray[np.int64]:
         """(N,) when each message was recorded."""
-        return np.concatenate([topic.stamps_ns for _, topic in self.parts])[self._order]
+        return np.asarray(self._rows[0], np.int64)
 
     def place(self, k: int) -> tuple[Recording, Topic, int]:
         """Where message `k` lies, and its number there. Raises IndexError beyond the last."""
-        k = int(self._order[k])
-        for recording, topic in self.parts:
-            if k < len(topic):
-                return recording, topic, k
-            k -= len(topic)
-        raise IndexError(k)
+        _, part, row = self._rows[:, k].tolist()
+        return *self.parts[part], row
 
     @cached_property
-    def _order(self) -> NDArray[np.int64]:
-        """(N,) the messages, counted one part after the other, by their times."""
-        return np.argsort(np.concatenate([topic.stamps_ns for _, topic in self.parts]), kind="stable")
+    def _rows(self) -> NDArray[np.int64]:
+        """(3, N) when each message was recorded, its part and its number there."""
+        tables = [(t.stamps_ns, np.full(len(t), n), np.arange(len(t))) for n, (_, t) in enumerate(self.parts)]
+        rows = np.concatenate([np.stack(table) for table in tables], axis=1)
+        return rows[:, np.argsort(rows[0], kind="stable")]
 
 
 class Header(NamedTuple):

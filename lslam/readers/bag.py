@@ -15,7 +15,7 @@ from lslam.formats.bag_listing import list_bag_files, parts_beside, shown, stem_
 from lslam.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.formats.packet_messages import is_decoded
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
-from lslam.formats.sequence_toml import FILE_NAME, LENGTHS, SequenceInfo, parse_sequence_toml, read_sequence_toml
+from lslam.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
 from lslam.geometry import portable, se3
 from lslam.printable import printable
 from lslam.readers.bag_halves import Halves, put_together
@@ -41,11 +41,11 @@ from lslam.readers.point_stamps import onto_recording, point_stamps, points_off,
 from lslam.readers.point_times import Sample
 from lslam.readers.point_units import in_metres, settle_unit
 from lslam.readers.sequence_on_disk import SequenceOnDisk
-from lslam.readers.sidecars import compensation_note, stated_times
+from lslam.readers.sidecars import calibration_over, compensation_note, read_info, stated_times
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Sequence, no_shared_time
+from lslam.types.sequence import Calibration, Sequence
 from lslam.types.trajectory import Trajectory
 
 KIND = "bag"
@@ -138,25 +138,22 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
         check_parts(bag, topic)
         lidars += _lidars_of(bag, topic, info, voice, bool(lidars))
     (leading, sequence, opened), frame = lidars[0], lidars[0][0].frame
-    stamps, own = sequence.stamps_ns, opened if info.imu_topic is None else None
+    own = opened if info.imu_topic is None else None
     imu = load_companion(bag, IMU, info.imu_topic, voice) if own is None or own.imu is None else None
     gnss = load_companion(bag, GNSS, info.gnss_topic, voice)
-    for what, stream in (("IMU", imu), ("GNSS", gnss)):
-        if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
-            voice.problems.append(no_shared_time(what))
-    links = Links(bag, voice)
-    sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(links, frame, imu, gnss, info, voice)
-    sequence.ground_truth = find_truth(bag, links, frame, voice)
     if imu is not None:
         sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())
     if gnss is not None:
         sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
+    voice.problems += sequence.streams_apart()
+    links = Links(bag, voice)
+    sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(links, frame, imu, gnss, info, voice)
+    sequence.ground_truth = find_truth(bag, links, frame, voice)
     if own is not None and own.imu is not None:
         if left_out := [t.name for t in bag.of_type("Imu")]:
             voice.notes.append(f"IMU from the sensor's packets: {', '.join(left_out)} left out; --imu-topic reads one")
         sequence.imu = own.imu
-        T_lidar_imu = own.T_lidar_imu if info.T_lidar_imu is None else info.T_lidar_imu
-        sequence.calibration = replace(sequence.calibration, T_lidar_imu=T_lidar_imu)
+        sequence.calibration = calibration_over(info, replace(sequence.calibration, T_lidar_imu=own.T_lidar_imu))
     places = places_of([index for index, _, _ in lidars], links, info.lidars)
     sequence.uses = _uses(sequence, imu, gnss, links) | {index.topic.name: "scans" for index, _, _ in lidars}
     if not places:
@@ -230,8 +227,7 @@ def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links:
 
 def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
     """What the user says, over a `sequence.toml` beside the bag, over what the bag says itself."""
-    beside = (path if path.is_dir() else path.parent) / FILE_NAME
-    said = overrides.over(read_sequence_toml(beside)) if beside.is_file() else overrides
+    said, _ = read_info(path if path.is_dir() else path.parent, overrides)
     text = bag_streams.read_text(bag, INFO_TOPIC)
     return said if text is None else said.over(parse_sequence_toml(text, f"{path}, {INFO_TOPIC}"))
 
@@ -274,8 +270,8 @@ def find_extrinsics(
 
     lidar : the frame of the scans
     """
-    T_cam0_lidar = chain(links.static, CAMERA, lidar) if info.T_cam0_lidar is None else info.T_cam0_lidar
-    T_lidar_imu, T_lidar_gnss = info.T_lidar_imu, info.T_lidar_gnss
+    found = calibration_over(info, Calibration(T_cam0_lidar=chain(links.static, CAMERA, lidar)))
+    T_lidar_imu, T_lidar_gnss = found.T_lidar_imu, found.T_lidar_gnss
     is_assumed = False
     if imu is not None and T_lidar_imu is None:
         T_lidar_imu = _find(links, lidar, imu.frame, "IMU", voice)
@@ -289,7 +285,7 @@ def find_extrinsics(
         T_lidar_gnss = _find(links, lidar, gnss.frame, "GNSS", voice)
         if T_lidar_gnss is None:
             voice.notes.append(f"extrinsics: {links.why_not(lidar, gnss.frame)}: the place of the antenna is unknown")
-    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_gnss), is_assumed
+    return replace(found, T_lidar_imu=T_lidar_imu, T_lidar_gnss=T_lidar_gnss), is_assumed
 
 
 def truth_topics(bag: Bag) -> list[BagTopic]:

@@ -23,7 +23,7 @@ from lslam.readers.pcap_velodyne import open_velodyne
 from lslam.readers.sequence_on_disk import SequenceOnDisk
 from lslam.readers.sidecars import calibration_over, compensation_note, load_streams, read_info, stated_times
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, no_shared_time
+from lslam.types.sequence import Calibration
 
 KIND = "pcap"
 _PACKET_BYTES, _LOOKED_AT = 200, 20  # LiDAR packets are larger; so many tell whose they are
@@ -85,10 +85,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
         )
         sequence.calibration = calibration_over(info, Calibration(T_lidar_imu=np.eye(4)))
         sequence.has_assumed_extrinsics = True
-    stamps = sequence.stamps_ns
-    for what, stream in (("IMU", sequence.imu), ("GNSS", sequence.gnss)):
-        if stream is not None and (stream.stamps_ns[0] > stamps[-1] or stream.stamps_ns[-1] < stamps[0]):
-            voice.problems.append(no_shared_time(what))
+    voice.problems += sequence.streams_apart()
     return sequence
 
 

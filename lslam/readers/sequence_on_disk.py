@@ -13,7 +13,7 @@ from lslam.readers.point_clock import PointClock
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans, StatedTimes
+from lslam.types.sequence import Calibration, Scans, StatedTimes, no_shared_time
 from lslam.types.trajectory import Trajectory
 
 
@@ -57,6 +57,12 @@ class SequenceOnDisk(Scans):
         if not 0 <= index < len(self):
             raise IndexError(f"scan {index} of {len(self)}")
         return self._read(index)
+
+    def streams_apart(self) -> list[str]:
+        """What is to be said of the IMU and of fixes that lie wholly before or after the scans."""
+        own, streams = self.stamps_ns, {"IMU": self.imu, "GNSS": self.gnss}
+        stamps = {name: stream.stamps_ns for name, stream in streams.items() if stream is not None}
+        return [no_shared_time(name) for name, its in stamps.items() if its[0] > own[-1] or its[-1] < own[0]]
 
     @abstractmethod
     def _read(self, index: int) -> Scan:
