@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.readers.point_clock import PointClock
+from lslam.readers.point_times import TimeRule
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
@@ -48,6 +49,11 @@ class SequenceOnDisk(Scans):
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    @property
+    def time_rule(self) -> TimeRule | None:
+        """How per-point times are meant; None where `clock` is."""
+        return None if self.clock is None else self.clock.rule
 
     def scan(self, index: int) -> Scan:
         """Read scan `index`; a file or message without points gives an empty scan.

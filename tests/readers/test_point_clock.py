@@ -12,6 +12,7 @@ from bag_builders import START_NS, STEP_NS, bag, raw_cloud
 from numpy.typing import NDArray
 
 from lslam.convert.bag_writer import BagWriter
+from lslam.formats.point_files import write_bin
 from lslam.frontend.register_scans import sweep_of
 from lslam.readers import open_sequence
 from lslam.types.sequence import Sequence
@@ -111,6 +112,16 @@ def test_a_low_word_that_wraps_within_a_scan_is_read_on(tmp_path: Path) -> None:
         assert scan.times is not None
         np.testing.assert_allclose(scan.times, SECONDS, atol=1e-6)
         assert bool(scan.fault) == (k == 7)
+
+
+@pytest.mark.parametrize(("kind", "unit", "ns"), [("<u4", 1e-9, 1), ("<f4", 1e-3, 1e6)])
+def test_a_sequence_says_by_which_rule_it_reads_times(kind: str, unit: float, ns: float, tmp_path: Path) -> None:
+    rule = recording(tmp_path, lambda k: sweep(kind, unit), 3).time_rule  # type: ignore[attr-defined]
+    assert (rule.field, rule.ns_per_unit, rule.is_absolute) == ("time", ns, False)
+    assert rule.sweep_s == pytest.approx(0.0999, rel=1e-3)
+    (tmp_path / "scans").mkdir()
+    write_bin(tmp_path / "scans" / "0.bin", np.ones((9, 3)))
+    assert open_sequence(tmp_path / "scans").time_rule is None  # type: ignore[attr-defined]
 
 
 def _with(rows: Rows, **columns: Any) -> Rows:
