@@ -27,7 +27,7 @@ from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
-from lslam.readers.merged_lidars import MergedLidars
+from lslam.preprocessing.merged_lidars import MergedLidars
 from lslam.types.scan import Scan
 from lslam.types.sequence import Calibration, Sequence
 from lslam.types.trajectory import Trajectory

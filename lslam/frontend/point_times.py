@@ -17,9 +17,9 @@ from lslam.kernels import jit
 from lslam.locks import one_at_a_time
 from lslam.odometry import create_odometry
 from lslam.preprocessing.clock_proposals import Proposal, azimuth_proposal, columns_clock, order_clock, propose_clock
+from lslam.preprocessing.merged_lidars import MergedLidars
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.preprocessing.views import Clocked
-from lslam.readers.merged_lidars import MergedLidars
 from lslam.types.scan import Scan
 from lslam.types.selection import SequenceView, select
 from lslam.types.sequence import Sequence, StatedTimes

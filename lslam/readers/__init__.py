@@ -100,10 +100,23 @@ def open_sequence(
     sequence = with_streams(sequence, imu, gnss, data_root)
     if sequence.kind == "bag" or sequence.kind not in READERS:
         return sequence
-    from lslam.readers.merged_lidars import with_folders
+    return _merged(sequence, overrides)
 
-    of_all = SequenceInfo(motion_compensated=motion_compensated)
-    return with_folders(sequence, overrides, lambda path: _open(path, of_all))
+
+def _merged(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
+    """With the LiDARs that the table `lidars` of its `sequence.toml` names. Raises InputError when one of them is not there."""
+    from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
+    from lslam.preprocessing.merged_lidars import FurtherLidar, MergedLidars
+    from lslam.readers.sidecars import read_info
+
+    folder = sequence.path if sequence.path.is_dir() else sequence.path.parent
+    of_all = SequenceInfo(motion_compensated=overrides.motion_compensated)
+    others = []
+    for name, T in (read_info(folder, overrides)[0].lidars or {}).items():
+        if not (folder / name).exists():
+            raise InputError(f"{folder / name}, named by lidars of {folder / FILE_NAME}, does not exist")
+        others.append(FurtherLidar(name, _open(folder / name, of_all), T))
+    return MergedLidars(sequence, others) if others else sequence
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:

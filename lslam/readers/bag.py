@@ -17,6 +17,7 @@ from lslam.formats.packet_messages import is_decoded
 from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
 from lslam.geometry import portable, se3
+from lslam.preprocessing.merged_lidars import FurtherLidar, MergedLidars
 from lslam.printable import printable
 from lslam.readers.bag_halves import Halves, put_together
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
@@ -34,7 +35,6 @@ from lslam.readers.bag_topics import (
 )
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
-from lslam.readers.merged_lidars import FurtherLidar, MergedLidars
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
 from lslam.readers.point_clock import open_clock, read_samples
 from lslam.readers.point_stamps import onto_recording, point_stamps, points_off, step_against

@@ -18,8 +18,8 @@ from lslam.frontend.clock_changes import later_choices
 from lslam.frontend.clock_choice import ClockChoice
 from lslam.frontend.point_times import with_point_times
 from lslam.preprocessing.clock_proposals import Proposal
+from lslam.preprocessing.merged_lidars import MergedLidars
 from lslam.preprocessing.sweep_clock import SweepClock
-from lslam.readers.merged_lidars import MergedLidars
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan import Scan

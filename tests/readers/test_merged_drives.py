@@ -12,7 +12,7 @@ from two_lidars import WAYS, merged, two_lidars
 
 import lslam
 from lslam.config import load_config
-from lslam.readers.merged_lidars import RINGS_APART
+from lslam.preprocessing.merged_lidars import RINGS_APART
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.sequence import Sequence
 

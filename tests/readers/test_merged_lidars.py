@@ -24,9 +24,9 @@ from lslam.formats.kitti_layout import write_scan, write_times
 from lslam.frontend.point_times import with_point_times
 from lslam.geometry import se3
 from lslam.pipeline.resume import input_digest
+from lslam.preprocessing.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
 from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
-from lslam.readers.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
 from lslam.types.scan import Scan
 from lslam.types.selection import select
 from lslam.types.sequence import Sequence, StatedTimes

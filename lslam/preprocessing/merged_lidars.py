@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +12,10 @@ from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
-from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.preprocessing.views import with_rings
-from lslam.readers.sidecars import read_info
 from lslam.types.scan import NO_RING, Scan, Span
 from lslam.types.selection import SequenceView
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, readable
 
 # More than any LiDAR has: the rings of the k-th one begin at k times this.
 RINGS_APART = 512
@@ -138,23 +134,6 @@ class MergedLidars(SequenceView):
             self.problems.append(f"{name}: no per-point times: its points are taken to be of their scan's stamp")
 
 
-def with_folders(sequence: Sequence, overrides: SequenceInfo, open_: Callable[[Path], Sequence]) -> Sequence:
-    """`sequence` merged with the LiDARs that the table `lidars` of its `sequence.toml` names, folders or files opened by `open_`.
-
-    Raises InputError when one of them is not there.
-    """
-    folder = sequence.path if sequence.path.is_dir() else sequence.path.parent
-    lidars = read_info(folder, overrides)[0].lidars
-    if not lidars:
-        return sequence
-    others = []
-    for name, T in lidars.items():
-        if not (folder / name).exists():
-            raise InputError(f"{folder / name}, named by lidars of {folder / FILE_NAME}, does not exist")
-        others.append(FurtherLidar(name, open_(folder / name), T))
-    return MergedLidars(sequence, others)
-
-
 def _source(lidar: FurtherLidar, middle_ns: int) -> _Reading:
     """When each of its scans begins and ends.
 
@@ -171,15 +150,9 @@ def _source(lidar: FurtherLidar, middle_ns: int) -> _Reading:
 
 def _sweep_of(sequence: Sequence) -> Span | None:
     """When sweeps begin and end, from the first scans that have points, None when these have no times."""
-    spans: list[Span] = []
-    for index in range(min(len(sequence), _LOOKED_AT)):
-        with suppress(InputError):
-            scan = sequence.scan(index)
-            if len(scan) and scan.times is not None:
-                spans.append(scan.span)
-    if not spans:
-        return None
-    return Span(float(np.median([s.begin_s for s in spans])), float(np.median([s.end_s for s in spans])))
+    first = readable(range(min(len(sequence), _LOOKED_AT)), sequence.scan)
+    spans = [scan.span for _, scan in first if scan.times is not None]
+    return Span(*np.median(spans, axis=0).tolist()) if spans else None
 
 
 def _period_ns(sequence: Sequence) -> int:
