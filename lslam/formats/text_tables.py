@@ -63,7 +63,7 @@ class TextTable:
         return values
 
     def lost_rows(self, values: NDArray[np.float64], what: str) -> NDArray[np.bool_]:
-        """Where `values` (N, K) of poses hold NaN, which are `what` there.
+        """Where `values` (N, K) of poses hold NaN, which messages call `what`.
 
         Raises InputError when that is everywhere, and with the line of one that is infinite.
         """
