@@ -19,6 +19,7 @@ from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError
 from lslam.frontend.register_scans import sweep_of
 from lslam.readers import open_sequence
+from lslam.readers.point_times import TimeRule
 from lslam.types.scan import Scan, Span
 from lslam.types.sequence import Sequence
 
@@ -140,6 +141,13 @@ def test_a_clock_that_starts_with_the_recording_is_a_clock(tmp_path: Path, field
         assert scan.times is not None
         assert abs(scan.stamp_ns - headers[k]) <= 1000
         np.testing.assert_allclose(scan.times, SECONDS, atol=1e-6)
+
+
+def test_a_sequence_tells_how_its_times_are_meant(tmp_path: Path) -> None:
+    rows = table([*XYZI, ("ring", "<u2"), ("t", "<u4")], ring=RING, t=NS)
+    rule = getattr(opened(tmp_path, rows), "time_rule", None)
+    assert isinstance(rule, TimeRule)
+    assert (rule.field, rule.ns_per_unit, rule.is_absolute, rule.is_before_stamp) == ("t", 1.0, False, False)
 
 
 def test_missing_times_are_noted(tmp_path: Path) -> None:
