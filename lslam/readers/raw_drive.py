@@ -41,7 +41,7 @@ def with_streams(sequence: Sequence, imu: bool, gnss: bool, data_root: Path | No
 def with_imu(sequence: Sequence, data_root: Path | None = None) -> Sequence:
     """The sequence with an IMU: its own, else, for a KITTI odometry sequence, that of its raw drive.
 
-    The drive is looked for below `data_root`, LSLAM_DATA, the current folder and those the sequence lies in, as
+    The drive is looked for below `data_root`, LSLAM_DATA, the current folder, that of the sequence and those it lies in, as
     `raw/<date>/<drive>_extract` (100 Hz) or `_sync` (10 Hz), with or without `raw` and `<date>`, with
     `calib_imu_to_velo.txt` beside it.
 
@@ -83,7 +83,7 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
         raise why_none(sequence.bag, kind)  # type: ignore[attr-defined]
     date, number, first = DRIVES[sequence_number(sequence.path.name)]
     roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
-    places = dict.fromkeys([*roots, *list(sequence.path.parents)[: 1 + _UPWARDS], Path.cwd()])
+    places = dict.fromkeys([*roots, sequence.path, *list(sequence.path.parents)[: 1 + _UPWARDS], Path.cwd()])
     folders = [
         place / above / day / f"{date}_drive_{number:04d}_{kind}"
         for kind in ("extract", "sync")
