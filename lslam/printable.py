@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from collections.abc import Sequence
 from typing import Any
 
 # Bytes of a name: a disk takes 255 with all that is put behind it.
 _LONGEST = 120
+_SHOWN = 8  # names in a sentence
 
 
 def printable(text: str) -> str:
@@ -92,3 +94,12 @@ def lasting(seconds: float) -> str:
 def counted(number: int, noun: str) -> str:
     """A number with its noun, in the plural unless it is one."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
+
+
+def shown(names: Sequence[object]) -> str:
+    """The first of many, with commas between them.
+
+    >>> shown([1, 2]), shown(range(20))
+    ('1, 2', '0, 1, 2, 3, 4, 5, 6, 7 and 12 more')
+    """
+    return ", ".join(map(str, names[:_SHOWN])) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from lslam.printable import shown
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
 # Endings of files that were compressed as a whole, as recorders and people do.
@@ -13,7 +14,6 @@ PACKED = {".zstd": "zstd", ".zst": "zstd", ".lz4": "lz4", ".gz": "gz", ".bz2": "
 # Captures of the packets of a sensor.
 CAPTURES = (".pcap", ".pcapng")
 METADATA = "metadata.yaml"
-_SHOWN = 8  # names in a sentence
 # Recorders of ROS 1 put the time at which a part begins before its number.
 _TIME = re.compile(r"\d{4}([-_]\d\d){5}")
 _NUMBER = re.compile(r"(?:(.*?)[_-])?(\d{1,4})$")
@@ -99,16 +99,6 @@ def packing_of(path: Path) -> str:
 def stem_of(path: Path) -> str:
     """The name without what makes it a bag and without what says that it is compressed."""
     return _unpacked(path.name)[: -len(suffix_of(path)) or None]
-
-
-def shown(names: Sequence[object]) -> str:
-    """The first of many, with commas between them.
-
-    >>> shown([1, 2]), shown(range(20))
-    ('1, 2', '0, 1, 2, 3, 4, 5, 6, 7 and 12 more')
-    """
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(map(str, names[:_SHOWN])) + more
 
 
 def _unpacked(name: str) -> str:

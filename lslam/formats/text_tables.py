@@ -128,15 +128,6 @@ def looks_like_header(line: str) -> bool:
     return is_name and not np.isfinite([_number(cell) for cell in cells]).any()
 
 
-def shortened(names: list[str]) -> str:
-    """The names between commas, no more than six of them.
-
-    >>> shortened(list("abcdefgh"))
-    'a, b, c, d, e, f and 2 more'
-    """
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-
-
 def separator_of(text: str) -> str | None:
     """What stands between the cells of a line: a semicolon, a tab, a comma, else blanks (None)."""
     return next((s for s in (";", "\t", ",") if s in text), None)

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
-from lslam.formats.text_tables import TextTable, looks_like_header, shortened
+from lslam.formats.text_tables import TextTable, looks_like_header
 from lslam.formats.time_columns import find_clock
 from lslam.formats.trajectory_columns import named_columns, placed_columns
 from lslam.geometry import se3, so3
+from lslam.printable import shown
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -102,7 +103,7 @@ def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, fra
     left_out = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns)]
     if left_out:
         hint = "" if len(columns) > 3 else "; rotations are read as quaternions (qx, qy, qz, qw)"
-        notes.append(f"left out: {shortened(left_out)}{hint}")
+        notes.append(f"left out: {shown(left_out)}{hint}")
     notes += [*rotation_notes, *filter(None, [clock.note])]
     if lost.any():
         notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")

@@ -15,7 +15,7 @@ from lslam.config import Config
 from lslam.errors import GateError, InputError, OutputExistsError, RunFailedError, RunFinishedError, cause
 from lslam.osm.source import extract_digest
 from lslam.pipeline.run_folder import MANIFEST
-from lslam.printable import printable_tree
+from lslam.printable import printable_tree, shown
 from lslam.remote import RemotePath
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -180,7 +180,7 @@ def _difference(
     changed = [key for key in sorted(before | now) if before.get(key) != now.get(key) and key not in FREE]
     unknown = set(_flat(printable_tree(Config().model_dump(mode="json")))) - set(before)
     if changed and set(changed) <= unknown:
-        return f"it was begun by an earlier lslam, which had no {', '.join(changed)}"
+        return f"it was begun by an earlier lslam, which had no {shown(changed)}"
     if changed:
         said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
         return f"the configuration differs: {', '.join(said)}{', ...' if len(changed) > 3 else ''}"

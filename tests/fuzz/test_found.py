@@ -123,3 +123,11 @@ def test_a_manifest_whose_problems_are_none(tmp_path: Path, problems: bytes) -> 
     lay_out(tmp_path, good | {"manifest.json": manifest})
     with pytest.raises(LslamError, match="finished"):
         BY_NAME["run folder"].read(tmp_path)
+
+
+def test_many_keys_that_a_configuration_lacks_are_some_in_a_sentence(tmp_path: Path) -> None:
+    good = BY_NAME["run folder"].corpus(tmp_path / "corpus")[0]
+    lay_out(tmp_path, good | {"config.toml": good["config.toml"][:60]})
+    with pytest.raises(LslamError, match=r"an earlier lslam, which had no \S+, .* and \d+ more;") as caught:
+        BY_NAME["run folder"].read(tmp_path)
+    assert len(str(caught.value)) < 500

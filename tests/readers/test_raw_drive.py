@@ -94,7 +94,13 @@ def test_the_faster_extract_drive_is_preferred_and_timed_by_the_camera(tmp_path:
     assert sequence.imu.stamps_ns[75] == sequence.stamps_ns[0], "0.75 s after the first of 100 Hz"
 
 
-PLACES = {"inside": "seq07", "beside": "", "by its day": "2011_09_30", "under raw": "raw", "under raw by its day": "raw/2011_09_30"}
+PLACES = {
+    "inside": "seq07",
+    "beside": "",
+    "by its day": "2011_09_30",
+    "under raw": "raw",
+    "under raw by its day": "raw/2011_09_30",
+}
 
 
 @pytest.mark.parametrize("place", PLACES)
