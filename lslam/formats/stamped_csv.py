@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.formats.text_tables import read_table
-from lslam.formats.time_columns import find_clock
+from lslam.formats.time_columns import find_clock, unread_columns
 from lslam.printable import shown
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -55,7 +55,7 @@ def read_stamped_csv(
         raise InputError(f"{path}, line 1: no column {', '.join(missing)}; the file has {header}")
     values = np.full((len(table.rows), len(where)), np.nan)
     values[:, [k is not None for k in where]] = table.values(columns_read)
-    rest = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns_read)]
+    rest = unread_columns(table, clock.columns.union(columns_read))
     for note in filter(None, [clock.note, rest and f"columns left out: {shown(rest)}"]):
         log.info("%s: %s", path, note)
     return clock.stamps_ns, values

@@ -113,6 +113,12 @@ def is_index(values: Floats) -> bool:
     return is_count and float(np.mean(steps == 1)) > 0.5
 
 
+def unread_columns(table: TextTable, columns: Collection[int]) -> list[str]:
+    """Names of the columns that are none of `columns` and do not just count the rows."""
+    others = [k for k, name in enumerate(table.names) if name and k not in columns]
+    return [table.names[k] for k in others if not is_index(table.numbers(k))]
+
+
 def is_fraction(whole: Floats, rest: Floats, unit_ns: int | None = None) -> bool:
     """Whether `rest` (N,), in a unit that its name states, is the fraction of the whole seconds `whole` (N,).
 

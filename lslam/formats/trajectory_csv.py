@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.formats.text_tables import TextTable, looks_like_header
-from lslam.formats.time_columns import find_clock
+from lslam.formats.time_columns import find_clock, unread_columns
 from lslam.formats.trajectory_columns import named_columns, placed_columns
 from lslam.geometry import se3, so3
 from lslam.printable import shown
@@ -100,7 +100,7 @@ def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, fra
         raise InputError(f"{path}: no column is a time in the header {', '.join(table.names)}; name it t, or stamp_ns")
     table.check_increasing(clock.stamps_ns)
     poses, has_rotations, rotation_notes = poses_of(values, table)
-    left_out = [name for k, name in enumerate(table.names) if name and k not in clock.columns.union(columns)]
+    left_out = unread_columns(table, clock.columns.union(columns))
     if left_out:
         hint = "" if len(columns) > 3 else "; rotations are read as quaternions (qx, qy, qz, qw)"
         notes.append(f"left out: {shown(left_out)}{hint}")
