@@ -40,12 +40,13 @@ def stamps_in_names(files: list[Path]) -> NameStamps | None:
     all names count.
     """
     stems = [path.stem for path in files]
-    shapes = {re.sub(r"\d+", "#", stem) for stem in stems}
+    # No name holds a zero byte.
+    shapes = {re.sub(r"\d+", "\0", stem) for stem in stems}
     readings = list(_dates(stems))
     if len(shapes) == 1:
         shape = shapes.pop()
         groups = [list(column) for column in zip(*(re.findall(r"\d+", stem) for stem in stems), strict=True)]
-        readings += [*_pairs(groups, shape.split("#")[1:-1]), *_numbers(groups)]
+        readings += [*_pairs(groups, shape.split("\0")[1:-1]), *_numbers(groups)]
     for stamps, words in readings:
         if len(np.unique(stamps)) == len(stamps):
             return NameStamps(np.array(stamps, np.int64), words)

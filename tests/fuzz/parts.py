@@ -10,7 +10,7 @@ import lz4.frame
 import numpy as np
 from fuzz.cases import Files, Parser
 from fuzz.sequences import read_sequence
-from readers.bag_builders import START_NS, STEP_NS, Fill, bag, clouds, imu, scan, together
+from readers.bag_builders import START_NS, STEP_NS, Fill, bag, clouds, imu, scan, together, transforms
 from readers.packet_builders import ouster_packets, velodyne_scans
 from readers.pcap_builders import OusterSpec, ouster, ouster_imu, velodyne
 
@@ -83,10 +83,23 @@ def _halves(folder: Path) -> list[Files]:
     return [{"a.bag": bag(folder / "a.bag", together(fill, imu(8))).read_bytes()}]
 
 
+def _two(folder: Path) -> list[Files]:
+    """Two LiDARs on one topic, and an odd name of the further one in sequence.toml."""
+    links = transforms({("front", "rear"): np.eye(4)})
+    fill = together(links, clouds(3, frame="front", n=40), clouds(3, frame="rear", n=40))
+    data = bag(folder / "a.mcap", fill, "mcap").read_bytes()
+    bare = bag(
+        folder / "b.mcap", together(clouds(3, frame="front", n=40), clouds(3, frame="rear", n=40)), "mcap"
+    ).read_bytes()
+    toml = b"[lidars]\nrear = [1, 0, 0, 2, 0, 1, 0, 0, 0, 0, 1, 0]\n"
+    return [{"a.mcap": data}, {"a.mcap": bare, "sequence.toml": toml}, {"a.mcap": bare}]
+
+
 PARSERS = [
     Parser("parts of a recording", read_sequence, _parts),
     Parser("bag, gz", lambda folder: read_sequence(folder / "a.bag.gz"), _packed),
     Parser("Velodyne packets, bag", lambda folder: read_sequence(folder / "a.bag"), _velodyne),
     Parser("Ouster packets, MCAP", lambda folder: read_sequence(folder / "a.mcap"), _ouster, trees=("a.json",)),
+    Parser("two LiDARs, MCAP", lambda folder: read_sequence(folder / "a.mcap", lidar_frame="all"), _two),
     Parser("halves and /tf, bag", lambda folder: read_sequence(folder / "a.bag"), _halves),
 ]

@@ -22,9 +22,9 @@ from lslam.readers import open_sequence
 _SCANS = 3
 
 
-def read_sequence(path: Path) -> None:
+def read_sequence(path: Path, lidar_frame: str | None = None) -> None:
     """Open it and read all its scans; a scan that is refused does not end it."""
-    sequence = open_sequence(path)
+    sequence = open_sequence(path, lidar_frame=lidar_frame)
     refused: list[InputError] = []
     for k in range(len(sequence)):
         try:

@@ -30,6 +30,7 @@ from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
+from lslam.readers.name_stamps import stamps_in_names
 from lslam.simulation.osm_perturb import read_perturbation
 from lslam.simulation.record import read_mark
 from lslam.simulation.scenario_files import scenario_named
@@ -51,6 +52,14 @@ def _text_parser(name: str, file: str, read: Callable[[Path], object], *texts: s
         name, lambda folder: read(folder / file), lambda _: [{file: data} for data in contents],
         trees=(file,) if is_tree else (), tables=() if is_tree else (file,),
     )  # fmt: skip
+
+
+def _read_names(path: Path) -> None:
+    """What the names of files say of their times; a name that no disk takes is none."""
+    lines = path.read_text(errors="replace").splitlines()
+    names = [Path(f"{line}.bin") for line in lines if line.strip("/.") and "\0" not in line and len(line) < 250]
+    if names:
+        stamps_in_names(names)
 
 
 _TUM = "# frame: lidar\n" + "".join(f"{1.5 + k / 10} {k} 0 0 0 0 0 1\n" for k in range(5))
@@ -223,6 +232,16 @@ _OF_TOOLS = (
     "sec;nsec;x;y;z\n7;100000000;1,5;2,5;3\n7;200000000;1,5;2,5;3\n8;1;0;0;0\n",
     "1 1 0 0 5 0 1 0 6 0 0 1 7\n4 1 0 0 5 0 1 0 6 0 0 1 8\n",
     "0 7.5 0 0 0 0 0 0 1\n1 7.6 1 0 0 0 0 0 1\n2 7.7 2 1 0 0 0 0 1\n",
+    "1670403902235281229,1,0,0,5,0,1,0,6,0,0,1,7\n1670403902335281229,1,0,0,5,0,1,0,6,0,0,1,8\n",
+    "GPSTime,easting,northing,altitude,vel_east,vel_north,vel_up\n7.1,1,2,3,4,5,6\n7.2,2,2,3,4,5,6\n7.4,3,3,3,4,5,6\n",
+)
+_NAMES = (
+    "1618033.5\n1618033.6\n1618033.8\n",
+    "a_1670403902.235281229\na_1670403902.35281229\n",
+    "000_1670403902235\n001_1670403902335\n",
+    "2023-11-14T22-13-20.123\n2023-11-14T22-13-20.223\n",
+    "1000000000000\n1000100000000\n1000200000000\n",
+    "000000\n000001\n",
 )
 PARSERS = [
     _text_parser("trajectory", "a.txt", read_trajectory, _TUM, _EUROC, _CSV, _KITTI),
@@ -232,6 +251,7 @@ PARSERS = [
                  "stamp\n1670403902235281229\n1670403902335281229\n"),
     _text_parser("stamps in columns", "stamps.csv", read_stamps, "#sec,nsec\n7,100000000\n7,300000000\n8,1\n",
                  "0 1670403902.2\n1 1670403902.3\n2 1670403902.4\n"),
+    _text_parser("names of scans", "names.txt", _read_names, *_NAMES),
     _text_parser("imu.csv", "imu.csv", read_imu_csv, _IMU, "sec,nanosec," + _IMU.split(",", 1)[1].replace("\n", "\n7,", 1)),
     _text_parser("gnss.csv", "gnss.csv", read_gnss_csv, _GNSS,
                  "%time,field.latitude,field.longitude,field.altitude\n1670403902235281229,49,8,100\n"),

@@ -27,6 +27,7 @@ NAMES = {
     "microseconds with a prefix": (lambda ns: f"scan_{ns // 1000}", 1_000, "microseconds since 1970"),
     "milliseconds with a suffix": (lambda ns: f"{ns // 10**6}_lidar", 10**6, "milliseconds since 1970"),
     "prefix, number of the sensor and suffix": (lambda ns: f"os1-64_{ns}_points", 1, "nanoseconds since 1970"),
+    "signs that stand for numbers": (lambda ns: f"os#1_{ns}#", 1, "nanoseconds since 1970"),
     "a counter before": (lambda ns: f"{(ns - START_NS) // 10**8:06d}_{ns}", 1, "nanoseconds since 1970"),
     "sec.nanosec padded": (lambda ns: f"{ns // 10**9}.{ns % 10**9:09d}", 1, "seconds and 9 decimals"),
     "sec.nanosec unpadded": (
