@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -87,10 +88,11 @@ def decide_rings(scans: list[Scan], wanted: str = "auto", known: int | None = No
     kind, count = parse_rings(wanted)
     # The end of a sweep, which a driver may begin with, says nothing of its order.
     usual = np.median([len(scan) for scan in scans])
-    first = next(scan for scan in scans if 2 * len(scan) >= usual)
+    whole = [scan for scan in scans if 2 * len(scan) >= usual]
+    first = whole[0]
     tried = {
         "field": lambda: _decide_field(scans),
-        "rows": lambda: organised_rows(first, count or known),
+        "rows": lambda: _decide_rows(whole, count or known),
         "order": lambda: _decide_order(first),
         "elevation": lambda: _decide_elevation(scans, count, known),
     }
@@ -178,6 +180,12 @@ def _decide_field(scans: list[Scan]) -> RingRule | None:
     values = np.unique(np.concatenate(fields))
     # A driver that fills the field with zeros says nothing.
     return RingRule("field", len(values)) if len(values) > 1 else None
+
+
+def _decide_rows(scans: list[Scan], count: int | None) -> RingRule | None:
+    """The layout of most scans: points that are stored ring after ring can be cut into rows where their number allows it."""
+    rule, having = Counter(organised_rows(scan, count) for scan in scans).most_common(1)[0]
+    return rule if 2 * having > len(scans) else None
 
 
 def organised_rows(scan: Scan, count: int | None = None) -> RingRule | None:

@@ -38,14 +38,14 @@ def test_the_weak_axis_of_a_corridor_is_its_length_in_loam_scan_to_scan() -> Non
 
 
 @pytest.mark.parametrize(
-    ("method", "usual", "worst"), [("loam-odom", 0.014, 0.03), ("loam", 0.016, 0.03), ("lego-loam", 0.012, 0.04)]
+    ("method", "usual", "worst"), [("loam-odom", 0.02, 0.13), ("loam", 0.018, 0.07), ("lego-loam", 0.033, 0.05)]
 )
 def test_features_keep_the_speed_between_bare_walls(method: str, usual: float, worst: float) -> None:
     """The last scans that see anything know the speed; a few edges that walls do not have must not unlearn it.
 
-    How well they know it is a matter of where the last pier stands, and, by as much again, of a hundredth of a millimetre in
-    the scans. Were no direction degenerate, 0.3 to 0.4 of the way of seed 0 would be lost; by their share
-    of the information alone, without the least one, `loam-odom` usually loses 0.022.
+    Were no direction degenerate, 0.24 to 0.61 of the way would be lost. How well the speed is known is a matter of the noise of
+    two scans, the last that see a pier: of five seeds with five kinds of noise, medians of the seeds are 0.006 to 0.016 with
+    `loam-odom`, 0.006 to 0.014 with `loam`, 0.010 to 0.027 with `lego-loam`, and the worst 0.100, 0.053 and 0.039.
     """
     shares = [strayed(seed, method) for seed in SEEDS]
     assert np.median(shares) < usual

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from lslam.config import load_config
 from lslam.errors import ConfigError, InputError, UsageError
 from lslam.preprocessing.beams import elevation_borders, ring_gap
-from lslam.preprocessing.rings import RingRule, decide_rings, elevations, rings_by_order
+from lslam.preprocessing.rings import RingRule, decide_rings, elevations, organised_rows, rings_by_order
 from lslam.readers import open_sequence
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
@@ -62,6 +62,16 @@ def test_rings_are_found_again(scenario: str, lidar: str, kind: str, count: int)
         assert agreement(found, scan.rings) >= 0.995
         # From the top: where labels are all there, they are the simulated ones.
         assert np.mean(found == scan.rings) > 0.995 or found.max() < count - 1
+
+
+@pytest.mark.parametrize("rows", [16, 48, 64])
+def test_a_scan_whose_points_could_be_rows_does_not_make_the_recording_organised(rows: int) -> None:
+    """Ring after ring, cut into as many equal parts: each has an elevation of its own, more or less."""
+    first, *others = map(bare, scans("street", "hdl64"))
+    cut = first.select(np.arange(len(first) // rows * rows))
+    assert organised_rows(cut, rows) is not None
+    rule = decide_rings([cut, *others])
+    assert (rule.kind, rule.count) == ("order", 64)
 
 
 @pytest.mark.parametrize(("scenario", "lidar"), [("street", "hdl64"), ("street", "vlp16"), ("walk", "os1-64")])
