@@ -1,7 +1,7 @@
 """Simulated drives as another machine or another day would give them, on request: a test that hangs on a rounding shows.
 
 `--scan-noise-mm A` moves every point of a simulated scan by a normal error of A mm along each axis; `--noise-seed K` draws
-another such error and, when no A is given, other noise of every sensor and other traffic in the same towns on the same paths.
+another such error and, when no A is given, other noise of every sensor on the same drive.
 Drives that tests simulate in other processes, and rays that they trace themselves, stay as they are.
 """
 
@@ -51,15 +51,19 @@ def move_points(noise_m: float, seed: int) -> None:
 
 
 def draw_other_noise(seed: int) -> None:
-    """Let all that differs from visit to visit of a town be drawn anew."""
-    from lslam.simulation.routes import Visit
+    """Let the noise of scans, IMU and GNSS be drawn anew in every drive; what moves in its town stays."""
+    from lslam.simulation import scenarios
 
-    seeds_of = Visit.seeds
+    drive, build, read = scenarios.SimulatedDrive, scenarios.SimulatedDrive.__init__, scenarios.read_sensors
 
-    def seeds(visit: Visit, town: int) -> tuple[int, ...]:
-        return (*seeds_of(visit, town), SHIFT + seed)
+    def init(self: SimulatedDrive, *given: Any, **named: Any) -> None:
+        build(self, *given, **named)
+        self._seeds = (*self._seeds, SHIFT + seed)
 
-    Visit.seeds = seeds  # type: ignore[method-assign]
+    def read_sensors(motion: Any, sensors: Any, carrier: str, end: float, seeds: tuple[int, ...], *more: Any) -> Any:
+        return read(motion, sensors, carrier, end, (*seeds, SHIFT + seed), *more)
+
+    drive.__init__, scenarios.read_sensors = init, read_sensors  # type: ignore[method-assign]
 
 
 def with_other_noise(drive: SimulatedDrive, seed: int) -> SimulatedDrive:

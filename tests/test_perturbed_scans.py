@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from perturbed_scans import draw_other_noise, move_points
 
-from lslam.simulation.routes import Visit
+from lslam.simulation import scenarios
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 
@@ -18,7 +18,8 @@ def drive() -> SimulatedDrive:
 def as_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Undoes after each test what it does to the simulator."""
     monkeypatch.setattr(SimulatedDrive, "scan", SimulatedDrive.scan)
-    monkeypatch.setattr(Visit, "seeds", Visit.seeds)
+    monkeypatch.setattr(SimulatedDrive, "__init__", SimulatedDrive.__init__)
+    monkeypatch.setattr(scenarios, "read_sensors", scenarios.read_sensors)
 
 
 def test_every_point_is_moved_by_about_as_much_as_is_asked_for_and_the_same_each_time() -> None:

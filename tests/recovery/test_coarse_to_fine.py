@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from analytic_scenes import pose_at, room, seen_from
 from numpy.typing import NDArray
+from perturbed_scans import with_other_noise
 from recovery_drives import driven
 
 from lslam.config.recovery import RecoveryConfig
@@ -93,20 +94,23 @@ def test_coarse_to_fine_is_not_tried_after_a_confident_result(monkeypatch: pytes
 
 
 def test_a_standing_start_on_few_planes_does_not_slide() -> None:
-    """A motorway under sixteen rings: from metres off the few planes of one scan drew the next to a false place."""
-    drive = simulate("motorway", seed=0, count=3, lidar="os1-16", motion_compensated=True, static_start=0.5)
-    np.testing.assert_allclose(drive.ground_truth.poses[1], drive.ground_truth.poses[0], atol=1e-9)
-    registration = RecoveringRegistration(recovery=ALONE)
-    registration.register(drive.scan(0).points)
-    points = prepare_points(drive.scan(1).points, registration.preprocess, 1)
+    """A motorway under sixteen rings: from metres off the few planes of one scan drew the next to a false place.
 
-    def slid(result: RegistrationResult) -> float:
-        assert result.ok
-        return float(np.linalg.norm(result.T_world_lidar[:3, 3]))
-
-    assert slid(registration.judged(registration.alignment.coarse_to_fine(points, np.eye(4)), np.eye(4))) < 0.05
-    for i in (1, 2):
-        assert slid(registration.register(drive.scan(i).points)) < 0.05
+    By the noise of the first scan the others stand .005 to .056 m off.
+    """
+    usual = simulate("motorway", seed=0, count=3, lidar="os1-16", motion_compensated=True, static_start=0.5)
+    np.testing.assert_allclose(usual.ground_truth.poses[1], usual.ground_truth.poses[0], atol=1e-9)
+    slid = []
+    for drive in (usual, *(with_other_noise(usual, noise) for noise in range(1, 5))):
+        registration = RecoveringRegistration(recovery=ALONE)
+        registration.register(drive.scan(0).points)
+        points = prepare_points(drive.scan(1).points, registration.preprocess, 1)
+        wide = registration.judged(registration.alignment.coarse_to_fine(points, np.eye(4)), np.eye(4))
+        results = [wide, *(registration.register(drive.scan(i).points) for i in (1, 2))]
+        assert all(result.ok for result in results)
+        slid.append([np.linalg.norm(result.T_world_lidar[:3, 3]) for result in results])
+    assert np.median(slid, axis=0).max() < 0.03
+    assert np.max(slid) < 0.1
 
 
 @pytest.mark.parametrize(("seed", "first"), [(0, 10), (1, 5)])
