@@ -93,8 +93,7 @@ def require_crs(origin: Floats, config: GnssConfig) -> None:
     """Raise UsageError when results about `origin`, lat, lon (deg), height (m), are wanted in coordinates of no map."""
     if config.crs is not None or config.height_crs is not None or config.geoid:
         place = Georeference(origin, np.eye(4), config.crs, height_epsg=config.height_crs, geoid=config.geoid)
-        if lacking := Projection(place).check():
-            log.warning("%s", lacking)
+        Projection(place).check()
 
 
 def place(

@@ -72,11 +72,11 @@ def has_heights(crs: Any) -> bool:
     return isinstance(crs, CRS) and bool(crs.is_compound)
 
 
-def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str) -> tuple[Any, str]:
-    """pyproj's best operation between two coordinate reference systems at places (N, 2) lat, lon, deg; and what it lacks.
+def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str) -> Any:
+    """pyproj's best operation between two coordinate reference systems at places (N, 2) lat, lon, deg.
 
-    Ballpark operations, which leave the geoid out, are never taken. Where a grid of a better one is missing, that is said; with
-    heights it is refused. Raises UsageError with the grid's name.
+    Ballpark operations, which leave the geoid out, are never taken, nor is a coarser one where the best lacks a grid: raises
+    UsageError with the grid's name.
     """
     from pyproj.aoi import AreaOfInterest
     from pyproj.transformer import TransformerGroup
@@ -89,21 +89,19 @@ def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str
         group = TransformerGroup(source, target, always_xy=True, area_of_interest=area, allow_ballpark=False)
     best = group.transformers[0] if group.transformers else None
     grids = _missing_grids(group.unavailable_operations, None if best is None else best.accuracy)
-    if best is None or (grids and (has_heights(source) or has_heights(target))):
-        if not grids:
-            raise UsageError(
-                f"{name}: PROJ knows no exact operation between the WGS84 ellipsoid and its heights: name a grid of its geoid "
-                "with --geoid, or a plane without heights"
-            )
-        raise UsageError(
-            f"{name}: PROJ lacks the grid {' and '.join(grids)}: {_how_to_get(grids)}, or name one with --geoid"
+    if grids:
+        is_vertical = has_heights(source) or has_heights(target)
+        coarser = "" if best is None or is_vertical else f", without which it is accurate to {best.accuracy:g} m"
+        way_out = (
+            "or name one with --geoid" if is_vertical else "or choose a plane that needs none, as that of a UTM zone"
         )
-    if not grids:
-        return best, ""
-    return best, (
-        f"{name}: PROJ lacks the grid {' and '.join(grids)}, and takes an operation that is accurate to {best.accuracy:g} m: "
-        f"{_how_to_get(grids)}"
-    )
+        raise UsageError(f"{name}: PROJ lacks the grid {' and '.join(grids)}{coarser}: {_how_to_get(grids)}, {way_out}")
+    if best is None:
+        raise UsageError(
+            f"{name}: PROJ knows no exact operation between the WGS84 ellipsoid and its heights: name a grid of its geoid "
+            "with --geoid, or a plane without heights"
+        )
+    return best
 
 
 def geoid_heights(geoid: str, lat_lon: NDArray[Any]) -> Floats:

@@ -107,11 +107,8 @@ class Projection:
             enu[:, 2] += geoid_heights(self.georeference.geoid, from_local(enu, self.georeference.origin))
         return se3.apply(T_world_enu, enu)
 
-    def check(self) -> str:
-        """What its operation lacks, in a sentence, or nothing.
-
-        Raises UsageError unless the coordinate reference system is known, counts in metres and is reached exactly.
-        """
+    def check(self) -> None:
+        """Raise UsageError unless the coordinate reference system is known, counts in metres and is reached exactly."""
         units = {axis.unit_name for axis in self._crs.axis_info}
         if not self._crs.is_projected or units != {"metre"} or self._crs.axis_info[-1].direction == "down":
             raise UsageError(
@@ -119,7 +116,6 @@ class Projection:
                 f"one, for example EPSG:{Projection(_without_epsg(self.georeference)).epsg}"
             )
         self.apply(np.zeros((1, 3)))
-        return self._operation[1]
 
     @cached_property
     def _crs(self) -> Any:
@@ -130,12 +126,8 @@ class Projection:
         """Whether PROJ's own operation gives the heights."""
         return has_heights(self._crs) and not self.georeference.geoid
 
-    @property
-    def _transformer(self) -> Any:
-        return self._operation[0]
-
     @cached_property
-    def _operation(self) -> tuple[Any, str]:
+    def _transformer(self) -> Any:
         if self._is_vertical:
             return exact_transformer("EPSG:4979", self._crs, self.georeference.origin[:2], self.name)
         plane = self._crs.sub_crs_list[0] if has_heights(self._crs) else self._crs
@@ -186,13 +178,12 @@ def to_wgs84(points: NDArray[Any], epsg: int, height_epsg: int | None = None, ge
     places, name = np.column_stack([lat, lon]), crs_name(epsg, height_epsg)
     if not is_compound or geoid:
         source = plane if not is_compound else plane.to_3d()
-        transformer, _ = exact_transformer(source, "EPSG:4979", places, name)
-        out = _transformed(transformer, there)
+        out = _transformed(exact_transformer(source, "EPSG:4979", places, name), there)
         if geoid and not is_ellipsoidal:
             # The plane's own ellipsoid has no say in heights above a geoid.
             out[:, 2] = there[:, 2] + geoid_heights(geoid, out)
     else:
-        out = _transformed(exact_transformer(crs, "EPSG:4979", places, name)[0], there)
+        out = _transformed(exact_transformer(crs, "EPSG:4979", places, name), there)
     _require_places(there, out, crs, epsg)
     return out
 

@@ -235,8 +235,7 @@ def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
     if crs.epsg is not None:
         georeference = replace(georeference, epsg=crs.epsg, height_epsg=crs.height_epsg)
     georeference = replace(georeference, geoid=crs.geoid or georeference.geoid)
-    if lacking := Projection(georeference).check():
-        log.warning("%s", lacking)
+    Projection(georeference).check()
     return georeference
 
 
