@@ -15,6 +15,7 @@ from lslam.graph.fix_errors import (
     actual_sigmas,
     agreeing_heights,
     clock_offset,
+    height_levels,
     rough_residuals,
 )
 from lslam.graph.gnss_alignment import GnssAlignment, align
@@ -130,23 +131,23 @@ def aligned(
         return align(of.antenna, of.positions, of.sigmas, of.slack, up, up_sigma, min_fixes)
 
     found = fit(fixes)
-    if found is not None and found.inliers.all():
-        return found, fixes, faults
     flat = replace(fixes, sigmas=np.column_stack([fixes.sigmas[:, :2], np.full(len(fixes.sigmas), NO_HEIGHT)]))
-    level = fit(flat)
-    gained = 0 if level is None else int(level.inliers.sum()) - (0 if found is None else int(found.inliers.sum()))
-    if level is None or gained < max(3, LEAST_SHARE * len(fixes.stamps_ns)):
+    level = found if found is not None and found.inliers.all() else fit(flat)
+    if level is None:
         return found, fixes, faults
-    off, judged = level.residuals[:, 2], np.hypot(fixes.sigmas[:, 2], fixes.slack)
-    way = np.linalg.norm(fixes.antenna - np.median(fixes.antenna, axis=0), axis=1)
-    judged = np.hypot(judged, min(up_sigma, float(np.deg2rad(2.0))) * way)
-    agrees = agreeing_heights(off, judged)
+    agrees = agreeing_heights(height_levels(level.residuals[:, 2], fixes.sigmas[:, 2]), fixes.sigmas[:, 2])
+    has_jump = not agrees.all()
+    gained = int(level.inliers.sum()) - (0 if found is None else int(found.inliers.sum()))
+    if not has_jump and gained >= max(3, LEAST_SHARE * len(fixes.stamps_ns)):
+        way = np.linalg.norm(fixes.antenna - np.median(fixes.antenna, axis=0), axis=1)
+        judged = np.hypot(np.hypot(fixes.sigmas[:, 2], fixes.slack), min(up_sigma, float(np.deg2rad(2.0))) * way)
+        agrees = agreeing_heights(level.residuals[:, 2], judged)
     without = replace(flat, sigmas=np.where(agrees[:, None], fixes.sigmas, flat.sigmas))
-    again = fit(without)
-    if again is None or (found is not None and again.inliers.sum() <= found.inliers.sum()):
+    again = None if agrees.all() else fit(without)
+    if again is None or (not has_jump and found is not None and again.inliers.sum() <= found.inliers.sum()):
         return found, fixes, faults
-    wrong = np.flatnonzero(~agrees)
-    off = again.residuals[:, 2]
+    wrong, off = np.flatnonzero(~agrees), again.residuals[:, 2]
+    off = height_levels(off, fixes.sigmas[:, 2]) if has_jump else off
     step = float(np.median(off[wrong]) - np.median(off[agrees]))
     at = wrong[0] if wrong[0] > 0 else wrong[-1]
     since = f"{'from' if wrong[0] > 0 else 'until'} {(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"

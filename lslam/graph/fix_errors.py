@@ -222,3 +222,28 @@ def agreeing_heights(off: Floats, sigmas: Floats) -> Bools:
     level = values[int(np.argmax(counts))]
     near = np.abs(off - level) <= WITHIN * sigmas
     return np.asarray(np.abs(off - np.median(off[near])) <= WITHIN * sigmas)
+
+
+def height_levels(off: Floats, sigmas: Floats) -> Floats:
+    """(F,) m, by which a height lies above the first ones, as far as heights jump from one fix to the next.
+
+    off : (F,) m, of fixes minus trajectory, in order of time; sigmas : (F,) m
+
+    Medians before and after a fix differ by a jump, while a tilt and odometry's drift change them little. A jump exceeds
+    the sigma of a height, and what such differences are elsewhere.
+    """
+    levels = np.zeros(len(off))
+    if len(off) < 2 * FEWEST:
+        return levels
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(off, FEWEST), axis=1)
+    steps = medians[FEWEST:] - medians[:-FEWEST]
+    usual = MAD * float(np.median(np.abs(steps - np.median(steps))))
+    least = WITHIN * np.maximum(sigmas[FEWEST : FEWEST + len(steps)], 1.5 * usual)
+    sizes = np.abs(steps) * (np.abs(steps) > least)
+    while sizes.any():
+        at = int(np.argmax(sizes))
+        near, before, after = off[at : at + 2 * FEWEST], medians[at], medians[at + FEWEST]
+        first = at + int(np.argmax(np.cumsum((near - after) ** 2 - (near - before) ** 2))) + 1
+        levels[first:] += steps[at]
+        sizes[max(at - FEWEST + 1, 0) : at + FEWEST] = 0.0
+    return levels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -134,6 +135,19 @@ def test_heights_of_another_datum_do_not_cost_east_and_north(seed: int) -> None:
     assert np.abs(apart(found)[:, :2]).max() < 0.3
     # Half of the heights leave the tilt less sure.
     assert np.abs(apart(found)[:, 2]).max() < 3.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("climb", [6.0, -6.0])
+def test_heights_that_jump_by_less_than_a_tilt_makes_are_named(climb: float, seed: int) -> None:
+    found = placed(climb=climb, seed=seed)
+    assert found.faults.facts is not None
+    assert found.faults.facts["heights_left_out"] == pytest.approx(73, abs=2)
+    said = re.search(r"fixes are (\d\.\d) m (above|below) the others, from (\d+\.\d) s", found.faults.problems[0])
+    assert said is not None
+    assert float(said[1]) == pytest.approx(6.0, abs=1.0)
+    assert said[2] == ("above" if climb > 0 else "below")
+    assert float(said[3]) == pytest.approx(24.9, abs=0.5)
 
 
 @pytest.mark.parametrize("seed", range(3))

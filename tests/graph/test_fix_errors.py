@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.graph.fix_errors import actual_sigmas, agreeing_heights, clock_offset, rough_residuals
+from lslam.graph.fix_errors import actual_sigmas, agreeing_heights, clock_offset, height_levels, rough_residuals
 
 Floats = NDArray[np.float64]
 UP = np.array([1.0, 1.0, 1.8])
@@ -103,3 +103,19 @@ def test_heights_agree_where_most_of_them_lie() -> None:
     agrees = agreeing_heights(off, np.full(100, 0.5))
     assert not agrees[60:].any()
     assert agrees[:60].sum() >= 58
+
+
+@pytest.mark.parametrize("memory", [0.0, 20.0, 100.0])
+def test_heights_that_wander_or_climb_do_not_jump(memory: float) -> None:
+    """A hundred drives with heights of 1 m, white or a Gauss-Markov process at 5 Hz, on a slope; then a step of 6.7 sigmas."""
+    rng, keep = np.random.default_rng(3), np.exp(-0.2 / memory) if memory else 0.0
+    off = rng.normal(size=(100, 400))
+    for i in range(1, 400):
+        off[:, i] = keep * off[:, i - 1] + np.sqrt(1 - keep**2) * off[:, i]
+    off += np.linspace(0.0, 3.0, 400)
+    assert not any(height_levels(one, np.ones(400)).any() for one in off)
+    off[:, 250:] += 6.7
+    levels = np.stack([height_levels(one, np.ones(400)) for one in off])
+    np.testing.assert_allclose(levels[:, -1], 6.7, atol=2.5)
+    assert not levels[:, :240].any()
+    assert not (levels[:, 260:] != levels[:, -1:]).any()
