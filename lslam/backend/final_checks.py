@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence as Many
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,45 +11,74 @@ from numpy.typing import NDArray
 
 from lslam.backend.fix_faults import Fixes
 from lslam.geometry import geodesy, se3
+from lslam.graph.chi_square import quantile
 from lslam.keyframes.store import KeyframeStore
-from lslam.maps.crispness import crispness
-from lslam.types.cloud import ArrayCloud
+from lslam.maps.crispness import plane_variances
 from lslam.types.gnss import Georeference
 from lslam.types.manual import ControlPoint
 
 Floats = NDArray[np.float64]
 
-# Times thicker than without them a map contradicts what holds the poses: repeated sampling changes it by a hundredth.
-THICKER = 1.15
-# Points of all keyframes, and neighbourhoods, of that comparison.
-POINTS, SAMPLES = 400_000, 20_000
+# Points of all keyframes, neighbourhoods of that comparison, and parts of the drive whose noise is independent.
+POINTS, SAMPLES, PARTS = 400_000, 20_000, 16
 # Sigmas by which fixes and control points may disagree.
 APART_SIGMAS = 4.0
 # From the median absolute deviation to one sigma.
 MAD = 1.4826
 
 
-def thicker_map(store: KeyframeStore, without: Floats, final: Floats, held_by: str) -> tuple[str, dict[str, Any]]:
-    """A sentence where planes are thicker with the `final` poses (K, 4, 4) than `without` what holds them; and both, m."""
-    before, after = (_thickness(store, poses) for poses in (without, final))
-    if before is None or after is None:
+@dataclass(frozen=True)
+class Thickening:
+    """Thickness of planes, m, before and after poses were held, and the growth of its square in units of its noise."""
+
+    before: float
+    after: float
+    sigmas: float
+
+    def is_clear(self, probability: float) -> bool:
+        """Whether planes got thicker, by more than chance and by a millimetre at the least that is written."""
+        return self.sigmas > np.sqrt(quantile(probability, 1)) and round(self.after, 3) > round(self.before, 3)
+
+
+def thickening(store: KeyframeStore, without: Floats, final: Floats) -> Thickening | None:
+    """What the `final` poses (K, 4, 4) do to planes of the keyframes' points at the poses `without` (K, 4, 4).
+
+    The same neighbourhoods are compared. Those of one part of the drive err together, so that parts give the noise.
+    """
+    (before, owner), (after, _) = (_plane_variances(store, poses) for poses in (without, final))
+    both = np.isfinite(before) & np.isfinite(after)
+    if not both.any():
+        return None
+    part = np.unique(owner[both] * PARTS // len(final), return_inverse=True)[1]
+    count, grown = np.bincount(part), np.bincount(part, (after - before)[both])
+    mean = grown.sum() / count.sum()
+    noise = np.sqrt(((grown - mean * count) ** 2).sum()) / count.sum()
+    was, is_now = (float(np.sqrt(values[both].mean())) for values in (before, after))
+    return Thickening(was, is_now, float(mean / max(noise, 1e-12)))
+
+
+def thicker_map(change: Thickening | None, held_by: str, probability: float) -> tuple[str, dict[str, Any]]:
+    """A sentence where planes are clearly thicker with what holds the poses than without; and both, m."""
+    if change is None:
         return "", {}
-    facts = {"planes_without_m": round(before, 4), "planes_m": round(after, 4)}
-    if after <= THICKER * before:
+    facts = {"planes_without_m": round(change.before, 4), "planes_m": round(change.after, 4)}
+    if not change.is_clear(probability):
         return "", facts
     return (
-        f"{held_by}: planes of the keyframes are {after / before:.1f} times as thick where the trajectory follows them, "
-        f"{after:.3f} m in place of {before:.3f} m without: they contradict the scans"
+        f"{held_by}: planes of the keyframes are {change.after / change.before:.2f} times as thick where the trajectory follows "
+        f"them, {change.after:.3f} m in place of {change.before:.3f} m without, {change.sigmas:.1f} sigmas: they contradict the "
+        "scans"
     ), facts
 
 
-def _thickness(store: KeyframeStore, poses: Floats) -> float | None:
-    """m, of planes of the keyframes' points at `poses`."""
+def _plane_variances(store: KeyframeStore, poses: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """(Q,) m2, variances about planes of the keyframes' points at `poses`, NaN where these are few; and (Q,) their keyframes."""
     clouds = [store.points(k) for k in range(len(poses))]
     step = 1 + sum(map(len, clouds)) // POINTS
-    points = np.concatenate([se3.apply(T, cloud[::step]) for T, cloud in zip(poses, clouds, strict=True)])
-    variance = crispness(ArrayCloud.of(points), samples=SAMPLES).plane_variance
-    return None if variance is None else float(np.sqrt(variance))
+    parts = [se3.apply(T, cloud[::step]) for T, cloud in zip(poses, clouds, strict=True)]
+    owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    queries = slice(None, None, max(1, -(-len(owner) // SAMPLES)))
+    return plane_variances(np.concatenate(parts), queries), owner[queries]
 
 
 def fixes_against_points(fixes: Fixes, points: Many[ControlPoint], georeference: Georeference) -> str:

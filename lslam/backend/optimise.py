@@ -23,7 +23,7 @@ from lslam.backend.control_points import (
     control_residuals,
     with_control,
 )
-from lslam.backend.final_checks import fixes_against_points, redundancy, thicker_map
+from lslam.backend.final_checks import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
 from lslam.backend.inputs import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
@@ -129,9 +129,34 @@ def _compared_with_map(out: BackEnd, graph: PoseGraph, given: Given) -> BackEnd:
             log.debug("the graph without control points: %s", error)
             return out
     held_by = "control points" if given.points else "GNSS"
-    said, facts = thicker_map(given.store, without, out.keyframes, held_by)
+    said, facts = thicker_map(thickening(given.store, without, out.keyframes), held_by, config.graph.probability)
+    if said and len(given.points) > 2:
+        said += _without_one(graph, without, given)
     given.problems.append(said)
     return replace(out, facts=out.facts | facts)
+
+
+def _without_one(graph: PoseGraph, without: Floats, given: Given) -> str:
+    """The end of the sentence about control points that contradict the scans: the one without which the others do not."""
+    config, points, keyframes = given.config, given.points, given.store.keyframes
+    results = bent(given.results, keyframes, graph.poses)
+    fewest: tuple[float, str] | None = None
+    for i in checking(range(len(points))):
+        others = [*points[:i], *points[i + 1 :]]
+        placement = with_control(Placement(), others, results, keyframes, _up(graph), config)
+        if placement.georeference is None:
+            continue
+        try:
+            change = thickening(given.store, without, optimise(on_earth(graph, placement), config.graph).poses)
+        except (GraphError, np.linalg.LinAlgError) as error:
+            log.debug("the graph without a control point: %s", error)
+            continue
+        if change is not None and (fewest is None or change.after < fewest[0]):
+            name = "" if change.is_clear(config.graph.probability) else points[i].at.said
+            fewest = change.after, name
+    if fewest is None or not fewest[1]:
+        return "; no single one of them is why"
+    return f"; without {fewest[1]} the others do not: is it the right scan, sigma and CRS?"
 
 
 def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str, ...] = ("graph",)) -> Placement:

@@ -56,6 +56,18 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples:
     return Crispness(entropy, variance, used, sampled, len(cloud), radius, least)
 
 
+def plane_variances(points: Floats, queries: slice, radius: float = RADIUS, least: int = LEAST) -> Floats:
+    """(Q,) m2, variance of the points (N, 3) about the plane through those around each query; NaN where these are few."""
+    from lslam.kernels.crispness import cell_keys, shapes
+
+    if not len(points):
+        return np.zeros(0)
+    low = points.min(0)
+    keys = cell_keys(points, low, radius)
+    order = np.argsort(keys, kind="stable")
+    return np.asarray(shapes(points[order], keys[order], points[queries], low, radius, least)[:, 1])
+
+
 def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:
     """Every `step`-th point of the cloud once, with all points of a slab of x that holds its neighbourhood."""
     if not isinstance(cloud, MergedMap):

@@ -131,6 +131,7 @@ def test_a_wrong_control_point_is_named(drives: Path, tmp_path: Path) -> None:
     control = points(tmp_path / "points.csv", (0, 20, 45, 70, 94), off=3.0)
     said = again(drives / "plain", tmp_path / "out", "--control", control)["manifest"]["problems"]
     assert any("points.csv, line 5 and points.csv, line 6: the control points are" in sentence for sentence in said)
+    assert any("without points.csv, line 6 the others do not" in sentence for sentence in said)
 
 
 def test_a_run_takes_the_same_files(tmp_path: Path) -> None:
