@@ -137,10 +137,10 @@ def _compared_with_map(out: BackEnd, graph: PoseGraph, given: Given) -> BackEnd:
 
 
 def _without_one(graph: PoseGraph, without: Floats, given: Given) -> str:
-    """The end of the sentence about control points that contradict the scans: the one without which the others do not."""
+    """The end of the sentence about control points that contradict the scans: those without which the others do not."""
     config, points, keyframes = given.config, given.points, given.store.keyframes
     results = bent(given.results, keyframes, graph.poses)
-    fewest: tuple[float, str] | None = None
+    names = []
     for i in checking(range(len(points))):
         others = [*points[:i], *points[i + 1 :]]
         placement = with_control(Placement(), others, results, keyframes, _up(graph), config)
@@ -151,12 +151,11 @@ def _without_one(graph: PoseGraph, without: Floats, given: Given) -> str:
         except (GraphError, np.linalg.LinAlgError) as error:
             log.debug("the graph without a control point: %s", error)
             continue
-        if change is not None and (fewest is None or change.after < fewest[0]):
-            name = "" if change.is_clear(config.graph.probability) else points[i].at.said
-            fewest = change.after, name
-    if fewest is None or not fewest[1]:
+        if change is not None and not change.is_clear(config.graph.probability):
+            names.append(points[i].at.said)
+    if not names:
         return "; no single one of them is why"
-    return f"; without {fewest[1]} the others do not: is it the right scan, sigma and CRS?"
+    return f"; without {' or without '.join(names)} the others do not: are scan, sigma and CRS right?"
 
 
 def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str, ...] = ("graph",)) -> Placement:
