@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 MOST = 60
 # Factors on odometry's drift that are tried, and refined.
 FACTORS = np.geomspace(1e-3, 1e5, 9)
+# Gain of the likelihood that pays for the one parameter of drift (Akaike 1974), where fixes are believed.
+AKAIKE = 1.0
 # Window of the median filter against outliers that the alignment accepts.
 AROUND = 7
 # Instants of the error in the graph, at most; a fix has that of the nearest.
@@ -73,7 +75,8 @@ def fit_gauss_markov(
 
     Differences of successive fixes contain neither correlated noise nor drift: they give the white share of the stated variance.
     The time constant of the rest and the drift factor maximise the restricted likelihood, since position and heading were
-    fitted. Where the statement is refuted the variance of the correlated part is estimated as well.
+    fitted. Where the statement is refuted the variance of the correlated part is estimated as well, and fixes are the first
+    to be suspected: drift must be significant.
 
     seconds : (F,) ascending; residuals : (F, 3) m, east, north, up, of fixes minus trajectory, aligned to them
     sigmas : (F, 3) m, stated; antenna : (F, 3) m, east, north, up; probability : of the chi-square test for white noise
@@ -97,7 +100,8 @@ def fit_gauss_markov(
     if largest is not None:
         slow = np.geomspace(LEAST_SLOW * white, max((largest / typical[:2].max()) ** 2, 4 * white), VARIANCES)
     drift = replace(drift, keyframes=drift.keyframes[good])
-    memory, variance, factor = _likeliest(seconds, scaled, sigmas, antenna, white, slow, drift, probability)
+    least_gain = AKAIKE if largest is None else 0.5 * quantile(probability, 1)
+    memory, variance, factor = _likeliest(seconds, scaled, sigmas, antenna, white, slow, drift, least_gain)
     if variance * len(seconds) < white:
         return None, factor
     return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], np.sqrt(variance) * typical, memory), factor
@@ -113,13 +117,13 @@ def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
 
 def _likeliest(
     seconds: Floats, scaled: Floats, sigmas: Floats, antenna: Floats, white: float, slow: Floats, drift: DriftOfFixes,
-    probability: float,
+    least_gain: float,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Time constant, s, and variance of what residuals `scaled` (F, 3) have beside their `white` part, and drift factor.
 
     slow : (V,) variances that are tried; a single one is known
-    Drift is a random walk, or a constant rate of equal variance at the end of the way. Fixes whose statement is refuted are
-    the first to be suspected: drift must gain more likelihood beside their noise than it does by chance.
+    least_gain : logarithm of the likelihood that drift must gain
+    Drift is a random walk, or a constant rate of equal variance at the end of the way.
     """
     groups = np.array_split(np.arange(len(seconds)), min(len(seconds), MOST))
     t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, scaled, antenna, sigmas))
@@ -155,7 +159,7 @@ def _likeliest(
         for unit, factors in ((walk, nothing), (walk, FACTORS), (rate, FACTORS))
     ]
     best = max(found[1:], key=lambda one: one[0])
-    memory, variance, factor = (best if best[0] - found[0][0] > 0.5 * quantile(probability, 1) else found[0])[1]
+    memory, variance, factor = (best if best[0] - found[0][0] > least_gain else found[0])[1]
     return memory, variance, factor
 
 
