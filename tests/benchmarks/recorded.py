@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.config.preprocess import PreprocessConfig
 from lslam.formats.trajectory_files import read_trajectory
+from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import estimate
 from lslam.geometry.interpolate import poses_at
 from lslam.odometry import create_odometry
@@ -32,8 +34,17 @@ PLACES = {
 }
 
 
-def untwisted(sequence: Sequence) -> list[Scan]:
-    """All scans, each with the motion of its sweep taken out along the trajectory of `icp`, so that all peers get the same."""
+# s from the stamp of a scan to the instant its true pose belongs to: KTH's is the end of the sweep.
+TRUTH_AT_S = {"MCD KTH day 06": 0.1}
+
+
+def untwisted(sequence: Sequence, at_s: float = 0.0) -> list[Scan]:
+    """All scans, each with the motion of its sweep taken out along the trajectory of `icp`, so that all peers get the same.
+
+    Points without a time field are timed by their order, as `lslam run` does. They are seen from where the sensor was `at_s`,
+    s, after the stamp.
+    """
+    sequence = with_point_times(sequence, PreprocessConfig())
     scans = [sequence.scan(i) for i in range(len(sequence))]
     if all(scan.times is None for scan in scans):
         return scans
@@ -41,9 +52,12 @@ def untwisted(sequence: Sequence) -> list[Scan]:
     stamps, poses = sequence.stamps_ns, np.stack([result.T_world_lidar for result in found])
     clean = []
     for scan in scans:
-        knots = knots_over(scan.span)
-        prior = MotionPrior(knots, poses_at(stamps, poses, scan.stamp_ns + np.round(1e9 * knots).astype(np.int64)))
-        clean.append(replace(scan, points=deskew_points(scan.points, scan.times, prior), times=None))
+        assert scan.times is not None
+        late = replace(scan, times=scan.times - np.float32(at_s))
+        knots = knots_over(late.span)
+        at_ns = scan.stamp_ns + np.round(1e9 * (knots + at_s)).astype(np.int64)
+        points = deskew_points(scan.points, late.times, MotionPrior(knots, poses_at(stamps, poses, at_ns)))
+        clean.append(replace(scan, points=points, times=None))
     return clean
 
 
@@ -56,7 +70,7 @@ def thinned(folder: Path) -> Iterator[Case]:
         sequence = open_sequence(path)
         rule, known = decide_rings([sequence.scan(i) for i in range(3)]), sequence.ground_truth
         rings = [rule.rings_of(sequence.scan(i)) for i in range(len(sequence))]
-        scans, reference = untwisted(sequence), path / "reference_lidar.tum"
+        scans, reference = untwisted(sequence, TRUTH_AT_S.get(name, 0.0)), path / "reference_lidar.tum"
         truth = read_trajectory(reference) if reference.is_file() else known
         assert truth is not None
         for step in (1, 2, 4):
