@@ -14,9 +14,11 @@ def available_cores() -> int:
 
 
 def pin_blas() -> None:
-    """Let OpenBLAS, once NumPy and SciPy load it, take the kernels that every x86-64 processor has: the same bytes on each.
+    """Let OpenBLAS, once NumPy and SciPy load it, take one core and kernels that every x86-64 processor has.
 
-    Matrices of this program are small, so that these kernels cost it nothing.
+    So sums have one order, and bytes are the same on each machine. Matrices of this program are small: more cores would wait for
+    each other, a hundred times as long where others use them.
     """
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     if platform.machine().lower() in ("x86_64", "amd64"):
         os.environ["OPENBLAS_CORETYPE"] = "Nehalem"

@@ -20,7 +20,11 @@ pytestmark = pytest.mark.skipif(
 NO_VECTORS = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX2 FMA3"
 # Each of what BLAS, NumPy and numba can be told once, together: where one of them changes a byte, the test of its row fails.
 SETTINGS = {
-    "Haswell, numba generic": {"OPENBLAS_CORETYPE": "Haswell", "NUMBA_CPU_NAME": "generic"},
+    "Haswell on four cores, numba generic": {
+        "OPENBLAS_CORETYPE": "Haswell",
+        "OPENBLAS_NUM_THREADS": "4",
+        "NUMBA_CPU_NAME": "generic",
+    },
     "SkylakeX, numba x86-64-v3": {"OPENBLAS_CORETYPE": "SkylakeX", "NUMBA_CPU_NAME": "x86-64-v3"},
     "Zen, numpy without vector units": {"OPENBLAS_CORETYPE": "Zen", "NPY_DISABLE_CPU_FEATURES": NO_VECTORS},
     "Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
