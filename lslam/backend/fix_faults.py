@@ -147,7 +147,10 @@ def aligned(
     if again is None or (not has_jump and found is not None and again.inliers.sum() <= found.inliers.sum()):
         return found, fixes, faults
     wrong, off = np.flatnonzero(~agrees), again.residuals[:, 2]
-    off = height_levels(off, fixes.sigmas[:, 2]) if has_jump else off
+    if has_jump:
+        off = height_levels(off, fixes.sigmas[:, 2])
+        if not off.any():
+            return found, fixes, faults  # the tilt of the first alignment made it
     step = float(np.median(off[wrong]) - np.median(off[agrees]))
     at = wrong[0] if wrong[0] > 0 else wrong[-1]
     since = f"{'from' if wrong[0] > 0 else 'until'} {(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"

@@ -123,7 +123,8 @@ def _likeliest(
 
     slow : (V,) variances that are tried; a single one is known
     least_gain : logarithm of the likelihood that drift must gain
-    Drift is a random walk, or a constant rate of equal variance at the end of the way.
+    Drift is a random walk, or a constant rate of equal variance at the end of the way. It is accepted where the likelihood,
+    marginal over time constants, gains enough.
     """
     groups = np.array_split(np.arange(len(seconds)), min(len(seconds), MOST))
     t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, scaled, antenna, sigmas))
@@ -148,45 +149,65 @@ def _likeliest(
     apart = np.abs(t[:, None] - t)
     gap = float(np.median(np.diff(seconds)))
     memories = np.geomspace(gap, LONGEST * max(t[-1] - t[0], gap), MEMORIES)
-    nothing = np.zeros(1)
 
     def likelihood(unit: Floats, memory: float, variance: float, factor: float) -> float:
         correlated = np.kron(variance * np.exp(-apart / memory), np.eye(3))
         return _log_likelihood(known + correlated + factor * unit, sides)
 
-    found = [
-        _maximum(partial(likelihood, unit), (memories, slow, factors))
-        for unit, factors in ((walk, nothing), (walk, FACTORS), (rate, FACTORS))
-    ]
-    best = max(found[1:], key=lambda one: one[0])
-    memory, variance, factor = (best if best[0] - found[0][0] > least_gain else found[0])[1]
+    nothing, *drifts = (
+        _Tried.over(partial(likelihood, unit), (memories, slow, factors))
+        for unit, factors in ((walk, np.zeros(1)), (walk, FACTORS), (rate, FACTORS))
+    )
+    # Both drifts are as probable, and so are all time constants.
+    beside = np.logaddexp(*(one.marginal for one in drifts)) - np.log(2.0)
+    best = max(drifts, key=lambda one: one.likelihoods.max())
+    memory, variance, factor = (best if beside.max() - nothing.marginal.max() > least_gain else nothing).refined()
     return memory, variance, factor
 
 
-def _maximum(of: Callable[..., float], tried: tuple[Floats, ...]) -> tuple[float, list[float]]:
-    """The maximum of a function of positive numbers, and where it is: of all `tried`, refined where there are several."""
-    from scipy.optimize import minimize
+@dataclass(frozen=True)
+class _Tried:
+    """Logarithms of a likelihood of positive numbers, time constants first, at all combinations of the values `tried`."""
 
-    best = max(product(*tried), key=lambda at: of(*at))
-    free = [i for i, values in enumerate(tried) if len(values) > 1]
+    of: Callable[..., float]
+    tried: tuple[Floats, ...]
+    likelihoods: Floats
 
-    def at(logarithms: Floats) -> list[float]:
-        moved = [float(value) for value in best]
-        for i, logarithm in zip(free, logarithms, strict=True):
-            moved[i] = float(np.exp(np.clip(logarithm, np.log(tried[i][0]), np.log(tried[i][-1]))))
-        return moved
+    @classmethod
+    def over(cls, of: Callable[..., float], tried: tuple[Floats, ...]) -> _Tried:
+        """All of them."""
+        values = np.array([of(*at) for at in product(*tried)])
+        return cls(of, tried, values.reshape([len(one) for one in tried]))
 
-    if not free:
-        return of(*best), at(np.zeros(0))
-    options: Any = {"xatol": 0.05, "fatol": 0.05, "maxfev": 150}
+    @property
+    def marginal(self) -> Floats:
+        """The likelihood over time constants, of each combination of the others."""
+        return np.asarray(np.logaddexp.reduce(self.likelihoods, axis=0))
 
-    def cost(logarithms: Floats) -> float:
-        return -of(*at(logarithms))
+    def refined(self) -> list[float]:
+        """The numbers at the maximum; those of which several were tried lie between them."""
+        from scipy.optimize import minimize
 
-    found = minimize(cost, np.log([best[i] for i in free]), method="Nelder-Mead", options=options)
-    # Rounded, so that another machine's last bits do not show.
-    refined = at(np.round(found.x, 2))
-    return of(*refined), refined
+        place = np.unravel_index(int(np.argmax(self.likelihoods)), self.likelihoods.shape)
+        best = [float(values[i]) for values, i in zip(self.tried, place, strict=True)]
+        free = [i for i, values in enumerate(self.tried) if len(values) > 1]
+
+        def at(logarithms: Floats) -> list[float]:
+            moved = list(best)
+            for i, logarithm in zip(free, logarithms, strict=True):
+                moved[i] = float(np.exp(np.clip(logarithm, np.log(self.tried[i][0]), np.log(self.tried[i][-1]))))
+            return moved
+
+        if not free:
+            return best
+        options: Any = {"xatol": 0.05, "fatol": 0.05, "maxfev": 150}
+
+        def cost(logarithms: Floats) -> float:
+            return -self.of(*at(logarithms))
+
+        found = minimize(cost, np.log([best[i] for i in free]), method="Nelder-Mead", options=options)
+        # Rounded, so that another machine's last bits do not show.
+        return at(np.round(found.x, 2))
 
 
 def _lasting(metre: Floats, places: Floats) -> Floats:
