@@ -7,6 +7,8 @@ Nothing heavy is imported before the folder is found.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,6 +73,11 @@ def open_sequence(
     """
     if (rows is None) != (cols is None) or min(rows or 1, cols or 1) < 1:
         raise UsageError(f"rows {rows} and cols {cols} of organised clouds go together and are above 0")
+    with _readable(name_or_path):
+        folder = find_folder(name_or_path, data_root)
+        if not isinstance(folder, RemotePath):
+            # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
+            folder = Path(os.path.abspath(folder))
     from lslam.formats.calibration_files import read_transform
     from lslam.formats.sequence_toml import SequenceInfo, is_rate
 
@@ -84,14 +91,8 @@ def open_sequence(
         vertical_correction_deg=vertical_correction_deg, point_times=None if point_times == "auto" else point_times,
         T_lidar_imu=None if extrinsics is None else read_transform(extrinsics), **topics,
     )  # fmt: skip
-    try:
-        folder = find_folder(name_or_path, data_root)
-        if not isinstance(folder, RemotePath):
-            # Absolute, but links kept: `sequences/07` may be one, and its poses lie beside the link.
-            folder = Path(os.path.abspath(folder))
+    with _readable(name_or_path):
         sequence = _open(folder, overrides)
-    except OSError as error:
-        raise InputError(f"{error.filename or name_or_path} cannot be read: {cause(error)}") from None
     from lslam.readers.raw_drive import with_streams
 
     given = [f"--{key.replace('_', '-')}" for key, name in topics.items() if name is not None]
@@ -101,6 +102,15 @@ def open_sequence(
     if sequence.kind == "bag" or sequence.kind not in READERS:
         return sequence
     return _merged(sequence, overrides)
+
+
+@contextmanager
+def _readable(name: str | Path) -> Iterator[None]:
+    """Turn an OSError of the block into an InputError that names the file, or what was asked for."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{error.filename or name} cannot be read: {cause(error)}") from None
 
 
 def _merged(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
