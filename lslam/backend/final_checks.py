@@ -110,11 +110,15 @@ def fixes_against_points(fixes: Fixes, points: Many[ControlPoint], georeference:
     )
 
 
-def redundancy(surveyed: Floats, seen: Floats) -> tuple[str, dict[str, Any]]:
-    """A sentence about two points, which nothing checks, with the scale between them and odometry; nothing about more.
+def redundancy(surveyed: Floats, seen: Floats, is_level: bool) -> tuple[str, dict[str, Any]]:
+    """A sentence about points that nothing checks: two, with the scale between them and odometry, or the heights of three.
 
     surveyed, seen : (N, 3) m, of the points by their survey and by odometry
+    is_level : whether something else tells what is up
     """
+    if len(surveyed) == 3 and not is_level:
+        said = "the heights of three have no redundancy where no IMU tells what is up: a wrong one tilts the drive"
+        return f"control points: {said}", {"height_redundancy": 0}
     if len(surveyed) != 2:
         return "", {}
     there, here = (float(np.linalg.norm(places[1] - places[0])) for places in (surveyed, seen))

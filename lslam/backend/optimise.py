@@ -90,7 +90,7 @@ def run_back_end(
         moved = replace(graph, poses=out.keyframes)
         out = replace(out, georeference=_by_fixes(sequence, moved, given, out.results).georeference)
     if points and out.georeference is not None:
-        out = _with_residuals(out, out.georeference, sequence, drift, given)
+        out = _with_residuals(out, out.georeference, sequence, drift, given, is_level=bool(graph.ups))
     out = _compared_with_map(out, graph, given)
     problems[:] = [problem for problem in problems if problem]
     for problem in problems:
@@ -99,7 +99,7 @@ def run_back_end(
 
 
 def _with_residuals(
-    out: BackEnd, georeference: Georeference, sequence: Sequence, drift: Drift, given: Given
+    out: BackEnd, georeference: Georeference, sequence: Sequence, drift: Drift, given: Given, is_level: bool
 ) -> BackEnd:
     """The outcome with what is left of the control points; what contradicts them is one of the problems."""
     config, points, results = given.config, given.points, given.results
@@ -107,7 +107,7 @@ def _with_residuals(
     left = control_residuals(points, out.results, georeference, geoid)
     given.problems.extend(against_odometry(points, results, given.store.keyframes, drift, probability, geoid))
     given.problems.extend(contradicting(left, probability))
-    single, facts = redundancy(*as_surveyed_and_seen(points, results, geoid))
+    single, facts = redundancy(*as_surveyed_and_seen(points, results, geoid), is_level)
     if single and config.gnss.mode == "off":
         log.warning("%s", single)
     if sequence.gnss is not None and len(sequence.gnss):

@@ -49,12 +49,19 @@ def test_fixes_that_disagree_with_control_points_are_said(off: list[float], said
 
 
 def test_two_points_have_no_redundancy() -> None:
-    said, facts = redundancy(np.array([[0.0, 0, 0], [0, 0, 101]]), np.array([[5.0, 0, 0], [5, 100, 0]]))
+    said, facts = redundancy(np.array([[0.0, 0, 0], [0, 0, 101]]), np.array([[5.0, 0, 0], [5, 100, 0]]), is_level=False)
     assert "no redundancy" in said
     assert "1.0100 times as far" in said
     assert facts == {"redundancy": 0, "scale_to_odometry": 1.01}
-    assert redundancy(np.zeros((3, 3)), np.zeros((3, 3))) == ("", {})
-    assert redundancy(np.ones((2, 3)), np.zeros((2, 3))) == ("", {})
+    assert redundancy(np.ones((2, 3)), np.zeros((2, 3)), is_level=False) == ("", {})
+
+
+def test_heights_of_three_points_have_no_redundancy_unless_up_is_known() -> None:
+    said, facts = redundancy(np.zeros((3, 3)), np.zeros((3, 3)), is_level=False)
+    assert "the heights of three have no redundancy" in said
+    assert facts == {"height_redundancy": 0}
+    assert redundancy(np.zeros((3, 3)), np.zeros((3, 3)), is_level=True) == ("", {})
+    assert redundancy(np.zeros((4, 3)), np.zeros((4, 3)), is_level=False) == ("", {})
 
 
 class Walls:
