@@ -69,7 +69,7 @@ def estimate(
         middle = tracker.middle
         result = tracker.track(loaded)
         if results:
-            results[-1] = told_by_next(results[-1], result, tracker, middle)
+            results[-1] = between_middles(results[-1], result, tracker, middle)
         stages = {"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages}
         if keyframing is not None:
             began = time.perf_counter()
@@ -125,7 +125,9 @@ def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
     return given_up or sum(r.status == "ok" for r in results) < max(1, len(results) // 2)
 
 
-def told_by_next(result: ScanResult, following: ScanResult, tracker: Tracker, middle: tuple[int, Floats]) -> ScanResult:
+def between_middles(
+    result: ScanResult, following: ScanResult, tracker: Tracker, middle: tuple[int, Floats]
+) -> ScanResult:
     """The result with its pose at the stamp between the middles of its sweep and the next one, where it lies there.
 
     middle : instant, ns, and pose of the middle of its own sweep; that of the following is the tracker's
