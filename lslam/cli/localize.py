@@ -10,7 +10,6 @@ import click
 
 from lslam.cli import options
 from lslam.cli import run as main_job
-from lslam.cli.console import setup_logging
 
 
 @click.command(
@@ -67,20 +66,15 @@ def command(sequence: str, map_path: Path, **given: Any) -> None:
     Where the map has changed or ends, odometry carries on; localization.csv says where. Exit 1 when the drive is not found
     in the map.
     """
-    setup_logging(given["verbose"], given["quiet"])
-    from lslam.warned import hearing
-
     options.require_there(map_path)
     settings = [f"localize.map={json.dumps(str(map_path), ensure_ascii=False)}", "loops.use=false"]
     if given["start"] is not None:
         settings.append(f"localize.start={json.dumps(_start_of(given['start']))}")
     if not given["save_map"]:
         settings.append("map.write=false")
-    others = {str(p.name): () if getattr(p, "multiple", False) else None for p in main_job.command.params}
     about = {"start": given["first"], "gnss": "fit" if given["gnss"] else None}
     about["settings"] = (*given["settings"], *settings)
-    with hearing():
-        main_job.perform(sequence, {**others, **given, **about})
+    click.get_current_context().invoke(main_job.command, sequence=sequence, **{**given, **about})
 
 
 def _start_of(text: str) -> list[float]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, NoReturn
 
@@ -50,8 +52,24 @@ LIBRARIES = (
 )
 
 
+class PipeContext(click.Context):
+    """A context for which a closed pipe behind stdout (`lslam ... | head`) is no error; click exits with 1."""
+
+    def __exit__(self, *error: Any) -> bool | None:
+        """As click does, but what a closed pipe ends has ended well."""
+        super().__exit__(*error)
+        if not isinstance(error[1], BrokenPipeError):
+            return None
+        from lslam.cli.console import leave_stdout
+
+        leave_stdout()
+        raise click.exceptions.Exit(0) from None
+
+
 class LazyGroup(click.Group):
     """A group that imports a sub-command's module only when it is called, so that `--help` is instant."""
+
+    context_class = PipeContext
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names in the order of the table."""
@@ -64,26 +82,6 @@ class LazyGroup(click.Group):
         command = import_module(f"lslam.cli.{cmd_name}").command
         assert isinstance(command, click.Command)
         return command
-
-    def make_context(self, *args: Any, **more: Any) -> click.Context:
-        """As click does, but a closed pipe behind --help and --version is no error; click exits with 1."""
-        try:
-            return super().make_context(*args, **more)
-        except BrokenPipeError:
-            from lslam.cli.console import leave_stdout
-
-            leave_stdout()
-            raise click.exceptions.Exit(0) from None
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """As click does, but a closed pipe behind stdout (`lslam ... | head`) is no error."""
-        try:
-            return super().invoke(ctx)
-        except BrokenPipeError:
-            from lslam.cli.console import leave_stdout
-
-            leave_stdout()
-            return 0
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         """As click does, but the error about an unknown name suggests the nearest one."""
@@ -131,16 +129,17 @@ def main() -> NoReturn:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours
     # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
-    with heeded():
-        code = _call()
-    sys.exit(code)
-
-
-def _call() -> int:
-    try:
+    with heeded(), _exit_codes():
         code = cli(standalone_mode=False)
         is_too_late()
-        return code if isinstance(code, int) else 0
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+@contextmanager
+def _exit_codes() -> Iterator[None]:
+    """An error in the block ends the process, with one sentence and its exit code."""
+    try:
+        yield
     except LslamError as error:
         _fail(str(error), error.exit_code)
     except click.ClickException as error:

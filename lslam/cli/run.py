@@ -97,33 +97,28 @@ def command(sequence: str, **given: Any) -> None:
     from lslam.warned import hearing
 
     with hearing():
-        perform(sequence, given)
+        _check_folder(given)
+        opened, config = opened_with({**given, "sequence": sequence})
+        truth = read_truth(given["gt"], opened)
+        from lslam.pipeline.run import plan, run
+        from lslam.pipeline.run_folder import default_folder
+        from lslam.profiling import profiled
 
-
-def perform(sequence: str, given: dict[str, Any]) -> None:
-    """Run what the options describe, and print the result."""
-    _check_folder(given)
-    opened, config = opened_with({**given, "sequence": sequence})
-    truth = read_truth(given["gt"], opened)
-    from lslam.pipeline.run import plan, run
-    from lslam.pipeline.run_folder import default_folder
-    from lslam.profiling import profiled
-
-    out = given["out"] or default_folder(opened.name, _variant(config))
-    if given["dry_run"]:
-        _print_plan(plan(opened, config, truth), config, out, given["as_json"])
-        return
-    try:
-        with heeded() as stop, profiled(given["profile"]), ExitStack() as stack:
-            run(
-                opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
-                command=shlex.join(["lslam", *sys.argv[1:]]),
-                reading={name: text for name, text in options.reading_of(given).items() if text is not None},
-                watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
-            )  # fmt: skip
-    except RunFinishedError as finished:
-        log.info("%s", finished)
-        print_finished(out, given["as_json"])
+        out = given["out"] or default_folder(opened.name, _variant(config))
+        if given["dry_run"]:
+            _print_plan(plan(opened, config, truth), config, out, given["as_json"])
+            return
+        try:
+            with heeded() as stop, profiled(given["profile"]), ExitStack() as stack:
+                run(
+                    opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
+                    command=shlex.join(["lslam", *sys.argv[1:]]),
+                    reading={name: text for name, text in options.reading_of(given).items() if text is not None},
+                    watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
+                )  # fmt: skip
+        except RunFinishedError as finished:
+            log.info("%s", finished)
+            print_finished(out, given["as_json"])
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
