@@ -61,7 +61,8 @@ def command(run: Path, **given: Any) -> None:
         raise UsageError("--overwrite does everything anew and --resume keeps finished parts: give one of them")
     options.require_there(given["loops_file"], given["control"], given["gt"])
     from lslam.cli.run import print_finished, print_result, read_truth, watch_of
-    from lslam.pipeline.regraph import open_again, optimise_again, read_for_graph, reading_of, require_another
+    from lslam.pipeline.regraph import open_again, read_for_graph, reading_of, require_another
+    from lslam.pipeline.run import run as main_job
     from lslam.pipeline.run_folder import check_target
     from lslam.stopping import heeded
 
@@ -76,8 +77,9 @@ def command(run: Path, **given: Any) -> None:
     reading = reading_of(known, given["sequence"], **options.reading_of(given))
     try:
         with heeded() as stop, ExitStack() as stack:
-            optimise_again(
-                known, opened, out, reading=reading, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
+            main_job(
+                opened, known.config, out=out, earlier=known, reading=reading, ground_truth=truth,
+                overwrite=given["overwrite"], resume=given["resume"],
                 command=shlex.join(["lslam", *sys.argv[1:]]),
                 watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
             )  # fmt: skip

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from collections.abc import Sequence as Many
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -24,20 +22,18 @@ from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
 from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
-from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.find_loops import find_loops, verify_known
 from lslam.osm.hold import hold_by_buildings
-from lslam.osm.source import OsmSource
+from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run_tables import write_loops, write_osm_matches
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference
-from lslam.types.manual import ControlPoint, Manual
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -47,17 +43,13 @@ from lslam.version import __version__
 log = logging.getLogger("lslam")
 
 
-def optimise_poses(
-    sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest,
-    osm: OsmSource | None = None, checkpoints: Checkpoints | None = None,
-    should_stop: Callable[[], bool] = lambda: False, manual: Manual | None = None,
-) -> BackEnd:  # fmt: skip
+def optimise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
     """Put the final poses into `record`, and what the graph did into the manifest.
 
-    A run that was interrupted, or whose odometry is lost, keeps what it has; `should_stop` is asked between keyframes, before
-    the graph and wherever its loops turn. `checkpoints` keep the loops that were found. `manual` : what a person knows.
+    A run that was interrupted, or whose odometry is lost, keeps what it has; whether to stop is asked between keyframes, before
+    the graph and wherever its loops turn.
     """
-    manual = manual or Manual()
+    config, manifest, store, manual = job.config, job.manifest, job.store, job.manual
     if config.debug.drift:
         manifest.problems.append(added_drift.describe(config.debug))
         log.warning("%s", manifest.problems[-1])
@@ -67,22 +59,20 @@ def optimise_poses(
     if manifest.outcome in ("interrupted", "diverged"):
         return BackEnd(record.results)
     clocks = KeyframeClocks()
-    hold = None if osm is None else partial(hold_by_buildings, osm)
+    hold = None if job.osm is None else partial(hold_by_buildings, job.osm)
     with manifest.timed("back_end_s"):
         candidates: list[LoopCandidate] = []
         try:
             if config.loops.use or manual.pairs:
                 with manifest.timed("loops_s"):
                     pairs = keyframe_pairs(manual.pairs, record.results, store.keyframes)
-                    candidates, said = _loops(
-                        store, record.results, config, manual.points, pairs, checkpoints, clocks, should_stop
-                    )
+                    candidates, said = _loops(job, record.results, pairs, clocks)
                     manifest.problems += [*pairs.problems, *said]
-            if should_stop():
+            if job.watch.should_stop():
                 raise InterruptedRunError("interrupted before the pose graph")
-            with asking(should_stop, "interrupted before the pose graph was solved"):
+            with asking(job.watch.should_stop, "interrupted before the pose graph was solved"):
                 done = run_back_end(
-                    sequence, record.results, store, config, candidates, record.turns, hold, clocks, record.inertial,
+                    job.sequence, record.results, store, config, candidates, record.turns, hold, clocks, record.inertial,
                     manual.points,
                 )  # fmt: skip
         except InterruptedRunError as error:
@@ -106,14 +96,14 @@ def optimise_poses(
 
 
 def _loops(
-    store: KeyframeStore, results: list[ScanResult], config: Config, points: Many[ControlPoint], pairs: KeyframePairs,
-    checkpoints: Checkpoints | None, clocks: KeyframeClocks, should_stop: Callable[[], bool],
-) -> tuple[list[LoopCandidate], list[str]]:  # fmt: skip
+    job: PreparedRun, results: list[ScanResult], pairs: KeyframePairs, clocks: KeyframeClocks
+) -> tuple[list[LoopCandidate], list[str]]:
     """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses.
 
     The known pairs come first: the others are searched from where those and control points put the keyframes. Beside them what
     is doubtful about the known ones.
     """
+    store, config, checkpoints, should_stop = job.store, job.config, job.kept("loops"), job.watch.should_stop
     poses = np.array([k.T_world_lidar for k in store.keyframes]).reshape(-1, 4, 4)
     known = None if checkpoints is None else checkpoints.latest()
     if known is not None and np.array_equal(known["poses"], poses):
@@ -126,7 +116,7 @@ def _loops(
         taken = {(c.a, c.b) for c in candidates}
         found = find_loops(
             store, config.loops, config.registration, submap_size, clocks, should_stop, config.input.workers,
-            where_held(store.keyframes, candidates, points, results, config), pairs.forbidden,
+            where_held(store.keyframes, candidates, job.manual.points, results, config), pairs.forbidden,
         )  # fmt: skip
         candidates += [c for c in found if (c.a, c.b) not in taken]
     if checkpoints is not None:

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from lslam.backend.outcome import BackEnd
 from lslam.config import Config
 from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
 from lslam.evaluation.evaluate import Evaluation
@@ -17,80 +22,84 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
-from lslam.pipeline.stages import make_feature_map, make_map, make_report, solve
+from lslam.pipeline.stages import make_feature_map, make_map, make_report
 from lslam.pipeline.storage import check_place, spool_of, upload
-from lslam.pipeline.watch import RunOutcome
 from lslam.remote import RemotePath
 from lslam.types.run_record import RunRecord
+
+if TYPE_CHECKING:
+    from lslam.pipeline.rebuild import EarlierRun
 
 log = logging.getLogger("lslam")
 
 
-def perform(
-    job: PreparedRun, out: Path | None, overwrite: bool, resume: bool, odometry_of: Path | None = None
-) -> RunOutcome:  # fmt: skip
-    """The run, into its folder when there is one; `odometry_of` : the folder of a run whose odometry serves."""
-    manifest = job.manifest
-    if isinstance(out, RemotePath):
-        return _perform_afar(job, out, overwrite, resume)
+@contextmanager
+def in_folder(
+    job: PreparedRun, out: Path | None, overwrite: bool, resume: bool, earlier: EarlierRun | None
+) -> Iterator[PreparedRun]:
+    """The run with its folder, which is held for the block and, in storage, uploaded after it; unchanged without one.
+
+    The status is written last, however the block ends. One in storage is filled on this machine; what is to go on stays there.
+    earlier : the run whose odometry serves
+    """
     if out is None:
-        record, _, evaluation = solve(job, KeyframeStore(deflate=job.config.keyframes.deflate))
-        manifest.take_over(record)
-        record.manifest = manifest.as_dict(manifest.outcome)
-        return RunOutcome(record, evaluation)
+        yield job
+        return
+    manifest = job.manifest
+    place = out if isinstance(out, RemotePath) else None
+    if place is not None:
+        check_place(place, overwrite or resume)
     manifest.identity = run_identity(job.sequence, job.truth, job.config, job.given)
-    goes_on = resume and may_go_on(out, manifest.identity, job.config)
-    with RunFolder(out, overwrite or resume, goes_on) as folder:
+    if place is not None and resume:
+        may_go_on(place, manifest.identity, job.config)
+    path = out if place is None else spool_of(place)
+    try:
+        goes_on = resume and may_go_on(path, manifest.identity, job.config)
+    except RunFinishedError:
+        if place is not None:  # it was not uploaded
+            upload(path, place)
+        raise
+    with RunFolder(path, overwrite or resume or place is not None, goes_on) as folder:
         try:
-            if odometry_of is not None:
-                folder.write_text("config.toml", outputs.config_text(job.config))
-                folder.begin_from(odometry_of)
-            record, evaluation = _fill(folder, job, goes_on or odometry_of is not None, odometry_of is not None)
+            yield _begun(job, folder, goes_on, earlier)
         except BaseException as error:
-            status = manifest.word_for(error)
-            _write_last(folder, manifest.as_dict(status, str(error) or type(error).__name__))
+            _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error) or type(error).__name__))
             raise
         if manifest.outcome != "interrupted":
             folder.keep_odometry()
-        folder.write_manifest(record.manifest)
+        folder.write_manifest(manifest.last)
         if manifest.outcome != "interrupted":
             folder.drop_checkpoint()
         log.info("%s; results in %s", manifest.outcome, folder.path)
-    return RunOutcome(record, evaluation)
+    if place is not None and manifest.outcome != "interrupted":
+        upload(path, place)
 
 
-def _perform_afar(job: PreparedRun, place: RemotePath, overwrite: bool, resume: bool) -> RunOutcome:
-    """The run, into a folder of this machine that is uploaded when it has ended; what is to go on stays where it is."""
-    check_place(place, overwrite or resume)
-    if resume:
-        may_go_on(place, run_identity(job.sequence, job.truth, job.config, job.given), job.config)
-    spool = spool_of(place)
-    try:
-        outcome = perform(job, spool, not resume, resume)
-    except RunFinishedError:  # and was not uploaded
-        upload(spool, place)
-        raise
-    if job.manifest.outcome != "interrupted":
-        upload(spool, place)
-    return outcome
+def _begun(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierRun | None) -> PreparedRun:
+    """The run in its folder, which says so from now on.
 
-
-def _fill(
-    folder: RunFolder, job: PreparedRun, goes_on: bool, has_odometry: bool = False
-) -> tuple[RunRecord, Evaluation | None]:
-    """The whole result in a run folder, the last word of its manifest aside; `has_odometry` : that of another run serves.
-
-    Raises InputError when that cannot be read.
+    Raises InputError when the odometry of the earlier run cannot be read.
     """
     folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
     folder.write_text("config.toml", outputs.config_text(job.config))
+    if earlier is not None:
+        folder.begin_from(earlier.folder)
     folder.write_manifest(job.manifest.as_dict("running"))
     store = KeyframeStore(folder.path / KEYFRAMES, deflate=job.config.keyframes.deflate)
-    checkpoints = odometry_checkpoints(folder, job.odometry, job.config, goes_on)
-    if has_odometry and (checkpoints is None or not checkpoints.is_over):
+    checkpoints = odometry_checkpoints(folder, job, goes_on or earlier is not None)
+    if earlier is not None and (checkpoints is None or not checkpoints.is_over):
         raise InputError("the state of the run's odometry is damaged or incomplete: run the sequence again")
-    record, done, evaluation = solve(job, store, folder.path, checkpoints)
-    write_back_end(folder.path, record, store, done)
+    return replace(job, store=store, folder=folder, checkpoints=checkpoints)
+
+
+def write_results(job: PreparedRun, record: RunRecord, done: BackEnd, evaluation: Evaluation | None) -> None:
+    """The whole result, into the folder of the run where it has one, and the manifest into the record."""
+    folder = job.folder
+    if folder is None:
+        job.manifest.take_over(record)
+        record.manifest = job.manifest.conclude()
+        return
+    write_back_end(folder.path, record, job.store, done)
     if job.osm is not None and record.buildings is not None:
         write_buildings(folder.path, record.buildings, job.osm.data)
     outputs.write_trajectories(folder, record, job.sequence.calibration)
@@ -103,7 +112,6 @@ def _fill(
         outputs.write_evaluation(folder, record, evaluation)
     make_feature_map(folder, job, record)
     make_report(folder, job, record, evaluation)
-    return record, evaluation
 
 
 def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:

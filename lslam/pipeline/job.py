@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,12 @@ from lslam.doctor.examine_truth import examine_jumps
 from lslam.doctor.examine_units import examine_units
 from lslam.errors import InputError, InterruptedRunError
 from lslam.evaluation.frames import main_axis
+from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.frontend.inertial_start import with_imu_settings
 from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
+from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.given import GivenMotion, GivenPoses
@@ -28,6 +30,7 @@ from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline.check import check_config
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.prior_map_files import require_map
+from lslam.pipeline.run_folder import RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
@@ -44,7 +47,10 @@ log = logging.getLogger("lslam")
 
 @dataclass(frozen=True)
 class PreparedRun:
-    """What is to be done, resolved: the chosen scans, the method, the truth and the map; `given` are the poses of --poses."""
+    """What is to be done, resolved: the chosen scans, the method, the truth and the map; `given` are the poses of --poses.
+
+    store : the keyframes; folder, checkpoints : None for a run that stays in memory
+    """
 
     sequence: Sequence
     odometry: Odometry
@@ -53,8 +59,16 @@ class PreparedRun:
     given: Trajectory | None
     manifest: Manifest
     watch: Watch
-    osm: OsmSource | None = None
-    manual: Manual = field(default_factory=Manual)
+    osm: OsmSource | None
+    manual: Manual
+    store: KeyframeStore
+    folder: RunFolder | None = None
+    checkpoints: OdometryCheckpoints | None = None
+
+    def kept(self, stage: str) -> Checkpoints | None:
+        """Checkpoints of a later stage beside those of odometry."""
+        every_s = self.config.odometry.checkpoint_s
+        return None if self.checkpoints is None else Checkpoints(self.checkpoints.folder, stage, every_s)
 
 
 def prepare(
@@ -77,7 +91,8 @@ def prepare(
     chosen = choose_scans(sequence, odometry, config)
     osm = open_osm(sequence, config)
     manual = read_manual(config, chosen)
-    return PreparedRun(chosen, odometry, config, truth, given, Manifest(command, chosen, config), watch, osm, manual)
+    manifest, store = Manifest(command, chosen, config), KeyframeStore(deflate=config.keyframes.deflate)
+    return PreparedRun(chosen, odometry, config, truth, given, manifest, watch, osm, manual, store)
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from lslam.config import Config
 from lslam.errors import InterruptedRunError, RunFailedError
 from lslam.formats.state_files import Records
-from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead, to_trajectory
 from lslam.geometry import noise, se3
 from lslam.geometry.geodesy import to_local
@@ -26,6 +25,7 @@ from lslam.localization.follow import MapFollower, doubted
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import LocalView, PriorMap
 from lslam.localization.start import PlaceFinder, Start, StartPrior
+from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import motion_within
 from lslam.pipeline.prior_map_files import read_prior_map
@@ -47,22 +47,20 @@ MOST_SAID = 3
 ANTENNA_M = 3.0
 
 
-def localise_poses(
-    sequence: Sequence, record: RunRecord, store: KeyframeStore, config: Config, manifest: Manifest, watch: Watch,
-    checkpoints: Checkpoints | None = None,
-) -> None:  # fmt: skip
+def localise_poses(job: PreparedRun, record: RunRecord) -> None:
     """Put the poses in the map's frame into `record`, and what became of each scan.
 
     A run that was interrupted, or whose odometry is lost, keeps what it has. Raises RunFailedError when the drive is not found in
     the map.
     """
+    config, manifest = job.config, job.manifest
     if manifest.outcome in ("interrupted", "diverged"):
         return
     with manifest.timed("localise_s"):
         prior_map = read_prior_map(Path(config.localize.map), config.registration)
         try:
-            search = PlaceFinder(PlaceSearch(prior_map, config.registration), store, config)
-            fixes, start = _followed(sequence, record.results, prior_map, search, config, watch, checkpoints)
+            search = PlaceFinder(PlaceSearch(prior_map, config.registration), job.store, config)
+            fixes, start = _followed(job, record.results, prior_map, search)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return
@@ -71,10 +69,10 @@ def localise_poses(
 
 
 def _followed(
-    sequence: Sequence, results: list[ScanResult], prior_map: PriorMap, search: PlaceFinder, config: Config,
-    watch: Watch, checkpoints: Checkpoints | None,
-) -> tuple[list[MapFix], dict[str, Any]]:  # fmt: skip
+    job: PreparedRun, results: list[ScanResult], prior_map: PriorMap, search: PlaceFinder
+) -> tuple[list[MapFix], dict[str, Any]]:
     """Every scan against the map; poses are still in level axes. And how the start was found."""
+    sequence, config, watch, checkpoints = job.sequence, job.config, job.watch, job.kept("localise")
     known = None if checkpoints is None else checkpoints.latest()
     poses = np.stack([r.T_world_lidar for r in results])
     of_map = hashlib.sha256(prior_map.points.tobytes()).hexdigest()

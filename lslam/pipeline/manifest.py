@@ -49,6 +49,7 @@ class Manifest:
     integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
     problems : what went wrong in this run, beside what was wrong with the recording before; warnings : what its log warns of,
         which stands behind them in the file and does not decide how the run ended
+    last : what the file says of a run that is over
     """
 
     def __init__(self, command: str, sequence: Sequence, config: Config) -> None:
@@ -72,6 +73,7 @@ class Manifest:
         self.localization: dict[str, Any] = {}
         self.identity: dict[str, str] = {}
         self.resumed_after: list[int] = []
+        self.last: dict[str, Any] = {}
         self._ended = ""
 
     @property
@@ -132,6 +134,11 @@ class Manifest:
     def word_for(self, error: BaseException) -> str:
         """Status of a run that `error` ended."""
         return "interrupted" if isinstance(error, InterruptedRunError) or is_interrupt(error) else "failed"
+
+    def conclude(self) -> dict[str, Any]:
+        """The manifest of a run that has come to its end, kept as `last`."""
+        self.last = self.as_dict(self.outcome)
+        return self.last
 
     def as_dict(self, status: str, why: str = "") -> dict[str, Any]:
         """The manifest as plain values."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from contextlib import suppress
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 
@@ -29,40 +28,37 @@ from lslam.odometry.given import GivenPoses
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import prior
-from lslam.osm.source import OsmSource
+from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import helped
-from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
-from lslam.pipeline.watch import Watch
+from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.types.constraint import Turn
 from lslam.types.inertial_state import InertialChain
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 
 _FAULTS_NAMED = 10  # scans
-# Sentences of one run; the scans beyond are marked all the same.
 # Sections that choose no kernel; of buildings it is enough whether there are any.
 _WITHOUT_KERNELS = {"input", "keyframes", "graph", "gnss", "osm", "eval", "report"}
 _warmed: set[tuple[object, ...]] = set()
 
 
-def estimate_poses(
-    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, folder: Path | None, truth: Trajectory | None,
-    watch: Watch, store: KeyframeStore, checkpoints: OdometryCheckpoints | None = None, osm: OsmSource | None = None,
-) -> RunRecord:  # fmt: skip
-    """Odometry over all scans, judged; its keyframes go to `store`, and `checkpoints` say where an earlier run left off.
+def estimate_poses(job: PreparedRun) -> RunRecord:
+    """Odometry over all scans, judged; its keyframes go to the store, and the checkpoints say where an earlier run left off.
 
     Raises InputError when no scan can be used.
     """
+    sequence, config, manifest, watch = job.sequence, job.config, job.manifest, job.watch
+    checkpoints, store, osm = job.checkpoints, job.store, job.osm
+    folder = None if job.folder is None else job.folder.path
+    if osm is not None:
+        osm.begin(None if folder is None else folder / REPLIES)
     stationary = StationaryDetector(config.preprocess, config.registration) if config.preprocess.skip_standing else None
     monitor = IntegrityMonitor(config.preprocess, config.registration) if config.odometry.integrity else None
-    is_over = checkpoints is not None and checkpoints.is_over
-    _warm_up(sequence, odometry, stationary, monitor, config, manifest, is_over)
+    _warm_up(job, stationary, monitor)
 
     if osm is not None and checkpoints is not None:
         for result in checkpoints.results:
@@ -77,11 +73,11 @@ def estimate_poses(
 
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
     limit = config.odometry.max_failures
-    inertial = _begin_imu(sequence, odometry, config, manifest, checkpoints)
-    motion = odometry.motion if isinstance(odometry, GivenPoses) else inertial.motion
+    inertial = _begin_imu(job)
+    motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
-            sequence, odometry, threads=config.input.workers, max_failures=limit, stationary=stationary,
+            sequence, job.odometry, threads=config.input.workers, max_failures=limit, stationary=stationary,
             motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
             checkpoints=checkpoints, monitor=monitor,
         )  # fmt: skip
@@ -105,7 +101,7 @@ def estimate_poses(
         folder=folder,
         results=results,
         trajectory=to_trajectory(results, config.odometry.method),
-        ground_truth=truth,
+        ground_truth=job.truth,
         checks=[] if monitor is None else monitor.checks,
         real_time_limit=config.input.skip_frames / sequence.rate_hz,
         pose_time=manifest.pose_time,
@@ -138,38 +134,35 @@ def _turns(inertial: Inertial, store: KeyframeStore, config: Config) -> list[Tur
     return found
 
 
-def odometry_checkpoints(
-    folder: RunFolder, odometry: Odometry, config: Config, goes_on: bool
-) -> OdometryCheckpoints | None:
+def odometry_checkpoints(folder: RunFolder, job: PreparedRun, goes_on: bool) -> OdometryCheckpoints | None:
     """Checkpoints in a run folder; None when they are not wanted. Says so when an earlier run left none to go on from."""
-    every_s = config.odometry.checkpoint_s
+    every_s = job.config.odometry.checkpoint_s
     if every_s == 0:
         return None
     checkpoints = OdometryCheckpoints(Checkpoints(folder.path / CHECKPOINT, "odometry", every_s))
     if goes_on and not checkpoints.scans:
-        why = "there is no checkpoint to go on from" if isinstance(odometry, Resumable) else "its state is its own"
-        log.info("%s begins again at the first scan: %s", config.odometry.method, why)
+        has_state = isinstance(job.odometry, Resumable)
+        why = "there is no checkpoint to go on from" if has_state else "its state is its own"
+        log.info("%s begins again at the first scan: %s", job.config.odometry.method, why)
     return checkpoints
 
 
-def _warm_up(
-    sequence: Sequence, odometry: Odometry, stationary: StationaryDetector | None, monitor: IntegrityMonitor | None,
-    config: Config, manifest: Manifest, is_over: bool,
-) -> None:  # fmt: skip
+def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: IntegrityMonitor | None) -> None:
     """Compile or load what the scans would otherwise wait for, less of it when odometry is over.
 
     What this process has loaded stays: a worker of a study does it once for all its runs alike.
     """
-    alike = type(odometry), is_over, bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
+    config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
+    alike = type(job.odometry), is_over, bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
     with (
-        manifest.timed("compile_s"), one_at_a_time(jit.lock_file(), "compiles kernels"), helped(config) as start_helper,
+        job.manifest.timed("compile_s"), one_at_a_time(jit.lock_file(), "compiles kernels"), helped(config) as start_helper,
         jit.announced(log, start_helper),
     ):  # fmt: skip
         if alike not in _warmed:
-            _load_kernels(odometry, stationary, monitor, config, is_over)
+            _load_kernels(job.odometry, stationary, monitor, config, is_over)
             _warmed.add(alike)
         with suppress(InputError):
-            measurable(sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn
+            measurable(job.sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn
 
 
 def _load_kernels(
@@ -196,20 +189,19 @@ def _load_kernels(
         inertial_start.warm_up()
 
 
-def _begin_imu(
-    sequence: Sequence, odometry: Odometry, config: Config, manifest: Manifest, checkpoints: OdometryCheckpoints | None
-) -> Inertial:
+def _begin_imu(job: PreparedRun) -> Inertial:
     """The IMU's part, empty without one; as an earlier run found it, when that left off on the way."""
+    config = job.config
     if not config.imu.use:
         return Inertial(None)
-    path = None if checkpoints is None else checkpoints.folder / "imu.npz"
-    with manifest.timed("imu_start_s"):
+    path = None if job.checkpoints is None else job.checkpoints.folder / "imu.npz"
+    with job.manifest.timed("imu_start_s"):
         known = None if path is None else load_start(path, config)
-        inertial = begin_inertial(sequence, config) if known is None else known
+        inertial = begin_inertial(job.sequence, config) if known is None else known
         if path is not None and known is None:
             path.parent.mkdir(exist_ok=True)
             save_start(path, inertial)
-    if getattr(odometry, "ignores_prior", False):
+    if getattr(job.odometry, "ignores_prior", False):
         inertial.problems.append(f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail")
     return inertial
 

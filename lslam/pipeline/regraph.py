@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from lslam.config import Config
 from lslam.config.load import load_config
 from lslam.errors import InputError, UsageError
-from lslam.pipeline.deliver import perform, raise_outcome
-from lslam.pipeline.job import prepare
 from lslam.pipeline.rebuild import EarlierRun, read_run, recording_of
 from lslam.pipeline.run_folder import require_odometry
-from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.readers import open_sequence
 from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
-from lslam.warned import hearing
 
 # Sections that odometry does not look at.
 FREE = ("loops", "graph", "gnss", "osm", "map", "eval", "report")
@@ -43,33 +35,6 @@ def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
     return told | {name: value for name, value in reading.items() if value is not None}
 
 
-def optimise_again(
-    run: EarlierRun, sequence: Sequence, out: Path, *, reading: Mapping[str, str] | None = None,
-    ground_truth: Trajectory | None = None, overwrite: bool = False, resume: bool = False, command: str = "",
-    watch: Watch | None = None,
-) -> RunOutcome:  # fmt: skip
-    """A run folder at `out` with the odometry of `run` and the pose graph of its configuration; `run` stays as it is.
-
-    reading : options that the sequence was opened with, for the manifest
-
-    Raises as `pipeline.run`, and UsageError for settings that odometry would have to be run again for.
-    """
-    watch = watch or Watch()
-    require_another(run.folder, out)
-    _require_same_odometry(run)
-    with hearing() as heard:
-        job = prepare(sequence, run.config, ground_truth, command, watch)
-        stamps = np.asarray(job.sequence.stamps_ns)
-        if not np.array_equal(stamps, run.trajectory.stamps_ns):
-            raise InputError(f"{sequence.path} does not fit {run.folder}: its {len(stamps)} scans have other stamps")
-        job.manifest.reading = dict(reading or {})
-        job.manifest.warnings = heard
-        outcome = perform(job, out, overwrite, resume, odometry_of=run.folder)
-    watch.on_end(outcome)
-    raise_outcome(job.manifest, job.config, ", and --resume goes on")
-    return outcome
-
-
 def require_another(run: Path, out: Path) -> None:
     """Raise UsageError when both are one folder, by whatever name."""
     if out.resolve() == run.resolve():
@@ -88,9 +53,13 @@ def _require_same_odometry(run: EarlierRun) -> None:
 
 
 def read_for_graph(folder: Path, settings: list[str]) -> EarlierRun:
-    """As `read_run`; raises InputError for a run that kept no odometry, or was located in a map."""
+    """As `read_run`, for `pipeline.run` to take as `earlier`.
+
+    Raises InputError for a run that kept no odometry, or was located in a map, UsageError for settings of odometry.
+    """
     run = read_run(folder, settings)
     require_odometry(folder)
     if run.config.localize.map:
         raise InputError(f"{folder} was located in a map, which takes the place of a pose graph")
+    _require_same_odometry(run)
     return run

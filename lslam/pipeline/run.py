@@ -1,18 +1,27 @@
-"""A sequence goes in; a trajectory, a map and an honest report come out: `job` resolves, `stages` work, `deliver` writes."""
+"""A sequence goes in; a trajectory, a map and an honest report come out: `job` resolves, passes work, `deliver` writes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from lslam.config import Config
-from lslam.pipeline.deliver import perform, raise_outcome
-from lslam.pipeline.job import prepare
+from lslam.errors import InputError
+from lslam.pipeline.deliver import in_folder, raise_outcome, write_results
+from lslam.pipeline.job import announce, prepare
+from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.stages import finalise_poses, score
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.remote import as_path
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 from lslam.warned import hearing
+
+if TYPE_CHECKING:
+    from lslam.pipeline.rebuild import EarlierRun
 
 
 def run(
@@ -26,6 +35,7 @@ def run(
     command: str = "",
     reading: Mapping[str, str] | None = None,
     watch: Watch | None = None,
+    earlier: EarlierRun | None = None,
 ) -> RunOutcome:
     """Estimate the trajectory of a sequence, build its map, score it when truth is known, and write the run folder.
 
@@ -38,6 +48,7 @@ def run(
     reading : options that `open_sequence` took (topics, extrinsics), for the manifest: `lslam map` needs them
     overwrite : replace an earlier run in `out`; resume : go on where it was killed or interrupted, if there is one
     command : what the manifest says the run was made by; watch : is told of progress, and may stop the run
+    earlier : a run of the same scans whose odometry serves, and is not run again
 
     Raises
     ------
@@ -48,8 +59,17 @@ def run(
     watch = watch or Watch()
     with hearing() as heard:
         job = prepare(sequence, config or Config(), ground_truth, command, watch)
+        if earlier is not None and not np.array_equal(job.sequence.stamps_ns, earlier.trajectory.stamps_ns):
+            count = len(job.sequence)
+            raise InputError(f"{job.sequence.path} does not fit {earlier.folder}: its {count} scans have other stamps")
         job.manifest.reading, job.manifest.warnings = dict(reading or {}), heard
-        outcome = perform(job, None if out is None else as_path(out), overwrite, resume)
+        with in_folder(job, None if out is None else as_path(out), overwrite, resume, earlier) as job:
+            announce(job)
+            record = estimate_poses(job)
+            done = finalise_poses(job, record)
+            evaluation = score(record, job.sequence, job.config)
+            write_results(job, record, done, evaluation)
+    outcome = RunOutcome(record, evaluation)
     watch.on_end(outcome)
     raise_outcome(job.manifest, job.config, "" if out is None else ", and --resume goes on")
     return outcome

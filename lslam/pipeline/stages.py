@@ -1,64 +1,40 @@
-"""The stages of a run, one after the other: poses, score, map, feature map, report."""
+"""The stages of a run after odometry: final poses, score, map, feature map, report."""
 
 from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from pathlib import Path
 
 from lslam.backend.outcome import BackEnd, view_loop
 from lslam.config import Config
 from lslam.errors import LslamError
 from lslam.evaluation.evaluate import Evaluation, evaluate
-from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import crispness
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import describe, level_world, optimise_poses
 from lslam.pipeline.feature_pass import build_feature_map, view_features
-from lslam.pipeline.job import PreparedRun, announce, stoppable
+from lslam.pipeline.job import PreparedRun, stoppable
 from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.map_pass import build_map, map_checkpoints
-from lslam.pipeline.odometry_pass import estimate_poses
-from lslam.pipeline.run_folder import REPLIES, RunFolder
+from lslam.pipeline.run_folder import RunFolder
 from lslam.types.run_record import RunRecord
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 
 
-def solve(
-    job: PreparedRun, store: KeyframeStore, folder: Path | None = None, checkpoints: OdometryCheckpoints | None = None
-) -> tuple[RunRecord, BackEnd, Evaluation | None]:
-    """The poses of all scans, made consistent and level, and their score."""
-    announce(job)
-    if job.osm is not None:
-        job.osm.begin(None if folder is None else folder / REPLIES)
-    record = estimate_poses(
-        job.sequence, job.odometry, job.config, job.manifest, folder, job.truth, job.watch, store, checkpoints, job.osm
-    )
+def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
+    """Put the final poses into the record: those of the pose graph, level; or, in its place, those in an existing map."""
     if job.config.localize.map:
-        return located(job, record, store, checkpoints)
-    loops = None if checkpoints is None else Checkpoints(checkpoints.folder, "loops", job.config.odometry.checkpoint_s)
-    done = optimise_poses(
-        job.sequence, record, store, job.config, job.manifest, job.osm, loops, job.watch.should_stop, job.manual
-    )
+        localise_poses(job, record)
+        if record.georeference is not None:
+            job.manifest.georeference = describe(record.georeference)
+        return BackEnd(record.results)
+    done = optimise_poses(job, record)
     level_world(record, job.sequence, job.config, job.manifest)
-    record.loop_view = view_loop(record, done, store)
-    return record, done, score(record, job.sequence, job.config)
-
-
-def located(
-    job: PreparedRun, record: RunRecord, store: KeyframeStore, checkpoints: OdometryCheckpoints | None
-) -> tuple[RunRecord, BackEnd, Evaluation | None]:
-    """The poses of all scans in the map of an earlier run, which takes the place of loops and pose graph."""
-    every_s = job.config.odometry.checkpoint_s
-    kept = None if checkpoints is None else Checkpoints(checkpoints.folder, "localise", every_s)
-    localise_poses(job.sequence, record, store, job.config, job.manifest, job.watch, kept)
-    if record.georeference is not None:
-        job.manifest.georeference = describe(record.georeference)
-    return record, BackEnd(record.results), score(record, job.sequence, job.config)
+    record.loop_view = view_loop(record, done, job.store)
+    return done
 
 
 def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
@@ -120,7 +96,7 @@ def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluati
     """report.html; the record's manifest is the run's last word, with the report's own time."""
     manifest = job.manifest
     manifest.take_over(record)
-    record.manifest = manifest.as_dict(manifest.outcome)
+    record.manifest = manifest.conclude()
     with manifest.timed("report_s"):
         if job.config.report.html:
             if isinstance(job.odometry, FeatureSource):
@@ -128,4 +104,4 @@ def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluati
             outputs.write_html(folder, record, evaluation)
     if job.watch.should_stop() and manifest.outcome not in ("interrupted", "diverged"):
         manifest.interrupt("interrupted before the report was whole")
-    record.manifest = manifest.as_dict(manifest.outcome)
+    record.manifest = manifest.conclude()

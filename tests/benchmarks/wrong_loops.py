@@ -24,14 +24,10 @@ from lslam.backend.outcome import BackEnd
 from lslam.config import Config, load_config
 from lslam.evaluation.associate import associate
 from lslam.frontend.register_scans import to_trajectory
-from lslam.keyframes.store import KeyframeStore
 from lslam.loops.find_loops import find_loops
-from lslam.odometry import create_odometry
-from lslam.pipeline.job import choose_scans
-from lslam.pipeline.manifest import Manifest
+from lslam.pipeline.job import prepare
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.watch import Watch
-from lslam.readers import open_sequence
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
 
@@ -50,13 +46,11 @@ def believed(done: BackEnd) -> set[tuple[int, int]]:
 
 
 def measure(path: str, config: Config, share: float, seeds: int) -> None:
-    sequence = choose_scans(open_sequence(path), create_odometry(config), config)
-    truth = sequence.ground_truth
+    job = prepare(path, config, None, "", Watch())
+    sequence, truth, store = job.sequence, job.truth, job.store
     if truth is None:
         sys.exit(f"{path} has no ground truth")
-    store = KeyframeStore()
-    manifest = Manifest("", sequence, config)
-    record = estimate_poses(sequence, create_odometry(config), config, manifest, Path(), truth, Watch(), store)
+    record = estimate_poses(job)
     print(f"{path}: {len(record.results)} scans, {len(store)} keyframes")
     for seed in range(seeds):
         results = added_drift.with_drift(record.results, config.debug.model_copy(update={"drift_seed": seed}))
