@@ -9,11 +9,7 @@ best, and only what no such process explains is odometry's.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +21,10 @@ Floats = NDArray[np.float64]
 
 # Size of the covariance: more fixes are averaged in groups.
 MOST = 60
-# Factors on odometry's drift that are tried, and refined.
-FACTORS = np.geomspace(1e-3, 1e5, 9)
+# Step of logarithms: finer than any of these numbers can be estimated.
+STEP = 0.1
+# Factors on odometry's drift.
+FACTORS = np.concatenate([[0.0], np.exp(np.arange(np.log(1e-3), np.log(1e5), STEP))])
 # Gain of the likelihood that pays for the one parameter of drift (Akaike 1974), where fixes are believed.
 AKAIKE = 1.0
 # Window of the median filter against outliers that the alignment accepts.
@@ -36,8 +34,9 @@ INSTANTS = 2000
 # Least white share of the variance, against singular covariances of perfect fixes.
 LEAST_WHITE = 1e-4
 # Correlation times that are tried, up to so many times the duration: beyond, an error is a constant. Variances likewise, from
-# a share of the white one, where they are unknown.
-MEMORIES, LONGEST, VARIANCES, LEAST_SLOW = 8, 10.0, 7, 0.01
+# a share of the white one, where they are unknown. Between them the logarithm of the likelihood is a spline, which is right
+# to 0.1 over an hour; its exponential is too narrow to be summed at so few.
+MEMORIES, LONGEST, VARIANCES, LEAST_SLOW = 12, 10.0, 13, 0.01
 
 
 @dataclass(frozen=True)
@@ -149,65 +148,32 @@ def _likeliest(
     apart = np.abs(t[:, None] - t)
     gap = float(np.median(np.diff(seconds)))
     memories = np.geomspace(gap, LONGEST * max(t[-1] - t[0], gap), MEMORIES)
-
-    def likelihood(unit: Floats, memory: float, variance: float, factor: float) -> float:
-        correlated = np.kron(variance * np.exp(-apart / memory), np.eye(3))
-        return _log_likelihood(known + correlated + factor * unit, sides)
-
-    nothing, *drifts = (
-        _Tried.over(partial(likelihood, unit), (memories, slow, factors))
-        for unit, factors in ((walk, np.zeros(1)), (walk, FACTORS), (rate, FACTORS))
-    )
+    # Six rates: the rank of their covariance.
+    values, axes = np.linalg.eigh(rate)
+    root = axes[:, -6:] * np.sqrt(np.maximum(values[-6:], 0.0))
+    tried = np.array([
+        [_log_likelihoods(known + variance * exponential, walk, root, sides) for variance in slow]
+        for exponential in (np.kron(np.exp(-apart / memory), np.eye(3)) for memory in memories)
+    ])  # fmt: skip
+    memories, likelihoods = _interpolated(memories, tried, 0)
+    slow, likelihoods = _interpolated(slow, likelihoods, 1)
     # Both drifts are as probable, and so are all time constants.
-    beside = np.logaddexp(*(one.marginal for one in drifts)) - np.log(2.0)
-    best = max(drifts, key=lambda one: one.likelihoods.max())
-    memory, variance, factor = (best if beside.max() - nothing.marginal.max() > least_gain else nothing).refined()
-    return memory, variance, factor
+    marginal = np.logaddexp.reduce(likelihoods, axis=(0, 2))
+    has_drift = marginal[:, 1:].max() - marginal[:, 0].max() > least_gain
+    possible = slice(1, None) if has_drift else slice(1)
+    considered = likelihoods[..., possible]
+    m, v, _, f = np.unravel_index(int(np.argmax(considered)), considered.shape)
+    return float(memories[m]), float(slow[v]), float(FACTORS[possible][f])
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """Logarithms of a likelihood of positive numbers, time constants first, at all combinations of the values `tried`."""
+def _interpolated(tried: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, Floats]:
+    """Positive numbers between those `tried`, and a cubic spline of the logarithms of their likelihoods along `axis`."""
+    from scipy.interpolate import CubicSpline
 
-    of: Callable[..., float]
-    tried: tuple[Floats, ...]
-    likelihoods: Floats
-
-    @classmethod
-    def over(cls, of: Callable[..., float], tried: tuple[Floats, ...]) -> _Tried:
-        """All of them."""
-        values = np.array([of(*at) for at in product(*tried)])
-        return cls(of, tried, values.reshape([len(one) for one in tried]))
-
-    @property
-    def marginal(self) -> Floats:
-        """The likelihood over time constants, of each combination of the others."""
-        return np.asarray(np.logaddexp.reduce(self.likelihoods, axis=0))
-
-    def refined(self) -> list[float]:
-        """The numbers at the maximum; those of which several were tried lie between them."""
-        from scipy.optimize import minimize
-
-        place = np.unravel_index(int(np.argmax(self.likelihoods)), self.likelihoods.shape)
-        best = [float(values[i]) for values, i in zip(self.tried, place, strict=True)]
-        free = [i for i, values in enumerate(self.tried) if len(values) > 1]
-
-        def at(logarithms: Floats) -> list[float]:
-            moved = list(best)
-            for i, logarithm in zip(free, logarithms, strict=True):
-                moved[i] = float(np.exp(np.clip(logarithm, np.log(self.tried[i][0]), np.log(self.tried[i][-1]))))
-            return moved
-
-        if not free:
-            return best
-        options: Any = {"xatol": 0.05, "fatol": 0.05, "maxfev": 150}
-
-        def cost(logarithms: Floats) -> float:
-            return -self.of(*at(logarithms))
-
-        found = minimize(cost, np.log([best[i] for i in free]), method="Nelder-Mead", options=options)
-        # Rounded, so that another machine's last bits do not show.
-        return at(np.round(found.x, 2))
+    if len(tried) == 1:
+        return tried, likelihoods
+    dense = np.geomspace(tried[0], tried[-1], 1 + round(float(np.log(tried[-1] / tried[0])) / STEP))
+    return dense, np.asarray(CubicSpline(np.log(tried), likelihoods, axis=axis)(np.log(dense)))
 
 
 def _lasting(metre: Floats, places: Floats) -> Floats:
@@ -225,19 +191,33 @@ def _lasting(metre: Floats, places: Floats) -> Floats:
     return np.asarray(effects @ metre @ effects.T / max(way[-1], 1e-9))
 
 
-def _log_likelihood(covariance: Floats, sides: Floats) -> float:
-    """Logarithm of the restricted likelihood of a covariance (N, N).
+def _log_likelihoods(base: Floats, walk: Floats, rates: Floats, sides: Floats) -> Floats:
+    """(2, len(FACTORS)) logarithms of the restricted likelihood of `base` + factor x drift, covariances (N, N).
 
+    Drift is `walk` (N, N), or has the square root `rates` (N, R).
     sides : (N, 1 + P) residuals, and Jacobians of the nuisance parameters
     """
     from scipy.linalg import solve_triangular
 
-    root = np.linalg.cholesky(covariance)
-    whitened = solve_triangular(root, sides, lower=True)
-    r, k = whitened[:, 0], whitened[:, 1:]
-    information, right = k.T @ k, k.T @ r
-    squared = float(r @ r - right @ np.linalg.solve(information, right))
-    return float(-0.5 * (squared + np.linalg.slogdet(information)[1]) - np.log(np.diag(root)).sum())
+    root = np.linalg.cholesky(base)
+    whitened, rates, half = (solve_triangular(root, right, lower=True) for right in (sides, rates, walk))
+    # Along these axes base and drift are diagonal.
+    values, axes = np.linalg.eigh(solve_triangular(root, half.T, lower=True))
+    few, roots, _ = np.linalg.svd(rates, full_matrices=False)
+    drifts = ((np.maximum(values, 0.0), axes), (roots**2, few))
+    of_drifts = np.stack([_beside_white(variances, along, whitened) for variances, along in drifts])
+    return np.asarray(of_drifts - np.log(np.diag(root)).sum())
+
+
+def _beside_white(values: Floats, axes: Floats, sides: Floats) -> Floats:
+    """As `_log_likelihoods`, of factor x `values` (R,) along the `axes` (N, R) and unit variance along all."""
+    along, spread = axes.T @ sides, 1.0 + FACTORS[:, None] * values
+    rest = sides - axes @ along
+    products = (along[:, :, None] * along[:, None, :]).reshape(len(along), -1)
+    squares = rest.T @ rest + (1.0 / spread @ products).reshape(len(FACTORS), *2 * sides.shape[1:])
+    right, information = squares[:, 1:, :1], squares[:, 1:, 1:]
+    squared = squares[:, 0, 0] - (right * np.linalg.solve(information, right)).sum(axis=(1, 2))
+    return np.asarray(-0.5 * (squared + np.log(spread).sum(axis=1) + np.linalg.slogdet(information)[1]))
 
 
 def _shared(chain: Floats, places: Floats) -> Floats:

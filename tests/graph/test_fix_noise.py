@@ -67,6 +67,20 @@ def test_the_common_part_and_its_memory_are_found(
     assert memory / 2 < np.median([f.memory for f in found if f]) < 2 * memory
 
 
+@pytest.mark.parametrize("percent", [0.02, 0.05])
+def test_what_is_tried_does_not_show(monkeypatch: pytest.MonkeyPatch, percent: float) -> None:
+    """Half an hour knows the time constant far better than the distance of those that are tried."""
+    found = []
+    for memories in (fix_noise.MEMORIES, 4 * fix_noise.MEMORIES):
+        monkeypatch.setattr(fix_noise, "MEMORIES", memories)
+        found.append([fixes(1800, 1.0, 0.3, 0.8, 30.0, seed, percent) for seed in range(3)])
+    for (few, walk), (many, fine) in zip(*found, strict=True):
+        assert few is not None
+        assert many is not None
+        assert few.memory == pytest.approx(many.memory, rel=1.5 * fix_noise.STEP)
+        assert walk == pytest.approx(fine, rel=1.5 * fix_noise.STEP)
+
+
 def test_wrong_fixes_do_not_change_the_common_part() -> None:
     rng = np.random.default_rng(2)
     seconds = np.arange(200.0)
