@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from lslam.evaluation.evaluate import evaluate
     from lslam.pipeline.run import run
     from lslam.readers import open_sequence
-    from lslam.recovery.policies import RecoveringRegistration as Registration
+    from lslam.registration.registration import Registration
     from lslam.simulation.scenarios import simulate
     from lslam.studies.from_python import compare
 
 __all__ = ["Registration", "__version__", "compare", "evaluate", "load_config", "open_sequence", "run", "simulate"]
 
 _HOMES = {
-    "Registration": ("lslam.recovery.policies", "RecoveringRegistration"),
+    "Registration": ("lslam.registration.registration", "Registration"),
     "compare": ("lslam.studies.from_python", "compare"),
     "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
     "load_config": ("lslam.config.load", "load_config"),

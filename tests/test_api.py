@@ -37,7 +37,7 @@ def test_every_name_is_there_and_documented(name: str) -> None:
     part = getattr(lslam, name)
     if name != "__version__":
         assert part.__doc__
-        assert part.__name__ == {"Registration": "RecoveringRegistration"}.get(name, name)
+        assert part.__name__ == {"Registration": "Registration"}.get(name, name)
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

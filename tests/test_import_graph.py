@@ -20,7 +20,6 @@ LAYERS = [
     ["frontend", "backend", "localization"],
     ["reports"],
     ["readers", "odometry", "inertial", "integrity", "loops", "graph", "maps", "evaluation", "simulation"],
-    ["recovery"],
     ["keyframes", "registration"],
     ["preprocessing", "profiling"],
     ["formats", "warned"],

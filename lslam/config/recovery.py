@@ -25,3 +25,7 @@ class RecoveryConfig(Section):
     fallback: Literal["none", "all-points"] = Field(
         "none", description="who poses a scan that LOAM's features hold badly: nobody, or `icp` on all its points"
     )
+
+
+# Of methods whose filter, smoother or window bridges a scan.
+NO_RECOVERY = RecoveryConfig(coarse_to_fine=False, start_search=False, less_planar=False, fallback="none")

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from lslam.inertial.window_motion import WindowMotion
-from lslam.odometry.base import Deskewing, Odometry, Registered, Windowed
+from lslam.odometry.base import Deskewing, Odometry, Windowed
 from lslam.registration.constant_velocity import MotionModel
+from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan_result import ScanResult
 
 
-def weighed(odometry: Deskewing, motion: MotionModel, found: Registered, prior: MotionPrior) -> ScanResult:
-    """What the motion model makes of a registration; of a window, once more where that moves its scans."""
+def fuse(
+    odometry: Deskewing, motion: MotionModel, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
+) -> RegistrationResult:
+    """The registration fused with the motion model; of a window, once more where that moves its scans."""
     if not (isinstance(odometry, Windowed) and isinstance(motion, WindowMotion)):
-        return motion.weigh(found.result, prior)
-    motion.take(odometry.equations(found))
-    result = motion.weigh(found.result, prior)
+        return motion.fuse(stamp_ns, result, prior)
+    motion.take(odometry.equations(stamp_ns, result))
+    fused = motion.fuse(stamp_ns, result, prior)
     again = odometry.equations_at(motion.stale())
     if not again:
-        return result
+        return fused
     motion.take(again)
-    return motion.weigh(found.result, prior)
+    return motion.fuse(stamp_ns, result, prior)
 
 
 def settle(odometry: Odometry, motion: MotionModel) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,10 +11,11 @@ from numpy.typing import NDArray
 from lslam.frontend import joint
 from lslam.geometry import se3, so3
 from lslam.integrity.monitor import IntegrityMonitor
-from lslam.odometry.base import Deskewing, Odometry, Registered, Resumable, Searching
-from lslam.odometry.sanity import plausible
+from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.sanity import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.constant_velocity import ConstantVelocity, MotionModel, middle_of
+from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult, Status
@@ -69,16 +69,47 @@ class Tracker:
 
     def track(self, loaded: Loaded) -> ScanResult:
         """Pose of the next scan."""
-        scan = loaded.scan
-        if scan is not None and self.stationary is not None:
-            result = self._stand_or_move(scan, loaded, self.stationary)
+        scan, odometry, motion, clock = loaded.scan, self.odometry, self.motion, StageClock()
+        standing = self._standing(scan, clock)
+        if standing is not None:
+            self._keep(standing)
+            return replace(standing, stages=clock.seconds)
+        span = Span() if scan is None else scan.span
+        with clock.stage("imu"):
+            prior = expected = motion.sweep(loaded.stamp_ns, span)
+        steady = None if motion.coasting is None else motion.coasting.predict(loaded.stamp_ns)
+        trial = None
+        if scan is None:
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
+        elif isinstance(odometry, Deskewing):
+            if motion.coasting is not None and motion.is_compared(loaded.stamp_ns, span):
+                # For comparison alone: the map and the motion model are not updated.
+                without = motion.coasting.sweep(scan.stamp_ns, span)
+                trial = odometry.register(scan, loaded.prepared, without)
+                trial, _ = self._refined(odometry, scan, loaded.prepared, without, trial, motion.coasting)
+            is_first_open = self._first is not None or not motion.is_known
+            # While the motion is unknown the clouds of several LiDARs do not fit each other: one of them tells it.
+            alone = scan.of_leading() if is_first_open else None
+            cloud, prepared = (scan, loaded.prepared) if alone is None else (alone, odometry.prepare(alone))
+            located = odometry.register(cloud, prepared, prior)
+            located, prior = self._refined(odometry, cloud, prepared, prior, located, motion, clock)
+            if is_first_open and located.is_accepted and scan.span.seconds > 0:
+                if self._first is None:
+                    self._first = (scan, loaded.prepared, located.T_world_lidar)
+                else:
+                    prior = expected = self._begin_again(odometry, *self._first, scan, located)
+                    located = odometry.register(scan, loaded.prepared, prior)
+                    prior = located.sweep or prior
+            located, prior = self._fused(odometry, scan, loaded.prepared, located, prior, expected, clock)
+            result = odometry.update(scan, prior, located)
         else:
-            result = self._move(loaded)
-        if self.motion.is_known:
-            self._first = None
-        if result.status == "ok":
-            self._last = result
-        return result
+            result = plausible(odometry.register(scan, loaded.prepared, prior), prior.pose, self._last)
+        self._correct(result, prior, clock)
+        if self.stationary is not None and scan is not None:
+            with clock.stage("standing"):
+                self.stationary.observe(scan, result)
+        self._keep(result)
+        return self._recorded(result, expected, steady, trial, clock)
 
     def check(self, position: int, loaded: Loaded, result: ScanResult) -> None:
         """Have the monitor, if there is one, check what `track` found for the scan at this position of the run."""
@@ -112,146 +143,143 @@ class Tracker:
         if self.monitor is not None:
             self.monitor.restore(state["monitor"])
 
-    def _stand_or_move(self, scan: Scan, loaded: Loaded, stationary: StationaryDetector) -> ScanResult:
-        began = time.perf_counter()
-        result = stationary.result_of(scan)
-        stages = {"standing": time.perf_counter() - began}
+    def _standing(self, scan: Scan | None, clock: StageClock) -> ScanResult | None:
+        """The result of a scan taken while the sensor stood; None where it has moved."""
+        if scan is None or self.stationary is None:
+            return None
+        with clock.stage("standing"):
+            result = self.stationary.result_of(scan)
         if result is not None:
             self.motion.correct(result.stamp_ns, result.T_world_lidar)
             self.sweep = MotionPrior.at_once(result.T_world_lidar)
-            return replace(result, stages=stages)
-        result = self._move(loaded)
-        began = time.perf_counter()
-        stationary.observe(scan, result)
-        stages["standing"] += time.perf_counter() - began
-        return replace(result, stages=stages | result.stages)
+        return result
 
-    def _move(self, loaded: Loaded) -> ScanResult:
-        scan, odometry, motion = loaded.scan, self.odometry, self.motion
-        span = Span() if scan is None else scan.span
-        clock = StageClock()
+    def _keep(self, result: ScanResult) -> None:
+        if self.motion.is_known:
+            self._first = None
+        if result.status == "ok":
+            self._last = result
+
+    def _fused(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, located: RegistrationResult, prior: MotionPrior,
+        expected: MotionPrior, clock: StageClock,
+    ) -> tuple[RegistrationResult, MotionPrior]:  # fmt: skip
+        """The registration fused with the IMU, or one near the prediction `expected`, and the motion within the sweep."""
+        fused = self._checked(odometry, scan.stamp_ns, located, prior, expected, clock)
+        if fused.is_accepted or not self.motion.is_inertial or not odometry.is_searching:
+            return fused, prior
+        near = self._near(odometry, scan, prepared, expected, located, fused, clock)
+        return near, expected if near.sweep is None else near.sweep
+
+    def _checked(
+        self, odometry: Deskewing, stamp_ns: int, located: RegistrationResult, prior: MotionPrior,
+        expected: MotionPrior | None, clock: StageClock,
+    ) -> RegistrationResult:  # fmt: skip
+        """The registration fused with the IMU; rejected where no vehicle gets to its pose from the last one."""
         with clock.stage("imu"):
-            prior = expected = motion.sweep(loaded.stamp_ns, span)
-        coasting = motion.coasting
-        steady = None if coasting is None else coasting.predict(loaded.stamp_ns)
-        trial = None
-        if scan is None:
-            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
-        elif isinstance(odometry, Deskewing):
-            if coasting is not None and motion.is_compared(loaded.stamp_ns, span):
-                # For comparison alone: the map and the motion model are not updated.
-                without = coasting.sweep(scan.stamp_ns, span)
-                trial = self._align(odometry, scan, loaded.prepared, without, coasting)[0].result
-            result, prior = self._register(odometry, scan, loaded.prepared, prior, clock)
-        else:
-            result = plausible(odometry.register(scan, loaded.prepared, prior), prior.pose, self._last)
-        found = result.T_world_lidar
-        is_blind = result.status == "ok" and not isinstance(odometry, Deskewing)
+            fused = joint.fuse(odometry, self.motion, stamp_ns, located, prior)
+        if expected is None or not fused.is_accepted:
+            return fused
+        reason = fault(fused.T_world_lidar, stamp_ns, self._last)
+        return fused.rejected(reason, expected.pose.copy(), None) if reason else fused
+
+    def _correct(self, result: ScanResult, prior: MotionPrior, clock: StageClock) -> None:
+        """Update the motion model and the motion within the sweep."""
+        pose, is_ok = result.T_world_lidar, result.status == "ok"
+        is_blind = is_ok and not isinstance(self.odometry, Deskewing)
         with clock.stage("imu"):
-            self.sweep = motion.refine(prior, result.stamp_ns, found) if is_blind else prior
-            motion.correct(result.stamp_ns, found, prior, result.status == "ok")
-            joint.settle(odometry, motion)
-        pose, instant_ns = middle_of(prior, result.stamp_ns, found)
-        self.middle = (instant_ns, pose)
+            self.sweep = self.motion.refine(prior, result.stamp_ns, pose) if is_blind else prior
+            self.motion.correct(result.stamp_ns, pose, prior, is_ok)
+            joint.settle(self.odometry, self.motion)
+        middle, instant_ns = middle_of(prior, result.stamp_ns, pose)
+        self.middle = (instant_ns, middle)
+
+    def _recorded(
+        self, result: ScanResult, expected: MotionPrior, steady: NDArray[np.float64] | None,
+        trial: RegistrationResult | None, clock: StageClock,
+    ) -> ScanResult:  # fmt: skip
+        """The result beside its predictions, and beside what registration from constant velocity took.
+
+        The map's update is no part of either.
+        """
+        pose, is_ok = result.T_world_lidar, result.status == "ok"
+        own = {
+            name: seconds
+            for name, seconds in clock.seconds.items()
+            if name != "imu" or self.motion.coasting is not None
+        }
         result = replace(
-            result,
-            prior_norm=_matrix_norm(expected.pose, found),
-            steady_norm=None if steady is None else _matrix_norm(steady, found),
-            gravity=motion.gravity_at(found) if result.status == "ok" else None,
-            imu=motion.imu_state(),
-            stages=result.stages if coasting is None else {**result.stages, **clock.seconds},
-        )
-        return result if trial is None or "bridged" in (trial.status, result.status) else _compared(result, trial)
-
-    def _register(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, clock: StageClock
-    ) -> tuple[ScanResult, MotionPrior]:
-        """Register the scan, fuse the pose with the IMU and update the map; also the motion that it was deskewed with."""
-        expected = prior
-        is_first_open = self._first is not None or not self.motion.is_known
-        # While the motion is unknown the clouds of several LiDARs do not fit each other: one of them tells it.
-        alone = scan.of_leading() if is_first_open else None
-        found, prior = self._align(
-            odometry, scan if alone is None else alone, prepared if alone is None else odometry.prepare(alone), prior,
-            self.motion, clock,
+            result, prior_norm=_matrix_norm(expected.pose, pose),
+            steady_norm=None if steady is None else _matrix_norm(steady, pose),
+            gravity=self.motion.gravity_at(pose) if is_ok else None, imu=self.motion.imu_state(),
+            stages={**result.stages, **own},
         )  # fmt: skip
-        if found.result.status == "ok" and scan.span.seconds > 0 and is_first_open:
-            if self._first is None:
-                self._first = (scan, prepared, found.result.T_world_lidar)
-            else:
-                prior = expected = self._begin_again(odometry, *self._first, found.result, scan.span)
-                found, prior = self._align(odometry, scan, prepared, prior)
-        with clock.stage("imu"):
-            weighed = joint.weighed(odometry, self.motion, found, prior)
-        weighed = plausible(weighed, expected.pose, self._last)
-        if weighed.status != "ok" and self.motion.is_inertial and isinstance(odometry, Searching):
-            found = self._near(odometry, scan, prepared, expected, found, weighed, clock)
-            prior = expected if found.sweep is None else found.sweep
-        else:
-            found = replace(found, result=weighed)
-        return odometry.update(prior, found), prior
+        if trial is None or not trial.is_accepted or result.status == "bridged":
+            return result
+        taken = sum(seconds for name, seconds in result.stages.items() if name not in ("update", "standing"))
+        return replace(result, steady_iterations=trial.iterations, saved_s=sum(trial.stages.values()) - taken)
 
-    def _align(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, motion: MotionModel | None = None,
-        clock: StageClock | None = None,
-    ) -> tuple[Registered, MotionPrior]:  # fmt: skip
-        """Register, and again with the motion within the sweep that follows from it; also the motion of the final deskewing.
+    def _refined(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, located: RegistrationResult,
+        motion: MotionModel | None = None, clock: StageClock | None = None,
+    ) -> tuple[RegistrationResult, MotionPrior]:  # fmt: skip
+        """Registered again with the motion within the sweep that follows from the pose; also the motion of the final deskewing.
 
         motion : refines the prior by the registered pose; None: no second registration
         clock : measures the time of `motion`
         """
-        found = odometry.register(scan, prepared, prior)
-        if found.sweep is not None:
-            return found, found.sweep
-        if motion is None or not motion.is_known or found.result.status != "ok" or scan.span.seconds <= 0:
-            return found, prior
+        if located.sweep is not None:
+            return located, located.sweep
+        if motion is None or not motion.is_known or not located.ok or scan.span.seconds <= 0:
+            return located, prior
         with (clock or StageClock()).stage("imu"):
-            better = motion.refine(prior, scan.stamp_ns, found.result.T_world_lidar)
+            better = motion.refine(prior, scan.stamp_ns, located.T_world_lidar)
         if _distance(prior, better) <= self.REFINE_M:
-            return found, prior
-        again = odometry.register(scan, prepared, better)
-        return replace(again, result=_both(found.result, again.result)), better
+            return located, prior
+        return _both(located, odometry.register(scan, prepared, better)), better
 
     def _near(
-        self, odometry: Searching, scan: Scan, prepared: Any, prior: MotionPrior, found: Registered, denied: ScanResult,
-        clock: StageClock,
-    ) -> Registered:  # fmt: skip
-        """Register again near the IMU's prediction, after a registration that failed or whose pose the IMU overruled (`denied`).
+        self, odometry: Deskewing, scan: Scan, prepared: Any, expected: MotionPrior, located: RegistrationResult,
+        rejected: RegistrationResult, clock: StageClock,
+    ) -> RegistrationResult:  # fmt: skip
+        """Register again near the IMU's prediction, after a registration that failed or that the IMU rejected.
 
         With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
         accepted against the IMU.
         """
-        near, first = odometry.register_near(scan, prepared, prior, found), found.result
-        with clock.stage("imu"):
-            weighed = joint.weighed(odometry, self.motion, near, prior)
-        if weighed.status == "ok":
-            return replace(near, result=_both(first, weighed))
-        apart, off = (_apart(pose, first.T_world_lidar) for pose in (near.result.T_world_lidar, prior.pose))
-        is_same = near.result.status == "ok" and apart < SAME * off
-        return replace(near, result=_both(near.result, first if is_same else denied))
+        near = odometry.register(scan, prepared, expected, is_near=True)
+        fused = self._checked(odometry, scan.stamp_ns, near, expected, None, clock)
+        if fused.is_accepted:
+            return _both(located, fused)
+        apart, off = (_apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
+        chosen = located if near.ok and apart < SAME * off else rejected
+        # Where nothing is found near by, the first registration enters with the points as they are seen from there.
+        base = near
+        if not near.ok:
+            own = replace(located, points=near.points, sweep=near.sweep)
+            base = replace(own, iterations=near.iterations, stages=near.stages)
+        moved = base.moved(chosen.T_world_lidar, chosen.covariance)
+        is_rejected = base.ok and not chosen.is_accepted
+        moved = replace(moved, is_rejected=is_rejected, reason=chosen.reason, converged=chosen.converged)
+        return _both(located, moved)
 
     def _begin_again(
-        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], second: ScanResult, span: Span
-    ) -> MotionPrior:
+        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], second: Scan,
+        located: RegistrationResult,
+    ) -> MotionPrior:  # fmt: skip
         """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
 
-        The prior of the second scan, whose registration told the speed; `span` is that of its sweep.
+        The prior of the second scan, whose registration told the speed.
         """
-        self.motion.correct(second.stamp_ns, second.T_world_lidar)
-        again = self.motion.sweep(second.stamp_ns, span)
+        self.motion.correct(second.stamp_ns, located.T_world_lidar)
+        again = self.motion.sweep(second.stamp_ns, second.span)
         prior = self.motion.rewind(first.stamp_ns, pose, first.span)
         odometry.restart()
-        odometry.update(prior, self._align(odometry, first, prepared, prior)[0])
+        odometry.update(first, prior, odometry.register(first, prepared, prior))
         return again
 
 
-def _compared(result: ScanResult, trial: ScanResult) -> ScanResult:
-    """The result beside what registration from constant velocity took; the map's update is no part of either."""
-    own = sum(seconds for name, seconds in result.stages.items() if name != "update")
-    return replace(result, steady_iterations=trial.iterations, saved_s=sum(trial.stages.values()) - own)
-
-
-def _both(first: ScanResult, second: ScanResult) -> ScanResult:
+def _both(first: RegistrationResult, second: RegistrationResult) -> RegistrationResult:
     """The second registration of a scan, with the iterations and times of both."""
     stages = {name: first.stages.get(name, 0.0) + second.stages.get(name, 0.0) for name in first.stages | second.stages}
     return replace(second, iterations=first.iterations + second.iterations, stages=stages)

@@ -32,7 +32,7 @@ def odometry_constraints(
     """From each keyframe to the next, with the growth of odometry's covariance on the way.
 
     A scan's covariance is that of the local map and that of its registration on it; only the former accumulates
-    (`registration.uncertainty`). Methods without covariances get the drift of `config`.
+    (`odometry.uncertainty`). Methods without covariances get the drift of `config`.
     fitness : of each keyframe but the first with the one before, m2, where covariances come of that
     """
     constraints = []

@@ -14,10 +14,10 @@ from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_estimate import PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.inertial.navigation_state import POSE, NavigationState
 from lslam.registration.constant_velocity import middle_of
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
@@ -73,13 +73,13 @@ class FilterMotion(InertialMotion):
         swept = self._prior(found, instant_ns, middle, stamp_ns, prior.times)
         return replace(swept, covariance=prior.covariance)
 
-    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The result as it is: its registration weighed points and prior already. The other states follow its pose."""
-        C = result.registration_covariance
-        if C is None or result.status != "ok" or prior.covariance is None or self._next is None:
+        C = result.covariance
+        if C is None or not result.is_accepted or prior.covariance is None or self._next is None:
             return result
         instant_ns, state = self._next
-        middle, _ = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        middle, _ = middle_of(prior, stamp_ns, result.T_world_lidar)
         T_world_imu = middle @ self.T_lidar_imu
         covariance = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
         self._found = instant_ns, state.moved_to(T_world_imu, covariance)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -20,12 +19,12 @@ from lslam.kernels import kalman
 from lslam.kernels.rotation import apart, vector_between
 from lslam.preprocessing.deskew import knots_over
 from lslam.registration.constant_velocity import ConstantVelocity, middle_of
+from lslam.registration.solver import RegistrationResult
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
 from lslam.types.imu_state import ImuState
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
@@ -108,17 +107,17 @@ class InertialMotion(Stateful):
             return prior
         return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
 
-    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
 
-        Where they contradict each other, it stays registration's, or the scan is bridged: `_denied`. Behind a gap nothing is
+        Where they contradict each other, it stays registration's, or the scan is bridged: `_rejected`. Behind a gap nothing is
         weighed: the scan before was deskewed without the IMU, and is wrong by more than its covariance says. prior : of
         the registration, says how the sweep moved
         """
-        C, is_off = result.registration_covariance, not self.config.weigh or self.config.velocity == "integrated"
-        if C is None or result.status != "ok" or is_off or self._has_gap:
+        C, is_off = result.covariance, not self.config.weigh or self.config.velocity == "integrated"
+        if C is None or not result.is_accepted or is_off or self._has_gap:
             return result
-        middle, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
         before = self._instant_ns
         if self.refusal or before is None or instant_ns <= before or not self._covers(before, instant_ns):
             return result
@@ -131,11 +130,11 @@ class InertialMotion(Stateful):
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
         if surprise(rest, P + 2 * C) > 1:
-            return self._denied(result, rest, P)
+            return self._rejected(stamp_ns, result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.
         pose, covariance = kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age)
-        return replace(result, T_world_lidar=pose, registration_covariance=covariance)
+        return result.moved(pose, covariance)
 
     def _felt_motion(self, step: Increments) -> tuple[Floats, Floats]:
         """How far, m, the IMU came over `step` from the newest pose, (3,), and the covariance (6, 6) of that and of its turn.
@@ -149,7 +148,9 @@ class InertialMotion(Stateful):
         P[:3, :3], P[3:, 3:] = felt, R_felt @ self.estimate.gyroscope.turn_covariance(step) @ R_felt.T
         return moved, P
 
-    def _denied(self, result: ScanResult, rest: Floats, covariance: Floats) -> ScanResult:
+    def _rejected(
+        self, stamp_ns: int, result: RegistrationResult, rest: Floats, covariance: Floats
+    ) -> RegistrationResult:
         """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
 
         Where that is nearer to what the IMU expected, the scan is bridged: it stands where the IMU put it, as surely as
@@ -158,15 +159,12 @@ class InertialMotion(Stateful):
         """
         if self._was_bridged or not self.coasting.is_known or self._expected is None:
             return result
-        steady, (stamp_ns, expected) = self.coasting.predict(result.stamp_ns), self._expected
-        if stamp_ns != result.stamp_ns or _distance(steady, expected) >= _distance(steady, result.T_world_lidar):
+        steady, (expected_ns, expected) = self.coasting.predict(stamp_ns), self._expected
+        if expected_ns != stamp_ns or _distance(steady, expected) >= _distance(steady, result.T_world_lidar):
             return result
         metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
         reason = f"registration is {metres:.2f} m and {degrees:.1f} deg from what the IMU felt"
-        return replace(
-            result, status="bridged", reason=reason, T_world_lidar=expected, registration_covariance=covariance,
-            converged=False,
-        )  # fmt: skip
+        return result.rejected(reason, expected, covariance)
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
@@ -348,5 +346,5 @@ def warm_up() -> None:
         stamp_ns = 100_000_000 * k
         prior = motion.sweep(stamp_ns, Span(0.0, 0.1))
         prior = motion.refine(prior, stamp_ns, prior.pose)
-        found = ScanResult(k, stamp_ns, prior.pose, registration_covariance=1e-4 * np.eye(6))
-        motion.correct(stamp_ns, motion.weigh(found, prior).T_world_lidar, prior)
+        result = RegistrationResult(prior.pose, covariance=1e-4 * np.eye(6))
+        motion.correct(stamp_ns, motion.fuse(stamp_ns, result, prior).T_world_lidar, prior)

@@ -17,11 +17,11 @@ from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.constant_velocity import middle_of
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.preintegration import MotionState, PreintegratedStep, SweepLink
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
@@ -57,11 +57,11 @@ class LinkedMotion(FilterMotion):
         """Never: without the IMU there is nothing to estimate the states from."""
         return False
 
-    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The result as it is; the states of the smoother are kept for `correct`."""
         self._found = None
         if result.inertial is not None and prior.link is not None:
-            middle, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+            middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
             self._found = instant_ns, self._state_of(result.inertial)
             self._linked = instant_ns, middle
         return replace(result, inertial=None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import pairwise
 from typing import ClassVar, Protocol
 
@@ -19,11 +18,11 @@ from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.constant_velocity import middle_of
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
 
 Floats = NDArray[np.float64]
@@ -75,20 +74,20 @@ class SmootherMotion(InertialMotion):
         self._usual_bias = estimate.gyroscope.bias
         # Whether the smoother's newest state is that of the newest sweep, `_instant_ns`.
         self._is_begun = False
-        # The state that `weigh` added, ns and the state, for `correct`.
+        # The state that `fuse` added, ns and the state, for `correct`.
         self._added: tuple[int, InertialState] | None = None
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
         """The prior itself: a sweep is deskewed once, by the state before."""
         return prior if self.is_inertial else super().refine(prior, stamp_ns, pose)
 
-    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The pose that the smoother makes of registration and IMU, with its covariance."""
         self._withdraw()
-        C = result.registration_covariance
-        middle, instant_ns = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        C = result.covariance
+        middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
         step = self._felt_until(instant_ns)
-        if C is None or result.status != "ok" or step is None:
+        if C is None or not result.is_accepted or step is None:
             return result
         T_world_imu = middle @ self.T_lidar_imu
         there = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
@@ -101,15 +100,12 @@ class SmootherMotion(InertialMotion):
             # The IMU's pose is as sure as the IMU, whatever registration said of its own.
             lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
             covariance = noise.transported(self._felt_motion(step)[1], lever)
-            return replace(
-                result, status="bridged", reason=str(error), T_world_lidar=prior.pose, converged=False,
-                registration_covariance=covariance,
-            )  # fmt: skip
+            return result.rejected(str(error), prior.pose, covariance)
         self._added = instant_ns, found
         within = se3.relative(result.T_world_lidar, middle)
         pose = se3.normalise(found.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
         covariance = noise.transported(found.covariance[:6, :6], pose[:3, 3] - found.T_world_imu[:3, 3])
-        return replace(result, T_world_lidar=pose, registration_covariance=covariance)
+        return result.moved(pose, covariance)
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True

@@ -16,11 +16,11 @@ from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.navigation_state import POSE
 from lslam.inertial.window import Window, moment_of, off_by
 from lslam.registration.constant_velocity import middle_of
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.scan_equations import ScanEquations
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
@@ -56,16 +56,16 @@ class WindowMotion(FilterMotion):
         """What the points of some scans say of their poses, for the estimates to come."""
         self._taken |= {one.stamp_ns: one for one in equations}
 
-    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The result at the pose and with the covariance that the joint estimate gives it."""
         self._joint = self._found = None
-        if result.status != "ok" or prior.covariance is None or self._next is None or self.window is None:
+        if not result.is_accepted or prior.covariance is None or self._next is None or self.window is None:
             return result
         instant_ns, state = self._next
-        middle, _ = middle_of(prior, result.stamp_ns, result.T_world_lidar)
+        middle, _ = middle_of(prior, stamp_ns, result.T_world_lidar)
         T_world_imu = middle @ self.T_lidar_imu
         T_imu_scan = se3.relative(T_world_imu, result.T_world_lidar)
-        moment = moment_of(replace(state, T_world_imu=T_world_imu), instant_ns, result.stamp_ns, T_imu_scan)
+        moment = moment_of(replace(state, T_world_imu=T_world_imu), instant_ns, stamp_ns, T_imu_scan)
         window, H = self.window.extended(moment).with_equations(self._taken).solved(self.imu)
         newest = window.newest(H, state)
         pose = se3.normalise(newest.T_world_imu @ T_imu_scan)
@@ -74,7 +74,7 @@ class WindowMotion(FilterMotion):
         self._joint, self._found = window, (instant_ns, newest)
         lever = pose[:3, 3] - newest.T_world_imu[:3, 3]
         covariance = noise.transported(newest.covariance[POSE, POSE], lever)
-        return replace(result, T_world_lidar=pose, registration_covariance=covariance)
+        return result.moved(pose, covariance)
 
     def stale(self) -> dict[int, Floats]:
         """Poses (4, 4), by stamps, of the scans that the joint estimate moved away from where they were linearised."""

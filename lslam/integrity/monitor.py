@@ -64,7 +64,8 @@ class IntegrityMonitor(Stateful):
     STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_usual")
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
-        self._preprocess, self._config = preprocess, registration
+        self._preprocess = preprocess
+        self._config = registration.model_copy(update={"blob_weight": 0.0})
         # One scan has no fine planes.
         self._planes = tuple(
             GaussianMap(
@@ -154,11 +155,7 @@ class IntegrityMonitor(Stateful):
             self._motion = se3.log(found.T_world_lidar) / seconds
 
     def _lay(self, points: PreparedPoints, start: Floats, annealing: Annealing) -> RegistrationResult:
-        c = self._config
-        return solve(
-            self._planes[0], points, start, annealing,
-            sigma=c.sigma, blob_weight=0.0, weak_share=c.weak_share, coarser=self._planes[1:],
-        )  # fmt: skip
+        return solve(self._planes, points, start, annealing, self._config)
 
     def _quick(self) -> Annealing:
         c = self._config

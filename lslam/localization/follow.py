@@ -15,11 +15,12 @@ from lslam.graph.drift import drift_covariance
 from lslam.graph.odometry_constraints import growth
 from lslam.localization.prior_map import LocalView
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.registration.acceptance import correction
+from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.alignment import MapAlignment
-from lslam.registration.registration import MIN_SOURCE_POINTS, NEAR_KERNEL
+from lslam.registration.attempt import NEAR_KERNEL
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.map_fix import FixStatus, MapFix
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
@@ -115,15 +116,12 @@ class MapFollower(Stateful):
     def _judge(self, found: RegistrationResult) -> tuple[FixStatus, str]:
         """What the map says of a scan, and why not more."""
         c = self.config.registration
-        if not found.ok or found.covariance is None:
-            return "beyond", found.reason or "the map has nothing here"
-        if found.overlap < c.min_overlap:
-            return "beyond", f"{found.overlap:.0%} of the points find the map"
-        if found.inlier_share < c.min_inliers or self.usual.is_collapse(found.inlier_share):
-            return (
-                "changed",
-                f"{found.inlier_share:.0%} of the points agree with the map, {self.usual.usual:.0%} before",
-            )
+        limits = Acceptance(
+            c.min_overlap, c.min_inliers, needs_covariance=True, usual=self.usual, is_usual_of_matches=True
+        )
+        rejection = limits.rejection(found)
+        if rejection is not None:
+            return "beyond" if rejection.test in ("solution", "overlap") else "changed", rejection.reason
         d = se3_difference(self.T, found.T_world_lidar)
         # A scan that fits as well as those before has found its place, and odometry is worse than its covariance.
         is_outlier = float(d @ np.linalg.solve(self.covariance + self._floor, d)) > self._gate

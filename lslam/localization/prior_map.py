@@ -133,4 +133,4 @@ class LocalView:
             count_cap=c.count_cap, reach=np.inf, breadth=0.0,
         )  # fmt: skip
         insert_all(target, self._map.around(centre, self._reach + BLOCK / 2))
-        return MapAlignment(target, c, "plane")
+        return MapAlignment(target, c)

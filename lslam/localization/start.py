@@ -17,6 +17,7 @@ from lslam.localization.place_search import APART, PlaceSearch, Region
 from lslam.loops.level import find_up, level_rotation
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
 from lslam.preprocessing.prepare import PreparedPoints, thin
+from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -123,11 +124,10 @@ class PlaceFinder:
         found = self._solve(
             query.source, rough, Annealing(r.kernel_max, r.kernel_min, r.kernel_decay, c.max_iterations)
         )
-        if not found.ok or found.covariance is None or len(found.degenerate):
-            self.reasons.append(found.reason or "the surfaces do not hold it in every direction")
-            return None
-        if found.overlap < c.min_overlap or found.inlier_share < r.min_inliers:
-            self.reasons.append(f"{found.overlap:.0%} overlap, {found.inlier_share:.0%} of it within the kernel")
+        limits = Acceptance(c.min_overlap, r.min_inliers, needs_covariance=True, needs_all_directions=True)
+        rejection = limits.rejection(found)
+        if rejection is not None or found.covariance is None:
+            self.reasons.append("" if rejection is None else rejection.reason)
             return None
         R = self._R_level @ self._poses[b, :3, :3]
         T = found.T_world_lidar @ se3.make(R, np.zeros(3)) @ se3.inverse(self._poses[b])
@@ -188,11 +188,8 @@ class PlaceFinder:
     def _solve(
         self, points: PreparedPoints, start: Floats, annealing: Annealing, target: GaussianMap | None = None
     ) -> RegistrationResult:
-        r = self.config.registration
-        return solve(
-            self.search.whole.fine if target is None else target, points, start, annealing,
-            sigma=r.sigma, blob_weight=r.blob_weight, weak_share=r.weak_share,
-        )  # fmt: skip
+        level = self.search.whole.fine if target is None else target
+        return solve((level,), points, start, annealing, self.config.registration)
 
     def _drift(self, a: int, b: int) -> tuple[float, float]:
         """m and rad that odometry may be wrong by between two keyframes."""

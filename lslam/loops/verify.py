@@ -14,6 +14,7 @@ from lslam.geometry import se3, so3
 from lslam.loops.level_submap import LevelSubmap
 from lslam.loops.search import LARGE, SHARED, find_initial_guesses
 from lslam.preprocessing.prepare import PreparedPoints, thin
+from lslam.registration.acceptance import Acceptance
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 from lslam.types.constraint import LoopStage
@@ -93,11 +94,7 @@ class Verifier:
     def _solve(
         self, a: LevelSubmap, points: PreparedPoints, start: Floats, annealing: Annealing, *, coarse_only: bool = False
     ) -> RegistrationResult:
-        r = self.registration
-        return solve(
-            a.coarse if coarse_only else a.fine, points, start, annealing,
-            sigma=r.sigma, blob_weight=r.blob_weight, weak_share=r.weak_share,
-        )  # fmt: skip
+        return solve((a.coarse if coarse_only else a.fine,), points, start, annealing, self.registration)
 
     def _support(self, a: LevelSubmap, upright: PreparedPoints, seen: Flags, T_a_b: Floats) -> float:
         """Inlier share among the points in cells that a observed: unlike their number, it does not depend on the shift."""
@@ -110,21 +107,24 @@ class Verifier:
     def _judge(self, a: LevelSubmap, b: LevelSubmap, found: RegistrationResult) -> Verification:
         """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""
         c = self.config
-        if not found.ok or found.covariance is None:
-            return Verification(LoopStage.REGISTRATION, found.reason or "nothing matches")
         T = found.T_world_lidar
+        if not found.ok:
+            return Verification(LoopStage.REGISTRATION, found.reason)
         there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
         back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
-        overlap = min(there.overlap, back.overlap)
-        rmse = max(there.rmse, back.rmse)
-        facts = Verification(LoopStage.REGISTRATION, "", T, found.covariance, rmse, overlap)
-        if len(found.degenerate):
-            return facts.rejected(LoopStage.REGISTRATION, "the surfaces do not hold it in every direction")
-        if rmse > c.max_rmse:
-            return facts.rejected(LoopStage.REGISTRATION, f"rmse {rmse:.2f} m, {c.max_rmse:g} m allowed")
-        if overlap < c.min_overlap:
-            return facts.rejected(LoopStage.OVERLAP, f"overlap {overlap:.0%}, {c.min_overlap:.0%} needed")
-        return facts
+        worse = min(there, back, key=lambda one: one.overlap)
+        both = replace(found, rmse=max(there.rmse, back.rmse), matched=worse.matched, source_points=worse.source_points)
+        limits = Acceptance(
+            c.min_overlap, max_rmse=c.max_rmse, needs_covariance=True, needs_all_directions=True, target="other submap"
+        )
+        rejection = limits.rejection(both)
+        if both.covariance is None:
+            return Verification(LoopStage.REGISTRATION, "nothing matches")
+        facts = Verification(LoopStage.REGISTRATION, "", T, found.covariance, both.rmse, both.overlap)
+        if rejection is None:
+            return facts
+        stage = LoopStage.OVERLAP if rejection.test == "overlap" else LoopStage.REGISTRATION
+        return facts.rejected(stage, rejection.reason)
 
     def _agree(self, facts: Verification, forward: RegistrationResult, backward: RegistrationResult) -> Verification:
         """Forward and backward must agree; their difference is added to the covariance of the loop closure."""

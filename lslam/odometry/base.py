@@ -3,31 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.preprocessing.features import Features
+from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_equations import ScanEquations
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
-
-
-@dataclass(frozen=True)
-class Registered:
-    """A scan as `register` of a method that deskews found it.
-
-    result : what is said about it; detail : what the method's own `update` needs beside
-    sweep : the motion within the sweep, of a method that estimates it itself; None: the prior's, which the found pose refines
-    """
-
-    result: ScanResult
-    detail: Any = None
-    sweep: MotionPrior | None = None
 
 
 class Method(Protocol):
@@ -72,16 +59,21 @@ class Deskewing(Method, Protocol):
     """A method that takes the motion within a sweep from the prior, or begins there and estimates it.
 
     Its `register` only aligns, so that the front end can call it again with the motion that the first alignment found,
-    unless that tells its own;
-    `update` then takes the scan in.
+    unless the result has a motion of its own; `update` then takes the scan in.
+    is_searching : whether it looks for scans farther off than a good prior can be
     """
 
-    def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> Registered:
-        """Pose of the scan at its stamp; a failed registration returns the prior with status `bridged`. Learns nothing."""
+    is_searching: bool
+
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
+        """Pose of the scan at its stamp, the prior's where registration failed. Learns nothing.
+
+        is_near : nothing is searched away from a prior that is nearly right
+        """
         ...
 
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
-        """Learn from a scan that was registered from `prior`, at the pose of its result; the result with the time that took."""
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
+        """Learn from a scan that was registered from `prior`, at the pose of its result; the record of the scan."""
         ...
 
     def restart(self) -> None:
@@ -90,22 +82,10 @@ class Deskewing(Method, Protocol):
 
 
 @runtime_checkable
-class Searching(Deskewing, Protocol):
-    """A method that looks for scans farther off than a good prior can be, and finds them there where places are alike."""
-
-    def register_near(self, scan: Scan, prepared: Any, prior: MotionPrior, found: Registered) -> Registered:
-        """As `register`, which `found` something before; nothing is sought away from a prior that is nearly right.
-
-        Where nothing is found there, `update` is of what `register` found.
-        """
-        ...
-
-
-@runtime_checkable
 class Windowed(Deskewing, Protocol):
     """A method whose scans stay open while a motion model estimates their poses together."""
 
-    def equations(self, found: Registered) -> tuple[ScanEquations, ...]:
+    def equations(self, stamp_ns: int, result: RegistrationResult) -> tuple[ScanEquations, ...]:
         """What the points of a scan say of its pose where `register` found it; nothing where that failed."""
         ...
 

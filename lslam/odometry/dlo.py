@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 from lslam.config.config import Config
-from lslam.odometry.base import Registered
-from lslam.odometry.icp import Icp
-from lslam.odometry.scan_outcome import of_registration
+from lslam.config.recovery import NO_RECOVERY
+from lslam.odometry.icp import Icp, registration_of
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
+from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
+from lslam.types.stage_clock import StageClock
 
 
 def create(config: Config) -> Dlo:
     """The method as the configuration wants it, with no recovery beside the two registrations."""
-    section = config.registration.model_copy(update={"residual": "gicp", "target": "submap"})
-    return Dlo(Registration(section, config.preprocess))
+    return Dlo(registration_of(config, "gicp", NO_RECOVERY, target="submap"))
 
 
 class Dlo(Icp):
@@ -30,34 +28,28 @@ class Dlo(Icp):
 
     def __init__(self, registration: Registration) -> None:
         super().__init__(registration)
-        self.pairwise = self._fresh_pairwise()
+        c = registration.config.model_copy(update={"target": "scan"})
+        self.pairwise = Registration(c, registration.preprocess, NO_RECOVERY)
 
-    def _fresh_pairwise(self) -> Registration:
-        section = self.registration.config.model_copy(update={"target": "scan"})
-        return Registration(section, self.registration.preprocess)
+    def register(
+        self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
+    ) -> RegistrationResult:
+        """Align with the last scan, then with the submap."""
+        clock = StageClock()
+        with clock.stage("deskew"):
+            points = self.registration.target.covered(deskew(prepared, prior))
+        with clock.stage("scan"):
+            step = self.pairwise.locate(points, prior.pose, is_near)
+        with clock.stage("map"):
+            result = self.registration.locate(points, step.T_world_lidar if step.ok else prior.pose, is_near)
+        return replace(result, map_age=self.map_age, stages=clock.seconds)
 
-    def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> Registered:
-        began = time.perf_counter()
-        points = self.registration.covered(deskew(prepared, prior))
-        deskewed = time.perf_counter()
-        step = self.pairwise.locate(points, prior.pose, is_near)
-        paired = time.perf_counter()
-        start = step.T_world_lidar if step.ok else prior.pose
-        located = self.registration.locate(points, start, is_near)
-        done = time.perf_counter()
-        stages = {"deskew": deskewed - began, "scan": paired - deskewed, "map": done - paired}
-        return Registered(of_registration(scan, located, self._uncertainty.map_age, stages), (points, located))
-
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> None:
         """Enter the scan as the last one, and as a keyframe when one is due."""
-        result = super().update(prior, found)
-        began = time.perf_counter()
-        points, located = found.detail
-        self.pairwise.update(points, located.decided(found.result))
-        stages = {**result.stages, "update": result.stages["update"] + time.perf_counter() - began}
-        return replace(result, stages=stages)
+        super().insert(stamp_ns, prior, result)
+        self.pairwise.update(result)
 
     def restart(self) -> None:
         """No last scan and no keyframes."""
         super().restart()
-        self.pairwise = self._fresh_pairwise()
+        self.pairwise = self.pairwise.fresh()

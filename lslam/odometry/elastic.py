@@ -27,7 +27,6 @@ from lslam.registration.optimiser import (
     Correspondences,
     OptimiserResult,
     Term,
-    named,
 )
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
@@ -128,7 +127,7 @@ def register_elastic(
     covariance = np.asarray(np.linalg.pinv(A, hermitian=True), np.float64)
     information = np.asarray(np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True), np.float64)
     pose = sweep.prior.pose
-    found = OptimiserResult(pose, information, named(facts), at_stamp @ d.ravel(), iterations, converged, weak)
+    found = OptimiserResult.of(pose, information, facts, at_stamp @ d.ravel(), iterations, converged, weak)
     return ElasticResult(sweep, skew[0], covariance, found)
 
 

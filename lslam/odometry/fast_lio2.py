@@ -6,15 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.odometry.icp import Icp
-from lslam.registration.registration import Registration
+from lslam.config.recovery import NO_RECOVERY
+from lslam.odometry.icp import Icp, registration_of
 from lslam.types.motion_prior import MotionPrior
 
 
 def create(config: Config) -> FastLio2:
     """The method as the configuration wants it: point to plane, with no recovery beside the filter."""
-    section = config.registration.model_copy(update={"residual": "plane"})
-    return FastLio2(Registration(section, config.preprocess))
+    return FastLio2(registration_of(config, recovery=NO_RECOVERY))
 
 
 class FastLio2(Icp):

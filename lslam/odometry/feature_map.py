@@ -10,7 +10,7 @@ from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
-from lslam.registration.target import KeyframeTarget
+from lslam.registration.map_scans import LastKeyframes
 from lslam.types.state import State, Stateful
 
 # As LOAM fits its lines: five points at least.
@@ -71,7 +71,7 @@ class FeatureMap(Stateful):
         self._lines = _lines_for(self.edges)
 
 
-class FeatureKeyframes(KeyframeTarget):
+class FeatureKeyframes(LastKeyframes):
     """Keeps the features of the newest keyframes in a feature map, and no others'."""
 
     def insert(self, target: FeatureMap, cloud: Features, T_world_lidar: NDArray[np.float64]) -> None:

@@ -15,7 +15,7 @@ from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
 from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise, slots_of
-from lslam.registration.residuals import RESIDUALS
+from lslam.registration.residuals import PLANE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
 
@@ -77,6 +77,17 @@ def solve_on_map(
     levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
     inlier_ratio : share of the correspondences, the nearest, that have a say from the second step on
     """
+    problem = map_problem(
+        target, edges, planes, T_prior, annealing, noise, scatter=scatter, levels=levels, inlier_ratio=inlier_ratio
+    )
+    return result_of(optimise(*problem), T_prior, len(edges) + len(planes))
+
+
+def map_problem(
+    target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
+    scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None, inlier_ratio: float = 1.0,
+) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
+    """What `optimise` is asked for by `solve_on_map`."""
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
     lines, matches = target.edges, Correspondences(len(planes) + len(edges))
@@ -85,12 +96,9 @@ def solve_on_map(
         (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR),
         (*slots_of(len(edges)), matches.away2[len(planes) :]),
     )  # fmt: skip
-    on_planes = voxel_terms(
-        RESIDUALS["plane"], (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0
-    )
+    on_planes = voxel_terms(PLANE, (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
-    found = optimise([on_lines, *on_planes], T_prior, annealing, limits, matches, inlier_ratio=inlier_ratio)
-    return result_of(found, T_prior, len(edges) + len(planes))
+    return [on_lines, *on_planes], T_prior, annealing, limits, matches, np.inf, inlier_ratio
 
 
 def remap_solution(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:

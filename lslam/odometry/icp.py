@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.config.recovery import RecoveryConfig
 from lslam.errors import UsageError
-from lslam.odometry.base import Registered
-from lslam.odometry.scan_outcome import of_registration
+from lslam.odometry.keyframe_submap import KeyframeSubmap
+from lslam.odometry.scan_outcome import recorded
+from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
-from lslam.recovery.policies import policies_of
+from lslam.registration.map_scans import make_map_scans
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.uncertainty import PoseUncertainty
+from lslam.registration.voxel_target import VoxelTarget
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -40,16 +42,25 @@ def create(config: Config) -> Icp:
             f"method {method!r} measures by the residual {own!r}, registration.residual asks for {chosen!r}: "
             f"choose one of them, or --method icp --residual {chosen}"
         )
-    section = config.registration.model_copy(update={"residual": own or chosen})
-    return Icp(Registration(section, config.preprocess, policies_of(config.recovery)))
+    return Icp(registration_of(config, own or chosen))
+
+
+def registration_of(
+    config: Config, residual: str | None = "plane", recovery: RecoveryConfig | None = None, **keys: Any
+) -> Registration:
+    """A registration of points as the configuration wants it, but by this residual and these keys of its section.
+
+    recovery : None: as configured
+    """
+    c = config.registration.model_copy(update={"residual": residual, **keys})
+    target = VoxelTarget(c, config.preprocess, KeyframeSubmap.of if c.target == "submap" else make_map_scans)
+    return Registration(c, config.preprocess, recovery or config.recovery, target)
 
 
 class Icp(Stateful):
-    """Adapter from scans and motion priors to `Registration`.
+    """Adapter from scans and motion priors to `Registration`."""
 
-    The detail of a scan that was registered: its points, deskewed, and what the registration found.
-    """
-
+    is_searching = True
     deskew = "by the motion prior, and again by the motion that registration finds"
     STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
 
@@ -62,25 +73,18 @@ class Icp(Stateful):
         config = self.registration.preprocess
         return prepare_points(scan.points, config, scan.index, scan.times if config.deskew else None)
 
-    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> Registered:
+    def register(
+        self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
+    ) -> RegistrationResult:
         """Align with the local map."""
-        return self._align(scan, prepared, prior)
-
-    def register_near(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, found: Registered) -> Registered:
-        """Local registration about the prior: narrow kernel, no recovery."""
-        near = self._align(scan, prepared, prior, is_near=True)
-        points, located, *rest = near.detail
-        return near if located.ok else replace(near, detail=(points, found.detail[1], *rest))
-
-    def _align(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False) -> Registered:
         began = time.perf_counter()
         points = deskew(prepared, prior)
         deskewed = time.perf_counter()
-        located = self.registration.locate(points, prior.pose, is_near, self.information_of(prior))
+        result = self.registration.locate(points, prior.pose, is_near, self.information_of(prior))
         stages = {"register": time.perf_counter() - deskewed}
         if points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
-        return Registered(of_registration(scan, located, self.map_age, stages), (points, located))
+        return replace(result, map_age=self.map_age, stages=stages)
 
     @property
     def map_age(self) -> float:
@@ -91,24 +95,20 @@ class Icp(Stateful):
         """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
         return None
 
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
         """Enter the scan into the local map where its result puts it."""
         began = time.perf_counter()
-        points, located, *_ = found.detail
-        located = located.decided(found.result)
-        self.insert(prior, found.result.stamp_ns, points, located)
-        result = self._uncertainty.stamped(found.result, located, prior)
-        return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
+        self.insert(scan.stamp_ns, prior, result)
+        record = recorded(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))
+        return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
 
-    def insert(self, prior: MotionPrior, stamp_ns: int, points: PreparedPoints, located: RegistrationResult) -> None:
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> None:
         """Enter a scan that was registered from `prior` into the map."""
-        self.registration.update(points, located)
+        self.registration.update(result)
 
     def restart(self) -> None:
         """An empty map."""
-        self.registration = Registration(
-            self.registration.config, self.registration.preprocess, self.registration.recovery
-        )
+        self.registration = self.registration.fresh()
         self._uncertainty = self._fresh_uncertainty()
 
     def _fresh_uncertainty(self) -> PoseUncertainty:
@@ -119,6 +119,6 @@ class Icp(Stateful):
         rng = np.random.default_rng(0)
         room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
-        trial = Registration(self.registration.config, self.registration.preprocess, self.registration.recovery)
+        trial = self.registration.fresh()
         for _ in range(2):
             trial.register(room)

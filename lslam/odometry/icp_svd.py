@@ -14,10 +14,11 @@ from lslam.config.config import Config
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3, umeyama
-from lslam.odometry.scan_outcome import AlignerResult, judged
+from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.optimiser import STEP_M, STEP_RAD
-from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -65,7 +66,7 @@ class IcpSvd(Stateful):
         began = time.perf_counter()
         c = self._config
         if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
-            found = AlignerResult(prior.pose, len(prepared.source), len(prepared.source))
+            found = RegistrationResult(prior.pose, source_points=len(prepared.source), inliers=len(prepared.source))
         else:
             found = align_closed_form(
                 prepared.source, self._last, prior.pose, inlier_ratio=c.inlier_ratio,
@@ -104,7 +105,7 @@ def as_partners(points: NDArray[Any], T_world_lidar: Floats) -> Partners:
 def align_closed_form(
     source: Floats, last: Partners, T_prior: Floats, *,
     inlier_ratio: float = 1.0, inlier_distance: float | None = None, max_iterations: int = 50,
-) -> AlignerResult:  # fmt: skip
+) -> RegistrationResult:  # fmt: skip
     """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of Girolimetto.
 
     Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: those
@@ -123,13 +124,16 @@ def align_closed_form(
             umeyama.align(moved[kept], last.points[partner[kept]]) if len(kept) else (T, 1.0, False)
         )
         if not is_determined:
-            return AlignerResult(T_prior, len(source), 0, converged=False, iterations=rounds)
+            return RegistrationResult(T_prior, source_points=len(source), converged=False, iterations=rounds)
         T = step @ T
         if np.linalg.norm(step[:3, 3]) < STEP_M and so3.angle(step[:3, :3]) < STEP_RAD:
             converged = True
             break
     rmse = float(np.sqrt(np.mean(distance[kept] ** 2))) if len(kept) else 0.0
-    return AlignerResult(last.T_world_lidar @ se3.normalise(T), len(source), len(kept), converged, rounds, rmse)
+    return RegistrationResult(
+        last.T_world_lidar @ se3.normalise(T), source_points=len(source), inliers=len(kept), converged=converged,
+        iterations=rounds, rmse=rmse,
+    )  # fmt: skip
 
 
 def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> NDArray[np.int64]:

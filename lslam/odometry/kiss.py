@@ -13,7 +13,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.foreign import importing
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import gate_points
-from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from lslam.config.config import Config
 from lslam.odometry.feature_steps import two_steps
-from lslam.odometry.loam import Loam, LoamVariant
+from lslam.odometry.feature_target import LoamVariant
+from lslam.odometry.loam import Loam
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.segments import lego_features
 from lslam.types.scan import Scan

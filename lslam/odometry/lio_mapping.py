@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.config.recovery import NO_RECOVERY
 from lslam.geometry import normal_equations
-from lslam.odometry.base import Registered
 from lslam.odometry.fast_lio2 import FastLio2
+from lslam.odometry.icp import registration_of
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
@@ -22,8 +23,7 @@ Floats = NDArray[np.float64]
 
 def create(config: Config) -> LioMapping:
     """The method as the configuration wants it: point to plane, with no recovery beside the window."""
-    section = config.registration.model_copy(update={"residual": "plane"})
-    return LioMapping(Registration(section, config.preprocess), config.lio_mapping.window - 1)
+    return LioMapping(registration_of(config, recovery=NO_RECOVERY), config.lio_mapping.window - 1)
 
 
 class LioMapping(FastLio2):
@@ -49,14 +49,13 @@ class LioMapping(FastLio2):
         """Mean age, in scans, of the points of the map, which begins where the window ends."""
         return super().map_age + len(self.pending)
 
-    def equations(self, found: Registered) -> tuple[ScanEquations, ...]:
+    def equations(self, stamp_ns: int, result: RegistrationResult) -> tuple[ScanEquations, ...]:
         """Of a scan that was just registered, none where that failed."""
-        points, located = found.detail
         self._offered = {}
-        if found.result.status != "ok" or len(self.registration.map) == 0:
+        if not result.ok or len(self.registration.map) == 0:
             return ()
-        self._offered = {found.result.stamp_ns: points}
-        return (self._at(found.result.stamp_ns, points, located.T_world_lidar),)
+        self._offered = {stamp_ns: result.points}
+        return (self._at(stamp_ns, result.points, result.T_world_lidar),)
 
     def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
         """Of scans at other poses (4, 4), by their stamps; none of those that are in the map already."""
@@ -64,16 +63,15 @@ class LioMapping(FastLio2):
         return tuple(self._at(stamp_ns, known[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in known)
 
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
-        return ScanEquations(stamp_ns, T, *self.registration.alignment.equations(points, T))
+        return ScanEquations(stamp_ns, T, *self.registration.target.equations(points, T))
 
-    def insert(self, prior: MotionPrior, stamp_ns: int, points: PreparedPoints, located: RegistrationResult) -> None:
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> None:
         """Keep the scan for the map; while that is young, or the window silent, it enters at once."""
-        is_young = self.registration.inserted <= self.registration.config.start_scans
-        if not located.ok or prior.covariance is None or is_young:
-            self.registration.update(points, located)
+        if not result.ok or prior.covariance is None or self.registration.history.is_young:
+            self.registration.update(result)
             return
-        self.registration.observe(located)
-        self.pending = (*self.pending, (stamp_ns, points, located.T_world_lidar))
+        self.registration.history.observe(result)
+        self.pending = (*self.pending, (stamp_ns, result.points, result.T_world_lidar))
 
     def settle(self, poses: Mapping[int, Floats]) -> None:
         """Move the scans that wait to the poses (4, 4) of the window; those old enough, or no longer in it, enter the map."""
@@ -81,7 +79,7 @@ class LioMapping(FastLio2):
         due = [k < len(waiting) - self.lag or stamp_ns not in poses for k, (stamp_ns, _, _) in enumerate(waiting)]
         for (_, points, T), is_due in zip(waiting, due, strict=True):
             if is_due:
-                self.registration.enter(points, T)
+                self.registration.enter(RegistrationResult(T, points=points))
         self.pending = tuple(one for one, is_due in zip(waiting, due, strict=True) if not is_due)
 
     def warm_up(self) -> None:

@@ -6,39 +6,32 @@ The smoother is the motion model (`lslam.inertial.smoothing`, `lslam.graph.inert
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from lslam.config.config import Config
-from lslam.config.recovery import RecoveryConfig
-from lslam.odometry.base import Registered
-from lslam.odometry.feature_map import FeatureKeyframes
-from lslam.odometry.icp import Icp
-from lslam.odometry.loam import Loam, LoamVariant
-from lslam.registration.registration import Registration
+from lslam.config.recovery import NO_RECOVERY
+from lslam.odometry.feature_target import LoamVariant
+from lslam.odometry.icp import Icp, registration_of
+from lslam.odometry.loam import Loam
+from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.uncertainty import PoseUncertainty
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
-
-SCAN_TO_MAP = LoamVariant(None, with_map=True)
-# The smoother is what bridges a scan: nothing else is tried.
-NONE = RecoveryConfig(coarse_to_fine=False, start_search=False, less_planar=False, fallback="none")
+from lslam.types.state import Stateful
 
 
 def create(config: Config) -> LioSam | LioSamOfPoints:
     """The method on features or on all points, with no recovery beside the smoother."""
     own = config.lio_sam
     if own.features == "loam":
-        return LioSam(config, SCAN_TO_MAP)
-    section = config.registration.model_copy(
-        update={
-            "residual": "plane", "target": "keyframe", "keyframes": own.keyframes, "keyframe_m": own.keyframe_m,
-            "keyframe_deg": own.keyframe_deg,
-        }
-    )  # fmt: skip
-    return LioSamOfPoints(Registration(section, config.preprocess))
+        keyframes = own.keyframes, own.keyframe_m, float(np.deg2rad(own.keyframe_deg))
+        quiet = config.model_copy(update={"recovery": NO_RECOVERY})
+        return LioSam(quiet, LoamVariant(None, with_map=True, keyframes=keyframes))
+    keys: dict[str, Any] = {"keyframes": own.keyframes, "keyframe_m": own.keyframe_m, "keyframe_deg": own.keyframe_deg}
+    return LioSamOfPoints(registration_of(config, recovery=NO_RECOVERY, target="keyframe", **keys))
 
 
 class SmoothedUncertainty(PoseUncertainty):
@@ -54,50 +47,40 @@ class SmoothedUncertainty(PoseUncertainty):
         super().__init__()
         self.points = PoseUncertainty()
 
-    def alone(self, result: ScanResult, found: Registered, prior: MotionPrior) -> ScanResult:
-        """The `result` with `points_covariance`, that of the local map; `found` is what the smoother decided."""
-        located: RegistrationResult = found.detail[1]
-        entered = located.decided(found.result)
-        if found.result.status == "ok":
-            entered = entered.moved(entered.T_world_lidar, located.covariance)
-        by_points = self.points.stamped(found.result, entered, prior)
-        if by_points.covariance is None or by_points.registration_covariance is None:
-            return result
-        return replace(result, points_covariance=by_points.covariance - by_points.registration_covariance)
+    def alone(self, record: ScanResult, result: RegistrationResult, stamp_ns: int, prior: MotionPrior) -> ScanResult:
+        """The record with `points_covariance`, that of the local map; `result` is the smoother's."""
+        entered = result.moved(result.T_world_lidar, result.detail) if result.is_accepted else result
+        whole, own = self.points.covariances(entered, stamp_ns, prior)
+        return record if whole is None or own is None else replace(record, points_covariance=whole - own)
 
 
-class LioSam(Loam):
+class Smoothed(Stateful):
+    """Scans enter the map where the smoother puts them."""
+
+    _uncertainty: Any
+
+    def register(self, scan: Scan, prepared: Any, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
+        """As of the method; the covariance by the points is kept beside the smoother's."""
+        result: RegistrationResult = super().register(scan, prepared, prior, is_near)  # type: ignore[misc]
+        return replace(result, detail=result.covariance)
+
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
+        """Enter the scan into the map where the smoother puts it."""
+        record: ScanResult = super().update(scan, prior, result)  # type: ignore[misc]
+        smoothed: ScanResult = self._uncertainty.alone(record, result, scan.stamp_ns, prior)
+        return smoothed
+
+    def _fresh_uncertainty(self) -> SmoothedUncertainty:
+        return SmoothedUncertainty()
+
+
+class LioSam(Smoothed, Loam):
     """Edges and planar points on the feature map of the newest keyframes."""
 
     deskew = "features, by the newest state of the smoother"
-    _uncertainty: SmoothedUncertainty
-
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
-        """Enter the scan into the feature map where the smoother puts it."""
-        return self._uncertainty.alone(super().update(prior, found), found, prior)
-
-    @property
-    def recovery(self) -> RecoveryConfig:
-        """Nothing."""
-        return NONE
-
-    def _fresh_keyframes(self) -> FeatureKeyframes:
-        own = self.config.lio_sam
-        return FeatureKeyframes(own.keyframes, own.keyframe_m, float(np.deg2rad(own.keyframe_deg)))
-
-    def _fresh_uncertainty(self) -> SmoothedUncertainty:
-        return SmoothedUncertainty()
 
 
-class LioSamOfPoints(Icp):
+class LioSamOfPoints(Smoothed, Icp):
     """All points on the local map of the newest keyframes."""
 
     deskew = "by the newest state of the smoother"
-    _uncertainty: SmoothedUncertainty
-
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
-        """Enter the scan into the local map where the smoother puts it."""
-        return self._uncertainty.alone(super().update(prior, found), found, prior)
-
-    def _fresh_uncertainty(self) -> SmoothedUncertainty:
-        return SmoothedUncertainty()

@@ -13,15 +13,16 @@ from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.geometry import noise, normal_equations, se3
 from lslam.kernels.transform import transform
-from lslam.odometry.base import Registered
 from lslam.odometry.plane_association import associate
 from lslam.odometry.plane_factors import sighting_residuals
 from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
 from lslam.odometry.plane_values import SHARED
 from lslam.odometry.plane_window import PlaneWindow
+from lslam.odometry.scan_outcome import recorded
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.acceptance import correction
+from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.preintegration import SweepLink
 from lslam.types.scan import Scan
@@ -46,6 +47,7 @@ def create(config: Config) -> Lips:
 class Lips(Stateful):
     """Planes of each scan are associated with landmarks, and the window of states and planes is optimised."""
 
+    is_searching = False
     deskew = "by the motion that the smoother and the IMU predict"
     STATE: ClassVar[tuple[str, ...]] = ("window",)
 
@@ -59,7 +61,9 @@ class Lips(Stateful):
         config = self.config.preprocess
         return prepare_points(scan.points, config, scan.index, scan.times if config.deskew else None)
 
-    def register(self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior) -> Registered:
+    def register(
+        self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
+    ) -> RegistrationResult:
         """Optimise the window with the planes of the scan; raises UsageError without the IMU."""
         link = prior.link
         if link is None:
@@ -83,26 +87,23 @@ class Lips(Stateful):
                 )
                 window = solution or predicted
         with clock.stage("covariance"):
-            result = self._result(scan, link, window, planes, found)
+            result = self._result(link, window, planes, found)
         off = correction(prior.pose, result.T_world_lidar)
-        return Registered(
-            replace(
-                result, status="bridged" if reason else "ok", reason=reason, converged=not reason, iterations=steps,
-                source_points=len(points), prior_error=off, stages=clock.seconds,
-            ),
-            (window, predicted),
+        return replace(
+            result, ok=not reason, reason=reason, converged=not reason, iterations=steps, source_points=len(points),
+            prior_error=off, stages=clock.seconds, detail=(window, predicted, result.detail),
         )  # fmt: skip
 
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
         """The window goes on with the scan's planes, or without them where its result is rejected."""
         began = time.perf_counter()
-        window, predicted = found.detail
-        if found.result.status != "ok":
+        window, predicted, covariance = result.detail
+        if not result.is_accepted:
             none = np.zeros((0, 3))
             window = replace(predicted, landmarks=predicted.landmarks.seen(np.zeros(0, np.int64), none, none))
         self.window = window.marginalised()
-        result = found.result
-        return replace(result, stages={**result.stages, "update": time.perf_counter() - began})
+        record = recorded(scan, result, None if result.is_rejected else covariance, result.covariance)
+        return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
 
     def restart(self) -> None:
         """An empty window."""
@@ -122,21 +123,20 @@ class Lips(Stateful):
             return PlaneWindow.begin(link.state, se3.inverse(link.T_lidar_imu))
         return self.window.extended(link.step)
 
-    def _result(self, scan: Scan, link: SweepLink, window: PlaneWindow, planes: Planes, found: Longs) -> ScanResult:
+    def _result(self, link: SweepLink, window: PlaneWindow, planes: Planes, found: Longs) -> RegistrationResult:
+        """The newest pose with its covariance on the planes; the detail is that in the world."""
         pose = se3.normalise(window.T_world_lidar @ se3.inverse(link.within))
         P = window.joint_covariance()
         known = np.flatnonzero(found >= 0)
         state = slice(SHARED, SHARED + 6)
-        on_planes = window.covariance_on_planes()
         step = pose[:3, 3] - window.values.poses[-1, :3, 3]
-        total = float(planes.counts.sum())
-        share = float(planes.counts[known].sum()) / total if total else 0.0
+        on_planes = noise.transported(window.covariance_on_planes(), step)
         n = planes.counts[known]
-        return ScanResult(
-            index=scan.index, stamp_ns=scan.stamp_ns, T_world_lidar=pose,
-            covariance=noise.transported(P[state, state], step), registration_covariance=noise.transported(on_planes, step),
-            inliers=round(float(n.sum())), overlap=share, rmse=float(np.sqrt(n @ planes.rms[known] ** 2 / max(n.sum(), 1.0))),
+        rmse = float(np.sqrt(n @ planes.rms[known] ** 2 / max(n.sum(), 1.0)))
+        return RegistrationResult(
+            pose, covariance=on_planes, inliers=round(float(n.sum())), matched=round(float(n.sum())), rmse=rmse,
             degenerate=self._degenerate(window, found), inertial=window.values.newest(P[:27, :27]),
+            detail=noise.transported(P[state, state], step),
         )  # fmt: skip
 
     def _degenerate(self, window: PlaneWindow, found: Longs) -> Floats:

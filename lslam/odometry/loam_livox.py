@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.geometry import se3
-from lslam.odometry.base import Registered
-from lslam.odometry.loam import Loam, LoamVariant, deskewed
-from lslam.odometry.scan_outcome import of_registration
+from lslam.odometry.feature_target import LoamVariant
+from lslam.odometry.loam import Loam, deskewed
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.preprocessing.petals import petal_features
 from lslam.registration.acceptance import correction, failed
@@ -52,10 +51,11 @@ class LoamLivox(Loam):
         """Edges and planar points along the lines. Raises InputError for points that are not in the order of firing."""
         return petal_features(scan, self.config.loam, self.config.preprocess)
 
-    def _align(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> Registered:
+    def register(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
+        """Piece after piece; at once where the sweep takes no time."""
         count = self.config.loam.pieces
-        if is_near or count < 2 or self.registration.target is None or not self.is_swept(prepared, prior):
-            return super()._align(scan, prepared, prior, is_near)
+        if is_near or count < 2 or len(self.registration.target) == 0 or not self.is_swept(prepared, prior):
+            return super().register(scan, prepared, prior, is_near)
         clock = StageClock()
         with clock.stage("deskew"):
             features = deskewed(prepared, prior)
@@ -65,13 +65,13 @@ class LoamLivox(Loam):
         pose = prior.pose
         for k in range(count):
             piece = between(features, borders[k], borders[k + 1] if k + 1 < count else np.inf)
-            found.append(self.registration.locate(piece, pose, clock))
+            found.append(self.registration.locate(piece, pose, clock=clock))
             pose = found[-1].T_world_lidar if found[-1].ok else pose
-        located, sweep = joined(found, middles, prior)
+        result, sweep = joined(found, middles, prior)
         with clock.stage("deskew"):
             features = deskewed(prepared, sweep)
-        result = of_registration(scan, located, self._uncertainty.map_age, clock.seconds)
-        return Registered(result, (features, located), sweep)
+        age = self._uncertainty.map_age
+        return replace(result, points=features, sweep=sweep, map_age=age, stages=clock.seconds)
 
 
 def between(features: Features, begin: float, end: float) -> Features:
@@ -119,8 +119,8 @@ def joined(
         matched=sum(part.matched for part in parts), inliers=sum(part.inliers for part in parts),
         iterations=sum(result.iterations for result in found), converged=all(part.converged for part in parts),
         rmse=float(np.sqrt(np.mean([part.rmse**2 for part in parts]))), prior_error=correction(prior.pose, pose),
-        posed_by=next((part.posed_by for part in parts if part.posed_by), ""),
-        degenerate=min((part.degenerate for part in parts), key=len),
+        pose_source=next((part.pose_source for part in parts if part.pose_source), ""),
+        degenerate=min((part.degenerate for part in parts), key=len), replaced=None, detail=None,
     )  # fmt: skip
     return located, sweep
 

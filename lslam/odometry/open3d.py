@@ -14,9 +14,10 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.foreign import importing_open3d
 from lslam.geometry import se3
-from lslam.odometry.scan_outcome import AlignerResult, judged
+from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import clean_points
-from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -74,10 +75,10 @@ class Open3dGicp:
     def warm_up(self) -> None:
         """Nothing to compile."""
 
-    def _align(self, cloud: Any, T_prior: Floats) -> AlignerResult:
+    def _align(self, cloud: Any, T_prior: Floats) -> RegistrationResult:
         count = len(cloud.points)
         if self._last is None or count < MIN_SOURCE_POINTS:
-            return AlignerResult(T_prior, count, count)
+            return RegistrationResult(T_prior, source_points=count, inliers=count)
         registration = self._package.pipelines.registration
         found = registration.registration_generalized_icp(
             cloud, self._last.cloud, REACH, se3.relative(self._last.T_world_lidar, T_prior),
@@ -85,4 +86,4 @@ class Open3dGicp:
         )  # fmt: skip
         pose = self._last.T_world_lidar @ np.asarray(found.transformation, np.float64)
         inliers = len(found.correspondence_set)
-        return AlignerResult(pose, count, inliers, rmse=float(found.inlier_rmse))
+        return RegistrationResult(pose, source_points=count, inliers=inliers, rmse=float(found.inlier_rmse))

@@ -29,23 +29,13 @@ def measurable(scan: Scan) -> Scan:
     return scan.select(np.asarray((np.abs(scan.points) < FARTHEST_M).all(axis=1)))
 
 
-def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:
-    """The result, or one `bridged` by the motion prior (4, 4) where its pose is none or no vehicle gets there.
+def fault(pose: Floats, stamp_ns: int, last: ScanResult | None) -> str:
+    """The reason why a pose (4, 4) at `stamp_ns` is none, or one that no vehicle reaches; empty where there is none.
 
     last : the newest accepted result; a pose is tested by the time since then, so that a method which jumped once is
         accepted again as soon as it may have got there
     """
-    reason = "" if result.status != "ok" else _fault(result, last)
-    if not reason:
-        return result
-    return replace(
-        result, T_world_lidar=T_prior.copy(), status="bridged", reason=reason, converged=False, inliers=0, rmse=0.0,
-        overlap=0.0, covariance=None, registration_covariance=None,
-    )  # fmt: skip
-
-
-def _fault(result: ScanResult, last: ScanResult | None) -> str:
-    pose = np.asarray(result.T_world_lidar)
+    pose = np.asarray(pose)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         return "the pose is not finite"
     if not so3.is_rotation(pose[:3, :3], RIGID) or not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
@@ -54,10 +44,18 @@ def _fault(result: ScanResult, last: ScanResult | None) -> str:
         return ""
     step = se3.relative(last.T_world_lidar, pose)
     move, turn = float(np.linalg.norm(step[:3, 3])), float(so3.angle(step[:3, :3]))
-    seconds = max((result.stamp_ns - last.stamp_ns) * 1e-9, LEAST_S)
-    if move <= FASTEST_M_S * seconds and turn <= FASTEST_RAD_S * seconds:
+    seconds = (stamp_ns - last.stamp_ns) * 1e-9
+    if move <= FASTEST_M_S * max(seconds, LEAST_S) and turn <= FASTEST_RAD_S * max(seconds, LEAST_S):
         return ""
-    return (
-        f"impossible jump of {move:.4g} m and {np.rad2deg(turn):.0f} deg since scan {last.index}, "
-        f"{(result.stamp_ns - last.stamp_ns) * 1e-9:.3g} s before"
-    )
+    return f"impossible jump of {move:.4g} m and {np.rad2deg(turn):.0f} deg since scan {last.index}, {seconds:.3g} s before"
+
+
+def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:
+    """The result, or one `bridged` by the motion prior (4, 4) where its pose has a `fault`."""
+    reason = fault(result.T_world_lidar, result.stamp_ns, last) if result.status == "ok" else ""
+    if not reason:
+        return result
+    return replace(
+        result, T_world_lidar=T_prior.copy(), status="bridged", reason=reason, converged=False, inliers=0, rmse=0.0,
+        overlap=0.0, covariance=None, registration_covariance=None,
+    )  # fmt: skip

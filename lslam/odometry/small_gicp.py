@@ -14,9 +14,10 @@ from lslam.config.registration import RegistrationConfig
 from lslam.extras import install_hint
 from lslam.foreign import importing
 from lslam.geometry import se3, so3
-from lslam.odometry.scan_outcome import AlignerResult, judged
+from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import clean_points
-from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -67,16 +68,19 @@ class SmallGicp:
     def warm_up(self) -> None:
         """Nothing to compile."""
 
-    def _align(self, source: Any, T_prior: Floats) -> AlignerResult:
+    def _align(self, source: Any, T_prior: Floats) -> RegistrationResult:
         count = 0 if source is None else source.size()
         if self._target is None or count < MIN_SOURCE_POINTS:
-            return AlignerResult(T_prior, count, count)
+            return RegistrationResult(T_prior, source_points=count, inliers=count)
         target, tree = self._target
         found = self._package.align(
             target, source, tree, T_prior, max_correspondence_distance=REACH, num_threads=self._threads
         )
         pose = np.asarray(found.T_target_source, np.float64)
-        return AlignerResult(pose, count, int(found.num_inliers), bool(found.converged), int(found.iterations))
+        return RegistrationResult(
+            pose, source_points=count, inliers=int(found.num_inliers), converged=bool(found.converged),
+            iterations=int(found.iterations),
+        )  # fmt: skip
 
     def _has_moved_on(self, pose: Floats) -> bool:
         moved = se3.relative(self._T_world_keyframe, pose)

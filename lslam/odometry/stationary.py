@@ -11,6 +11,7 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -22,8 +23,8 @@ Floats = NDArray[np.float64]
 
 # Steps beyond these, m and deg, need no test of the next scan: it is not stationary.
 SLOW_M, SLOW_DEG = 0.1, 1.0
-# Least overlap and inlier share for a test.
-MATCHED, AGREEING = 0.3, 0.7
+# Of a test.
+LIMITS = Acceptance(min_overlap=0.3, min_inliers=0.7, needs_covariance=True, needs_all_directions=True)
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,8 @@ class StationaryDetector(Stateful):
     """
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
-        self._preprocess, self._config = preprocess, registration
+        self._preprocess = preprocess
+        self._config = registration.model_copy(update={"blob_weight": 0.0})
         self._limit_m, self._limit_rad = preprocess.standing_m, float(np.deg2rad(preprocess.standing_deg))
         self._reference: ReferenceScan | None = None
         self._last: ScanResult | None = None
@@ -109,12 +111,12 @@ class StationaryDetector(Stateful):
     def _step(self, points: PreparedPoints, planes: GaussianMap) -> RegistrationResult:
         c = self._config
         once = Annealing(c.kernel_max, c.kernel_max, c.kernel_decay, 1)
-        return solve(planes, points, np.eye(4), once, sigma=c.sigma, blob_weight=0.0, weak_share=c.weak_share)
+        return solve((planes,), points, np.eye(4), once, c)
 
     def _is_stationary(self, scan: Scan, reference: ReferenceScan) -> bool:
         found = self._step(prepare_points(scan.points, self._preprocess, scan.index), reference.planes)
         C = found.covariance
-        if C is None or found.overlap < MATCHED or found.inlier_share < AGREEING or len(found.degenerate):
+        if C is None or LIMITS.rejection(found) is not None:
             return False
         if np.trace(C[:3, :3]) > self._limit_m**2 or np.trace(C[3:, 3:]) > self._limit_rad**2:
             return False

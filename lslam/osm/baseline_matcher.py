@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.outcome import Given
 from lslam.config import Config
+from lslam.config.registration import RegistrationConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.building_graph import JointSolution, optimise_jointly
@@ -24,6 +25,7 @@ from lslam.osm.matcher import Laid, accepted_part
 from lslam.osm.walls import OsmMap
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 from lslam.stopping import checking
@@ -180,10 +182,8 @@ def _align(
     ground.insert(_upright(target, HEIGHTS).astype(np.float32), np.eye(4))
     upright = _upright(source, HEIGHTS)
     points = PreparedPoints(upright.astype(np.float32), upright, np.zeros((len(upright), 6)), len(upright))
-    found = solve(
-        ground, points, se2.to_se3(prior), Annealing(WIDTH, 0.5, 0.8, STEPS), sigma=NOISE, blob_weight=1.0,
-        weak_share=0.0, residual=residual,
-    )  # fmt: skip
+    annealing, c = Annealing(WIDTH, 0.5, 0.8, STEPS), RegistrationConfig(sigma=NOISE, blob_weight=1.0, weak_share=0.0)
+    found = solve((ground,), points, se2.to_se3(prior), annealing, c, residual=residual_named(residual))
     pose = se2.of_se3(found.T_world_lidar)
     if not found.ok or found.overlap < LEAST_OVERLAP or np.linalg.norm(pose[:2] - prior[:2]) > FARTHEST:
         return None

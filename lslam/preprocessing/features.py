@@ -63,6 +63,12 @@ class Features:
     neither: FeaturePoints
     labels: NDArray[np.int8]
 
+    @property
+    def cloud(self) -> NDArray[np.float32]:
+        """All of them (N, 3), m, LiDAR frame."""
+        parts = (self.less_planes, self.planes, self.less_edges, self.neither)
+        return np.concatenate([part.points for part in parts], dtype=np.float32)
+
 
 @dataclass(frozen=True)
 class RingWalk:

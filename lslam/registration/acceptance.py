@@ -1,9 +1,10 @@
-"""Acceptance of a registration: the gates that points and features share."""
+"""Acceptance of a registration: one list of tests, of which each user sets the limits."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,52 +14,90 @@ from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
+Test = Literal["solution", "directions", "rmse", "overlap", "inliers", "agreement", "jump"]
 
 # Of a pose from the motion prior alone: sigmas of half a metre and two degrees.
 PRIOR_COVARIANCE = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
 
 
 @dataclass(frozen=True)
-class Wording:
-    """How a rejection goes on after "only 12 %": of too little overlap with the target, and of too few inliers."""
+class Rejection:
+    """The first test that a registration failed, and the reason in words."""
 
-    overlap: str
-    agreement: str
+    test: Test
+    reason: str
 
 
-def accepted(
-    result: RegistrationResult, T_prior: Floats, config: RegistrationConfig, usual: UsualAgreement, min_overlap: float,
-    wording: Wording,
-) -> RegistrationResult:  # fmt: skip
-    """The result with its correction of the prior, or a failed one at the prior with the reason.
+@dataclass(frozen=True)
+class Acceptance:
+    """Limits of a registration. A test whose limit is left at its default passes everything.
 
-    usual : recent inlier shares; min_overlap : least share of matched source points
+    min_overlap : share of the source points with a match; min_inliers : share of these within the kernel
+    max_rmse : m; max_jump_m, max_jump_deg : correction of the motion prior
+    needs_covariance, needs_all_directions : whether something must be matched, and hold every direction
+    usual : inlier shares of the scans before, of which a collapse is rejected; is_usual_of_matches : shares of the matches,
+        as where a map ends, not of the source points
+    source, target : words for what is registered, and for the target
     """
-    move, turn = correction(T_prior, result.T_world_lidar)
-    reason = result.reason
-    if not reason and result.overlap < min_overlap:
-        reason = f"only {result.overlap:.0%} {wording.overlap}"
-    elif not reason and result.inlier_share < config.min_inliers:
-        reason = f"only {result.inlier_share:.0%} of the matches agree"
-    elif not reason and usual.is_collapse(result.agreement):
-        reason = f"only {result.agreement:.0%} {wording.agreement}, lately {usual.usual:.0%} did"
-    elif not reason and (move > config.max_jump_m or turn > np.deg2rad(config.max_jump_deg)):
-        reason = f"impossible jump of {move:.1f} m and {np.rad2deg(turn):.0f} deg"
-    if reason:
-        return replace(failed(T_prior, result.source_points, reason), iterations=result.iterations)
-    return replace(result, prior_error=(move, turn))
+
+    min_overlap: float = 0.0
+    min_inliers: float = 0.0
+    max_rmse: float = math.inf
+    max_jump_m: float = math.inf
+    max_jump_deg: float = math.inf
+    needs_covariance: bool = False
+    needs_all_directions: bool = False
+    usual: UsualAgreement | None = None
+    is_usual_of_matches: bool = False
+    source: str = "points"
+    target: str = "map"
+
+    @classmethod
+    def of(cls, config: RegistrationConfig, usual: UsualAgreement, min_overlap: float, source: str) -> Acceptance:
+        """The limits of odometry."""
+        return cls(
+            min_overlap, config.min_inliers, max_jump_m=config.max_jump_m, max_jump_deg=config.max_jump_deg,
+            usual=usual, source=source,
+        )  # fmt: skip
+
+    def rejection(self, result: RegistrationResult, jump: tuple[float, float] = (0.0, 0.0)) -> Rejection | None:
+        """The first test that the result fails; None when it passes them all. `jump` : m and rad, from the prior."""
+        move, turn_deg = jump[0], math.degrees(jump[1])
+        if result.reason or not result.ok or (self.needs_covariance and result.covariance is None):
+            return Rejection("solution", result.reason or "nothing matches")
+        if self.needs_all_directions and len(result.degenerate):
+            return Rejection("directions", "the surfaces do not hold it in every direction")
+        if result.rmse > self.max_rmse:
+            return Rejection("rmse", f"rmse {result.rmse:.2f} m, {self.max_rmse:g} m allowed")
+        if result.overlap < self.min_overlap:
+            return Rejection("overlap", f"only {result.overlap:.0%} of the {self.source} overlap the {self.target}")
+        if result.inlier_share < self.min_inliers:
+            return Rejection("inliers", f"only {result.inlier_share:.0%} of the matches agree")
+        share = result.inlier_share if self.is_usual_of_matches else result.agreement
+        if self.usual is not None and self.usual.is_collapse(share):
+            said = (
+                f"only {share:.0%} of the {self.source} agree with the {self.target}, lately {self.usual.usual:.0%} did"
+            )
+            return Rejection("agreement", said)
+        if move > self.max_jump_m or turn_deg > self.max_jump_deg:
+            return Rejection("jump", f"impossible jump of {move:.1f} m and {turn_deg:.0f} deg")
+        return None
+
+    def accepted(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
+        """The result with its correction of the prior (4, 4), or a failed one at the prior with the reason."""
+        jump = correction(T_prior, result.T_world_lidar)
+        rejection = self.rejection(result, jump)
+        if rejection is None:
+            return replace(result, prior_error=jump)
+        return replace(failed(T_prior, result.source_points, rejection.reason), iterations=result.iterations)
 
 
 def failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
     """The motion prior with its covariance."""
     return RegistrationResult(
-        T_prior.copy(),
-        ok=False,
-        reason=reason,
-        covariance=PRIOR_COVARIANCE.copy(),
-        converged=False,
+        T_prior.copy(), ok=False, reason=reason, covariance=PRIOR_COVARIANCE.copy(), converged=False,
         source_points=source_points,
-    )
+    )  # fmt: skip
 
 
 def correction(T_prior: Floats, pose: Floats) -> tuple[float, float]:

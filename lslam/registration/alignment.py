@@ -12,10 +12,10 @@ from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
-from lslam.registration.optimiser import EVERYWHERE, Correspondences, normal_equations
-from lslam.registration.residuals import residual_named
+from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, normal_equations, optimise
+from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve, voxel_terms
+from lslam.registration.solver import RegistrationResult, prior_term, result_of, solve, voxel_terms
 
 Floats = NDArray[np.float64]
 
@@ -23,8 +23,8 @@ Floats = NDArray[np.float64]
 class MapAlignment:
     """Aligns scans with one map by one residual; acceptance of the result is elsewhere (`acceptance`)."""
 
-    def __init__(self, target: LocalMap, config: RegistrationConfig, residual: str) -> None:
-        self._map, self._config, self._residual = target, config, residual
+    def __init__(self, target: LocalMap, config: RegistrationConfig, residual: ResidualKind = PLANE) -> None:
+        self.map, self.config, self.kind = target, config, residual
         # Of the last refinement, and when in the life of the map it was.
         self._matches, self._changes = Correspondences(0), 0
 
@@ -38,34 +38,40 @@ class MapAlignment:
         allowed : (6, 6) projector on the directions that are aligned, world axes; no rows: all
         information : (6, 6) of the start as a prior, world axes, 1/m2 and 1/rad2; None: it is only a start
         """
-        c, coarser = self._config, coarser or self._map.coarser
-        coarser = coarser if residual_named(self._residual).is_wide else coarser[:1]
-        if c.inlier_distance is None:
-            # The larger the planes, the farther their surface may be from them.
-            widest = coarser[0].size / self._map.coarser[0].size
-            annealing = Annealing(max(width, widest * c.kernel_min), widest * c.kernel_min, c.kernel_decay, steps)
-        else:
-            annealing = Annealing(c.inlier_distance, c.inlier_distance, c.kernel_decay, steps)
-        return solve(
-            self._map.fine, points, start, annealing,
-            sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share,
-            coarser=coarser, residual=self._residual,
-            inlier_distance=np.inf if c.inlier_distance is None else c.inlier_distance, inlier_ratio=c.inlier_ratio,
-            allowed=allowed, matches=self._remembered(len(points.source)), information=information,
-        )  # fmt: skip
+        problem = self.problem(points, start, width, steps, coarser, allowed, information)
+        return result_of(optimise(*problem), start, len(points.source))
+
+    def problem(
+        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
+        allowed: Floats = EVERYWHERE, information: Floats | None = None,
+    ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
+        """What `optimise` is asked for by `refine`."""
+        c, coarser = self.config, coarser or self.map.coarser
+        coarser = coarser if self.kind.is_wide else coarser[:1]
+        # The larger the planes, the farther their surface may be from them.
+        end = coarser[0].size / self.map.coarser[0].size * c.kernel_min
+        width, end = (max(width, end), end) if c.inlier_distance is None else (c.inlier_distance,) * 2
+        matches = self._remembered(len(points.source))
+        terms = self._terms(points, (self.map.fine, *coarser), matches)
+        if information is not None:
+            terms.append(prior_term(start, information))
+        limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, allowed=allowed)
+        farthest = np.inf if c.inlier_distance is None else c.inlier_distance
+        return terms, start, Annealing(width, end, c.kernel_decay, steps), limits, matches, farthest, c.inlier_ratio
 
     def equations(self, points: PreparedPoints, T: Floats) -> tuple[Floats, Floats]:
         """H (6, 6) and g (6,) of the points at the pose T (4, 4), as `refine` weighs them where it ends."""
-        c = self._config
-        kind, matches = residual_named(self._residual), self._remembered(len(points.source))
-        levels = (self._map.fine, *self._map.coarser)
-        terms = voxel_terms(kind, kind.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
-        return normal_equations(terms, T, c.kernel_min, matches)
+        matches = self._remembered(len(points.source))
+        return normal_equations(self._terms(points, self.map.levels, matches), T, self.config.kernel_min, matches)
+
+    def _terms(self, points: PreparedPoints, levels: Sequence[GaussianMap], matches: Correspondences) -> list[Term]:
+        c = self.config
+        return voxel_terms(self.kind, self.kind.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
 
     def _remembered(self, count: int) -> Correspondences:
         """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
-        if self._changes != self._map.changes or len(self._matches) != count:
-            self._matches, self._changes = Correspondences(count), self._map.changes
+        if self._changes != self.map.changes or len(self._matches) != count:
+            self._matches, self._changes = Correspondences(count), self.map.changes
         return self._matches
 
     def coarse_to_fine(self, points: PreparedPoints, T_prior: Floats, width: float = np.inf) -> RegistrationResult:
@@ -77,7 +83,7 @@ class MapAlignment:
         their coarse plane, the others take a fine one.
         width : m, of the kernel at the start, where the prior is known better than `coarse_kernel`
         """
-        c = self._config
+        c = self.config
         coarser = self.coarse_maps(points, T_prior)
         coarse = self.on_planes(coarser[0], points, T_prior, self.slowly(min(width, c.coarse_kernel)))
         start = coarse.T_world_lidar if coarse.ok else T_prior
@@ -89,7 +95,7 @@ class MapAlignment:
 
         From thirty metres above the ground the rings of one scan lie metres apart.
         """
-        c, coarser = self._config, self._map.coarser
+        c, coarser = self.config, self.map.coarser
         once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
         for k, level in enumerate(coarser):
             if self.on_planes(level, points, T_prior, once).overlap >= c.start_overlap:
@@ -98,17 +104,14 @@ class MapAlignment:
 
     def slowly(self, width: float) -> Annealing:
         """A kernel that closes from `width`, m, so slowly that coarse planes are followed."""
-        c = self._config
+        c = self.config
         return Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
 
     def on_planes(
         self, coarse_map: GaussianMap, points: PreparedPoints, start: Floats, annealing: Annealing
     ) -> RegistrationResult:
         """Align with the planes of a coarse map alone, from `start` (4, 4)."""
-        c = self._config
-        return solve(
-            coarse_map, points, start, annealing, sigma=c.sigma, blob_weight=c.blob_weight, weak_share=c.weak_share
-        )
+        return solve((coarse_map,), points, start, annealing, self.config)
 
 
 def upright_directions(T_prior: Floats) -> Floats:

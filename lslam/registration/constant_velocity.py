@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.preprocessing.deskew import knots_over
+from lslam.registration.solver import RegistrationResult
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu_state import ImuState
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
@@ -70,7 +70,7 @@ class MotionModel(Protocol):
         """Whether the scan to come is to be registered from `coasting` as well."""
         return False
 
-    def weigh(self, result: ScanResult, prior: MotionPrior) -> ScanResult:
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """A registration from `prior` fused with the sensor's prediction."""
         return result
 

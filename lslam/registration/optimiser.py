@@ -88,20 +88,38 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Facts:
-    """Facts of the last linearisation beside its normal equations.
+class OptimiserResult:
+    """Where the iterations ended: pose (4, 4), H (6, 6) and sums of the last linearisation, and the last step (6,).
 
-    information : its sum, 1/m2; lever_information : times the squared lever arm of each point
+    weak : (K, 6) unobserved directions, unit rows, rotations scaled by the lever arm
+    information : sum, 1/m2; lever_information : times the squared lever arm of each point
     squared : weighted squared residuals, m2; robust : the sum of their weights
     matched : points that found a counterpart; inliers : those within the kernel's width
     """
 
+    pose: Floats
+    H: Floats
+    step: Floats
+    iterations: int
+    converged: bool
+    weak: Floats
     information: float
     squared: float
     inliers: int
     matched: int
     lever_information: float
     robust: float
+
+    @classmethod
+    def of(
+        cls, pose: Floats, H: Floats, facts: Floats, step: Floats, iterations: int, converged: bool, weak: Floats
+    ) -> OptimiserResult:
+        """With the sums of a linearisation by name."""
+        f = facts.tolist()
+        return cls(
+            pose, H, step, iterations, converged, weak, information=f[at.INFORMATION], squared=f[at.SQUARED],
+            inliers=int(f[at.INLIERS]), matched=int(f[at.MATCHED]), lever_information=f[at.LEVER], robust=f[at.ROBUST],
+        )  # fmt: skip
 
     @property
     def lever_arm(self) -> float:
@@ -114,24 +132,8 @@ class Facts:
         return math.sqrt(self.squared / max(self.robust, 1e-12))
 
 
-@dataclass(frozen=True)
-class OptimiserResult:
-    """Where the iterations ended: pose (4, 4), H (6, 6) and facts of the last one, and its step (6,).
-
-    weak : (K, 6) unobserved directions, unit rows, rotations scaled by the lever arm
-    """
-
-    pose: Floats
-    H: Floats
-    facts: Facts
-    step: Floats
-    iterations: int
-    converged: bool
-    weak: Floats
-
-
 def optimise(
-    terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Correspondences, *,
+    terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Correspondences,
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
 ) -> OptimiserResult:  # fmt: skip
     """Step from `T_start` (4, 4) until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
@@ -166,7 +168,7 @@ def optimise(
         scale = max(scale * annealing.decay, end)
         if inlier_ratio < 1.0:
             gate2 = trimmed(matches.away2, float(inlier_ratio), farthest2)
-    return OptimiserResult(se3.make(*pose), H, named(facts), d, iterations, converged, weak[:count])
+    return OptimiserResult.of(se3.make(*pose), H, facts, d, iterations, converged, weak[:count])
 
 
 def warm_up() -> None:
@@ -187,12 +189,3 @@ def normal_equations(terms: Sequence[Term], T: Floats, width: float, matches: Co
             term.points, term.target, term.settings, term.search, pose, (width, width, np.inf), (H, S, g, facts)
         )
     return np.triu(H) + np.triu(H, 1).T, g
-
-
-def named(facts: Floats) -> Facts:
-    """The sums of a linearisation, by name."""
-    f = facts.tolist()
-    return Facts(
-        information=f[at.INFORMATION], squared=f[at.SQUARED], inliers=int(f[at.INLIERS]),
-        matched=int(f[at.MATCHED]), lever_information=f[at.LEVER], robust=f[at.ROBUST],
-    )  # fmt: skip

@@ -95,8 +95,9 @@ class ResidualKind:
         return getattr(import_module(self.module), self.function)  # type: ignore[no-any-return]
 
 
+PLANE = ResidualKind("lslam.kernels.residuals", "linearise")
 RESIDUALS = {
-    "plane": ResidualKind("lslam.kernels.residuals", "linearise"),
+    "plane": PLANE,
     "point": ResidualKind(
         "lslam.kernels.point_residual", "linearise_point", _with_gaps, is_wide=False, voxel_share=0.625, times_steps=3
     ),
@@ -109,7 +110,7 @@ RESIDUALS = {
     ),
 }
 # Point to point in small voxels that pass for no planes, where all axes count alike; nothing that a user chooses.
-MEANS = replace(RESIDUALS["plane"], is_wide=False, along=1.0)
+MEANS = replace(PLANE, is_wide=False, along=1.0)
 
 
 def residual_named(name: str) -> ResidualKind:

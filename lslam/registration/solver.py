@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
 from lslam.kernels import prior_residual
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
@@ -21,9 +22,10 @@ from lslam.registration.optimiser import (
     Term,
     optimise,
 )
-from lslam.registration.residuals import ResidualKind, residual_named
+from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
-from lslam.types.scan_result import ScanResult
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.preintegration import MotionState
 
 Floats = NDArray[np.float64]
 
@@ -37,12 +39,19 @@ class RegistrationResult:
 
     T_world_lidar : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2
     ok : False when the pose is the motion prior because registration failed, `reason` says why and is empty otherwise
-    posed_by : the recovery policy or the fallback that found the pose; empty: the registration itself
-    is_denied : the pose is not the registration's: the scan enters the map there, and adaptive thresholds do not learn from it
+    is_rejected : the pose is not the registration's, since the IMU or the laws of motion contradict that: the scan enters
+        the map there, and adaptive thresholds do not learn from it
+    pose_source : the recovery policy or the fallback that found the pose; empty: the registration itself
     inliers : source points within the final kernel
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
     prior_error : correction of the motion prior, (m, rad)
+    replaced : the result of the method's features, in whose place this one stands
+    points : what was registered, deskewed; detail : whatever else the method's own `update` needs
+    sweep : the motion within the sweep, of a method that estimates it itself; None: the prior's, which the pose refines
+    map_age : as `ScanResult.map_age`
+    inertial : the state of the IMU that a smoother of its own found, for the motion model
+    stages : seconds per stage
     """
 
     T_world_lidar: NDArray[np.float64]
@@ -58,17 +67,31 @@ class RegistrationResult:
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     lever_arm: float = 1.0
-    is_denied: bool = False
-    posed_by: str = ""
+    is_rejected: bool = False
+    pose_source: str = ""
+    replaced: RegistrationResult | None = None
+    points: Any = None
+    detail: Any = None
+    sweep: MotionPrior | None = None
+    map_age: float = 1.0
+    inertial: MotionState | None = None
+    stages: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_accepted(self) -> bool:
+        """Whether the pose is a registration's that nothing contradicts."""
+        return self.ok and not self.is_rejected
 
     def moved(self, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> RegistrationResult:
         """The same registration at another pose."""
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
-    def decided(self, result: ScanResult) -> RegistrationResult:
-        """The same registration at the pose and with the status of `result`."""
-        moved = self.moved(result.T_world_lidar, result.registration_covariance)
-        return replace(moved, is_denied=self.ok and result.status != "ok")
+    def rejected(
+        self, reason: str, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None
+    ) -> RegistrationResult:
+        """The scan at another pose, since something contradicts the registration."""
+        moved = self.moved(T_world_lidar, covariance)
+        return replace(moved, is_rejected=True, reason=reason, converged=False)
 
     @property
     def overlap(self) -> float:
@@ -93,29 +116,23 @@ class RegistrationResult:
 
 
 def solve(
-    target: GaussianMap, points: PreparedPoints, T_prior: Floats, annealing: Annealing, *, sigma: float,
-    blob_weight: float, weak_share: float, coarser: Sequence[GaussianMap] = (), residual: str | ResidualKind = "plane",
-    inlier_distance: float = np.inf, inlier_ratio: float = 1.0, allowed: Floats = EVERYWHERE,
-    matches: Correspondences | None = None, information: Floats | None = None,
+    levels: Sequence[GaussianMap], points: PreparedPoints, T_prior: Floats, annealing: Annealing, c: RegistrationConfig, *,
+    residual: ResidualKind = PLANE, allowed: Floats = EVERYWHERE,
 ) -> RegistrationResult:  # fmt: skip
-    """Align the source points with the map by annealed Gauss-Newton, starting at `T_prior` (4, 4).
+    """Align the source points with maps by annealed Gauss-Newton, starting at `T_prior` (4, 4), as `c` weighs them.
 
-    Points without a plane or a blob in `target` are matched in the first of the `coarser` maps that has one. Correspondences
-    beyond `inlier_distance`, m, are rejected, and all but the nearest `inlier_ratio`. `allowed` as in `Limits`; `matches` of as
-    many points in these maps, if there are any, spare what was looked up. `information` (6, 6) of the prior, world axes,
-    joins that of the points.
+    Points without a plane or a blob in one of the maps, the finest first, are matched in the next. `allowed` as in `Limits`.
     """
-    kind = residual if isinstance(residual, ResidualKind) else residual_named(residual)
-    matches = Correspondences(len(points.source)) if matches is None else matches
-    terms = voxel_terms(kind, kind.points(points, sigma), (target, *coarser), matches, sigma, blob_weight)
-    if information is not None:
-        R, t = (np.ascontiguousarray(part, np.float64) for part in (T_prior[:3, :3], T_prior[:3, 3]))
-        terms.append(Term(prior_residual.linearise, (), (R, t, information), ()))
-    found = optimise(
-        terms, T_prior, annealing, Limits(weak_share, by_surfaces=kind.by_surfaces, allowed=allowed), matches,
-        inlier_distance=inlier_distance, inlier_ratio=inlier_ratio,
-    )  # fmt: skip
-    return result_of(found, T_prior, len(points.source))
+    matches = Correspondences(len(points.source))
+    terms = voxel_terms(residual, residual.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
+    limits = Limits(c.weak_share, by_surfaces=residual.by_surfaces, allowed=allowed)
+    return result_of(optimise(terms, T_prior, annealing, limits, matches), T_prior, len(points.source))
+
+
+def prior_term(T_prior: Floats, information: Floats) -> Term:
+    """The pose (4, 4) as a measurement, of information (6, 6), world axes, 1/m2 and 1/rad2."""
+    R, t = (np.ascontiguousarray(part, np.float64) for part in (T_prior[:3, :3], T_prior[:3, 3]))
+    return Term(prior_residual.linearise, (), (R, t, information), ())
 
 
 def voxel_terms(
@@ -147,9 +164,8 @@ def part_of_usual(size: float, usual: float) -> float:
 
 def result_of(found: OptimiserResult, T_prior: Floats, source_points: int) -> RegistrationResult:
     """The optimiser's result as a registration's, or the prior (4, 4) where it is not finite."""
-    facts = found.facts
     finite = bool(np.isfinite(found.pose).all() and np.isfinite(found.step).all())
-    is_known = finite and facts.matched >= LEAST_MATCHED
+    is_known = finite and found.matched >= LEAST_MATCHED
     return RegistrationResult(
         T_world_lidar=found.pose if finite else T_prior,
         ok=finite,
@@ -158,21 +174,21 @@ def result_of(found: OptimiserResult, T_prior: Floats, source_points: int) -> Re
         converged=found.converged,
         iterations=found.iterations,
         source_points=source_points,
-        matched=facts.matched,
-        inliers=facts.inliers,
-        rmse=facts.rmse,
+        matched=found.matched,
+        inliers=found.inliers,
+        rmse=found.rmse,
         degenerate=found.weak,
-        lever_arm=facts.lever_arm,
+        lever_arm=found.lever_arm,
     )
 
 
 def _covariance(found: OptimiserResult) -> Floats:
     """Inverse of the information, with a sigma of one metre along degenerate directions."""
-    lever = found.facts.lever_arm
+    lever = found.lever_arm
     scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
     A = found.H * np.outer(scale, scale)
     values, vectors = np.linalg.eigh(A)
-    values = np.maximum(values, 1e-9 * max(found.facts.information, 1e-9))
+    values = np.maximum(values, 1e-9 * max(found.information, 1e-9))
     if len(found.weak):
         along = ((found.weak @ vectors) ** 2).sum(0) > 0.5
         values = np.where(along, np.minimum(values, 1.0), values)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu_state import ImuState
-from lslam.types.preintegration import MotionState
 
 Status = Literal["ok", "bridged", "skipped"]
 
@@ -42,7 +41,6 @@ class ScanResult:
         that an IMU predicted
     saved_s : likewise, how much longer that took, s; the IMU's own part counted against it
     gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
-    inertial : the state of the IMU that a smoother found, for the motion model, which takes it off
     imu : what was known of the IMU after the scan; None without one, and once it was refused
     stamp_offset : (4, 4) pose at the stamp as the next scan tells it, seen from `T_world_lidar`; None where it tells none
     fault : what was wrong with the scan though it was of use; empty: nothing
@@ -74,7 +72,6 @@ class ScanResult:
     steady_iterations: int | None = None
     saved_s: float | None = None
     gravity: GravityDirection | None = None
-    inertial: MotionState | None = None
     imu: ImuState | None = None
     stamp_offset: NDArray[np.float64] | None = None
     fault: str = ""

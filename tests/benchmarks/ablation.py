@@ -34,8 +34,7 @@ from lslam.errors import UsageError
 from lslam.frontend import tracker
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.odometry import create_odometry
-from lslam.recovery import start_search
-from lslam.registration import local_map, residuals, solver
+from lslam.registration import local_map, residuals, solver, start_search
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 
@@ -69,7 +68,7 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "CLEARLY": ((), ((start_search, "CLEARLY", 1.0),)),
         "MUCH": ((), ((start_search, "MUCH", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),
-        "possible jumps": ((), ((tracker, "plausible", lambda result, prior, last: result),)),
+        "possible jumps": ((), ((tracker, "fault", lambda pose, stamp_ns, last: ""),)),
     },
     "loam": {
         **MAP,

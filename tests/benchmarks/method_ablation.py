@@ -24,7 +24,7 @@ from lslam.geometry import se3
 from lslam.inertial import imu_cleaning, saturation
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
-from lslam.odometry import elastic_constraints, lips, loam_livox, plane_association, plane_factors, planes
+from lslam.odometry import elastic_constraints, lips, loam_livox, plane_association, plane_factors, plane_segmentation
 from lslam.odometry.elastic_constraints import NOTHING, LastSweep
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -93,11 +93,11 @@ def without(**changes: Any) -> Callable[..., Any]:
     return lambda self, *args: replace(constraints(self, *args), **changes)
 
 
-def small_voxels_only(self: planes.PlaneExtractor, cells: Any, sizes: list[Any]) -> Any:
+def small_voxels_only(self: plane_segmentation.PlaneExtractor, cells: Any, sizes: list[Any]) -> Any:
     return regions(self, cells, sizes[:1])
 
 
-regions = planes.PlaneExtractor._regions
+regions = plane_segmentation.PlaneExtractor._regions
 
 ABLATIONS = {
     "saturation": Ablation(
@@ -142,16 +142,16 @@ ABLATIONS = {
             "ALIKE 20 deg": ((plane_association, "ALIKE", 0.94),),
             "CLOSE 2 m": ((plane_association, "CLOSE", 2.0),),
             "APART": ((plane_association, "APART", 1e9),),
-            "wide voxels": ((planes.PlaneExtractor, "_regions", small_voxels_only),),
-            "MIXED": ((planes, "MIXED", 1e9),),
-            "COMMON": ((lips, "PlaneExtractor", lambda: planes.PlaneExtractor(common_m=0.0, common_rad=0.0)),),
+            "wide voxels": ((plane_segmentation.PlaneExtractor, "_regions", small_voxels_only),),
+            "MIXED": ((plane_segmentation, "MIXED", 1e9),),
+            "COMMON": ((lips, "PlaneExtractor", lambda: plane_segmentation.PlaneExtractor(common_m=0.0, common_rad=0.0)),),
         },
     ),
     "lio-mapping": Ablation(
         ("lio-mapping",), ("walk", "urban", "residential", "corridor"),
         {
-            "late entry": ((LioMapping, "insert", lambda self, prior, stamp_ns, points, located: (
-                self.registration.update(points, located)
+            "late entry": ((LioMapping, "insert", lambda self, stamp_ns, prior, result: (
+                self.registration.update(result)
             )),),
         },
     ),

@@ -14,7 +14,8 @@ from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
-from lslam.odometry.base import Registered
+from lslam.odometry.scan_outcome import recorded
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
@@ -26,6 +27,8 @@ SPAN_S, NO_SPAN = 0.1, Span()
 class Oracle:
     """Gives true poses at a price of three steps and 10 ms a call."""
 
+    is_searching = False
+
     def __init__(self, poses: NDArray[np.float64]) -> None:
         self.poses = poses
         self.calls: list[int] = []
@@ -33,13 +36,13 @@ class Oracle:
     def prepare(self, scan: Scan) -> Scan:
         return scan
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
         self.calls.append(scan.index)
         stages = {"register": 0.01, "deskew": 0.001}
-        return Registered(ScanResult(scan.index, scan.stamp_ns, self.poses[scan.index], iterations=3, stages=stages))
+        return RegistrationResult(self.poses[scan.index], iterations=3, stages=stages)
 
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
-        return found.result
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
+        return recorded(scan, result, result.covariance, result.covariance)
 
     def restart(self) -> None:
         pass
@@ -86,48 +89,45 @@ class Priced(Oracle):
     lost_m = np.inf
     missed: Misses = frozenset()
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
         self.calls.append(scan.index)
         off = float(np.linalg.norm(prior.pose[:3, 3] - self.poses[scan.index][:3, 3]))
         steps = 1 + int(off / 0.05)
         is_found = off < self.lost_m and (scan.index, self.calls.count(scan.index)) not in self.missed
-        pose, status = (self.poses[scan.index], "ok") if is_found else (prior.pose, "bridged")
+        pose = self.poses[scan.index] if is_found else prior.pose
         stages = {"register": 0.01 * steps}
-        return Registered(ScanResult(scan.index, scan.stamp_ns, pose, status, iterations=steps, stages=stages))  # type: ignore[arg-type]
+        return RegistrationResult(pose, ok=is_found, converged=is_found, iterations=steps, stages=stages)
 
-    def update(self, prior: MotionPrior, found: Registered) -> ScanResult:
-        return replace(found.result, stages={**found.result.stages, "update": 7.0})
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
+        return replace(super().update(scan, prior, result), stages={**result.stages, "update": 7.0})
 
 
 class Misled(Priced):
-    """Sure of a place three metres off at one scan, or lost; near the prior it finds the truth, nothing, or a false place."""
+    """Sure of a place three metres off at one scan, or lost; near the prior it finds the truth, nothing, or a false place.
 
+    Near it takes a step and 10 ms more.
+    """
+
+    is_searching = True
     FALSE_AT, FALSE_M = 20, 3.0
     near = "true"
     is_lost = False
     off_m = 0.0
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
-        found = super().register(scan, prepared, prior).result
-        pose = found.T_world_lidar.copy()
-        pose[0, 3] += self.FALSE_M * (scan.index == self.FALSE_AT)
-        is_lost = self.is_lost and scan.index == self.FALSE_AT
-        return Registered(
-            replace(
-                found, T_world_lidar=prior.pose if is_lost else pose, status="bridged" if is_lost else "ok",
-                reason="lost" if is_lost else "", registration_covariance=1e-6 * np.eye(6),
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
+        found = replace(super().register(scan, prepared, prior), covariance=1e-6 * np.eye(6))
+        true, is_there = self.poses[scan.index].copy(), scan.index == self.FALSE_AT
+        if is_near:
+            found = replace(
+                found, iterations=found.iterations + 1, stages={"register": found.stages["register"] + 0.01}
             )
-        )  # fmt: skip
-
-    def register_near(self, scan: Scan, prepared: Scan, prior: MotionPrior, found: Registered) -> Registered:
-        again = self.register(scan, prepared, prior).result
-        self.off_m = max(self.off_m, float(np.linalg.norm(prior.pose[:3, 3] - self.poses[scan.index, :3, 3])))
-        if self.near == "nothing":
-            return Registered(replace(again, status="bridged", T_world_lidar=prior.pose))
-        pose = self.poses[scan.index].copy()
-        if scan.index == self.FALSE_AT:
-            pose[0, 3] += {"true": 0.0, "elsewhere": 1.0, "same": self.FALSE_M}[self.near]
-        return Registered(replace(again, status="ok", reason="", T_world_lidar=pose))
+            self.off_m = max(self.off_m, float(np.linalg.norm(prior.pose[:3, 3] - true[:3, 3])))
+        if self.near == "nothing" if is_near else self.is_lost and is_there:
+            reason = "nothing near" if is_near else "lost"
+            return replace(found, T_world_lidar=prior.pose, ok=False, converged=False, reason=reason)
+        off = {"true": 0.0, "elsewhere": 1.0, "same": self.FALSE_M}[self.near] if is_near else self.FALSE_M
+        true[0, 3] += off * is_there
+        return replace(found, T_world_lidar=true)
 
 
 def braked(
@@ -184,7 +184,8 @@ def test_a_lost_or_rejected_scan_is_registered_again_from_the_imus_prediction(
     off = denied.T_world_lidar[:3, 3] - oracle.poses[denied.index, :3, 3]
     np.testing.assert_allclose(off, [off_m, 0, 0], atol=1e-2)
     assert (denied.status, denied.reason) == ("bridged" if reason else "ok", reason)
-    assert denied.iterations == 2
+    assert (denied.iterations, denied.stages["register"]) == (3, pytest.approx(0.03)), "of both registrations"
+    assert denied.converged == (not reason)
 
 
 def test_the_second_registration_starts_at_the_imus_prediction_not_at_the_rejected_pose(
@@ -258,7 +259,7 @@ class Weighing(Oracle):
         super().__init__(poses)
         self.points: list[tuple[int, int]] = []
 
-    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior) -> Registered:
+    def register(self, scan: Scan, prepared: Scan, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
         assert len(scan) == len(prepared)
         self.points.append((scan.index, len(scan)))
         return super().register(scan, prepared, prior)

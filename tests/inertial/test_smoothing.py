@@ -15,9 +15,9 @@ from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.inertial.imu_noise import USUAL
 from lslam.inertial.initialise import FirstPoses, start
 from lslam.inertial.smoothing import SmootherMotion
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 
 IMU_NOISE = smoother_noise(USUAL)
 LEVER = np.array([0.4, -0.3, 0.2])
@@ -74,12 +74,12 @@ def flying(count: int) -> SmootherMotion:
     return motion
 
 
-def weighed(motion: SmootherMotion, k: int) -> ScanResult:
+def weighed(motion: SmootherMotion, k: int) -> RegistrationResult:
     """Scan k, registered where it was."""
     stamp = int(stamps()[k])
     prior = motion.sweep(stamp, Span())
-    result = motion.weigh(ScanResult(k, stamp, poses()[k], registration_covariance=SURE), prior)
-    motion.correct(stamp, result.T_world_lidar, prior, result.status == "ok")
+    result = motion.fuse(stamp, RegistrationResult(poses()[k], covariance=SURE), prior)
+    motion.correct(stamp, result.T_world_lidar, prior, result.is_accepted)
     return result
 
 
@@ -116,7 +116,7 @@ def is_followed(motion: SmootherMotion, k: int) -> bool:
     results = [weighed(motion, k + i) for i in range(3)]
     # The first begins the graph, at the pose of the scan before or its own.
     states = [motion.smoother.state()["steps"].rows, results[-1].T_world_lidar[:3, 3] - poses()[k + 2][:3, 3]]
-    return all(r.status == "ok" for r in results) and len(states[0]) == 3 and float(np.linalg.norm(states[1])) < 0.02
+    return all(r.is_accepted for r in results) and len(states[0]) == 3 and float(np.linalg.norm(states[1])) < 0.02
 
 
 def test_a_scan_without_a_graph_solution_is_bridged_with_the_covariance_of_the_imu() -> None:
@@ -124,18 +124,18 @@ def test_a_scan_without_a_graph_solution_is_bridged_with_the_covariance_of_the_i
     unsolvable(motion)
     predicted = motion.sweep(int(stamps()[10]), Span()).pose
     result = weighed(motion, 10)
-    assert (result.status, result.converged) == ("bridged", False)
+    assert (result.ok, result.is_rejected, result.converged) == (True, True, False)
     assert result.reason == "the smoother of poses and IMU cannot be solved: Indeterminant linear system detected"
     np.testing.assert_array_equal(result.T_world_lidar, predicted)
-    C = result.registration_covariance
+    C = result.covariance
     assert C is not None
     off = se3.relative(poses()[9], poses()[10])[:3, 3] - se3.relative(poses()[9], predicted)[:3, 3]
     assert np.linalg.norm(off) < 4 * np.sqrt(np.linalg.eigvalsh(C[:3, :3])[-1])
     twice = flying(10)
     unsolvable(twice)
     stamp = int(stamps()[10])
-    surer = ScanResult(10, stamp, poses()[10], registration_covariance=1e-4 * SURE)
-    np.testing.assert_array_equal(twice.weigh(surer, twice.sweep(stamp, Span())).registration_covariance, C)
+    surer = RegistrationResult(poses()[10], covariance=1e-4 * SURE)
+    np.testing.assert_array_equal(twice.fuse(stamp, surer, twice.sweep(stamp, Span())).covariance, C)
     assert is_followed(motion, 11)
 
 

@@ -94,11 +94,11 @@ def test_the_map_stays_as_it_is(world: Revisited) -> None:
     view = LocalView(prior_map, CONFIG.registration, 100.0)
     T = se3.inverse(prior_map.T_map_level) @ world.true_poses[0]
     alignment = view.at(T[:3, 3])
-    moments = [level.moments.copy() for level in alignment._map.levels]
+    moments = [level.moments.copy() for level in alignment.map.levels]
     scan = next(iter(world.drive))
     MapFollower(view, T, FIRST_P, CONFIG).correct(0, prepare_points(scan.points, CONFIG.preprocess, 0))
     assert prior_map.points.tobytes() == before
-    assert all(np.array_equal(a, b.moments) for a, b in zip(moments, alignment._map.levels, strict=True))
+    assert all(np.array_equal(a, b.moments) for a, b in zip(moments, alignment.map.levels, strict=True))
 
 
 def test_a_scan_without_points_is_carried(world: Revisited) -> None:

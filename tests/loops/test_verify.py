@@ -105,9 +105,11 @@ def test_starts_are_tried_with_a_quarter_of_the_points_and_the_best_refined_with
     a, b = (place(town(), pose(x, -45), x) for x in (5, 7))
     used: list[int] = []
 
-    def counting(target: GaussianMap, points: PreparedPoints, *given: object, **named: object) -> RegistrationResult:
+    def counting(
+        levels: tuple[GaussianMap, ...], points: PreparedPoints, *given: object, **named: object
+    ) -> RegistrationResult:
         used.append(len(points.source))
-        return solve(target, points, *given, **named)  # type: ignore[arg-type]
+        return solve(levels, points, *given, **named)  # type: ignore[arg-type]
 
     monkeypatch.setattr(verify, "solve", counting)
     assert compare(a, b, np.zeros(3), 5.0).reason == ""

@@ -13,10 +13,10 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.relative import by_path, error_transforms
 from lslam.geometry import se3, so3
+from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
-from lslam.recovery.policies import RecoveringRegistration
+from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.uncertainty import PoseUncertainty
 from lslam.simulation.scenarios import simulate
 from lslam.types.sequence import Sequence
 
@@ -57,7 +57,7 @@ def prepared(sequence: Sequence, indices: Iterable[int]) -> list[PreparedPoints]
 
 def registered(points: Iterable[PreparedPoints]) -> list[RegistrationResult]:
     """All scans, one after the other, in the default configuration."""
-    registration = RecoveringRegistration()
+    registration = Registration()
     return [registration.align(p) for p in points]
 
 

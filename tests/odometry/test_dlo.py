@@ -37,7 +37,7 @@ def test_a_drive_is_followed_on_few_keyframes() -> None:
     assert all(r.covariance is not None for r in results)
     assert drive.ground_truth is not None
     assert error_of(results, drive.ground_truth.poses) < 0.1
-    target = method.registration.target
+    target = method.registration.target.scans
     assert 2 <= len(target.poses) < COUNT  # type: ignore[attr-defined]
 
 

@@ -19,7 +19,8 @@ from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.all_points import ALL_POINTS
-from lslam.odometry.feature_registration import LESS_PLANAR, PATIENCE
+from lslam.odometry.feature_policies import LessPlanar
+from lslam.odometry.feature_target import PATIENCE
 from lslam.odometry.loam import Loam
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features
@@ -28,7 +29,6 @@ from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
-from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 
@@ -161,11 +161,11 @@ def test_after_a_row_of_failures_the_target_is_a_scan_at_hand() -> None:
     scans, _ = street()
     driver = Driver("loam-odom")
     driver.drive(scans[:6])
-    before = driver.loam.registration.target
+    before = driver.loam.registration.target.scan
     for k in range(6, 6 + PATIENCE):
-        assert driver.loam.registration.target is before
+        assert driver.loam.registration.target.scan is before
         driver.feed(starved(scans[k], "noise"))
-    assert driver.loam.registration.target is not before
+    assert driver.loam.registration.target.scan is not before
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -188,7 +188,7 @@ def test_few_features_are_helped_by_less_planar_points(method: str) -> None:
     scans, truth = street()
     results = Driver(method, regions=1, max_edge_points=1, max_planar_points=1).drive(scans[:20])
     assert all(r.status == "ok" for r in results)
-    assert all(r.posed_by == LESS_PLANAR for r in results[1:])
+    assert all(r.posed_by == LessPlanar.name for r in results[1:])
     assert ate(poses_of(results), truth[:20]) < GATES[method]
 
 
@@ -306,13 +306,13 @@ def test_all_points_correct_a_slide_of_features_by_non_ground_points() -> None:
     scans, truth = of_motorway(0, "os1-16", 9)
     driver = Driver("floam", fallback="all-points")
     expected = driver.drive(scans[:8])[-1].T_world_lidar @ se3.relative(truth[7], truth[8])
-    features, points = driver.loam.prepare(scans[8]), driver.loam.registration._all
-    assert points is not None
+    registration = driver.loam.registration
+    attempt, points = registration.attempt(driver.loam.prepare(scans[8]), expected), registration.target.all_points
     right = RegistrationResult(expected)
-    assert points.held(features, expected, expected, right) is right
+    assert points.held(attempt, expected, right) is right
     slid = RegistrationResult(expected @ se3.make(np.eye(3), np.array([2.0, 0.0, 0.0])))
-    held = points.held(features, expected, expected, slid)
-    assert held.posed_by == ALL_POINTS
+    held = points.held(attempt, expected, slid)
+    assert held.pose_source == ALL_POINTS
     assert np.linalg.norm(held.T_world_lidar[:3, 3] - expected[:3, 3]) < 0.2
 
 
@@ -336,7 +336,7 @@ def test_a_resumed_start_has_its_non_ground_points() -> None:
     first.drive(scans[:2])
     again.loam.registration.restore(deepcopy(first.loam.registration.state()))
     features, prior = first.loam.prepare(scans[2]), np.eye(4)
-    poses = [one.loam.registration.locate(features, prior, StageClock()).T_world_lidar for one in (first, again)]
+    poses = [one.loam.registration.locate(features, prior).T_world_lidar for one in (first, again)]
     np.testing.assert_array_equal(poses[0], poses[1])
     assert metres(first.feed(scans[2]), prior) > 3.0
 
@@ -355,8 +355,8 @@ def test_features_pose_every_scan_by_themselves(method: str) -> None:
     scans, truth = of_carpark()
     driver = Driver(method)
     results = driver.drive(scans)
-    assert driver.loam.registration._all is None
-    assert {r.posed_by for r in results} <= {"", LESS_PLANAR}
+    assert driver.loam.registration.target.all_points is None
+    assert {r.posed_by for r in results} <= {"", LessPlanar.name}
     assert all(r.status == "ok" for r in results)
     assert ate(poses_of(results), truth) < {"loam-odom": 0.2, "lego-loam": 0.1}.get(method, 0.02)
 
@@ -368,7 +368,7 @@ def test_edges_find_a_start_at_thirty_metres_a_second(method: str) -> None:
     found, blind = (Driver(method, start_reach=reach).drive(scans) for reach in (12.0, 0.0))
     assert max(metres(result, true) for result, true in zip(found, truth, strict=True)) < 0.05
     assert metres(blind[1], truth[1]) > 1.0
-    assert {r.posed_by for r in found} <= {"", LESS_PLANAR}
+    assert {r.posed_by for r in found} <= {"", LessPlanar.name}
 
 
 def test_two_matching_edges_do_not_support_a_start() -> None:

@@ -7,7 +7,7 @@ import pytest
 from drives import ate, coasting, drive, nees_per_dof, poses_of, standing
 
 from lslam.config.registration import RegistrationConfig, Residual
-from lslam.recovery.policies import RecoveringRegistration
+from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 
 FAMILY: tuple[Residual, ...] = ("gicp", "vgicp", "ndt")
@@ -20,7 +20,7 @@ GATES: dict[Residual, tuple[float, float]] = {
 
 def results_of(residual: Residual, scenario: tuple[str, int, int, str]) -> tuple[list[RegistrationResult], float]:
     d = drive(*scenario[:3], lidar=scenario[3])
-    registration = RecoveringRegistration(RegistrationConfig(residual=residual))
+    registration = Registration(RegistrationConfig(residual=residual))
     results = [registration.align(p) for p in d.points]
     return results, ate(poses_of(results), d.truth)
 
@@ -41,7 +41,7 @@ def test_drives_are_followed(residual: Residual, k: int) -> None:
 def test_rings_metres_apart_do_not_bias_a_flight() -> None:
     """Means of single rings draw those that follow to where they lie: a climb of .06 m per scan was pitched away in part."""
     d = drive("climbing", 0, 30, lidar="os1-32", compensated=True)
-    registration = RecoveringRegistration(RegistrationConfig(residual="point"))
+    registration = Registration(RegistrationConfig(residual="point"))
     results = [registration.align(p) for p in d.points]
     assert all(r.ok for r in results)
     off = np.linalg.norm(poses_of(results)[:, :3, 3] - d.truth[:, :3, 3], axis=1)
@@ -52,7 +52,7 @@ def test_rings_metres_apart_do_not_bias_a_flight() -> None:
 def test_a_head_that_turns_is_followed(residual: Residual) -> None:
     """Up to 9 deg per scan and 7 deg off the motion prior, at the pace of a walk."""
     d = drive("walk", 1, 20, compensated=True)
-    registration = RecoveringRegistration(RegistrationConfig(residual=residual))
+    registration = Registration(RegistrationConfig(residual=residual))
     assert ate(poses_of([registration.align(p) for p in d.points]), d.truth) < 0.05
 
 

@@ -7,9 +7,7 @@ import pytest
 
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
-from lslam.odometry.feature_registration import WORDING as OF_FEATURES
-from lslam.registration.acceptance import PRIOR_COVARIANCE, Wording, accepted, correction
-from lslam.registration.registration import WORDING as OF_POINTS
+from lslam.registration.acceptance import PRIOR_COVARIANCE, Acceptance, correction
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 
@@ -18,8 +16,9 @@ PRIOR = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
 
 
 def judged(
-    wording: Wording, metres: float = 0.1, degrees: float = 1.0, matched: int = 90, inliers: int = 80, reason: str = ""
-) -> RegistrationResult:
+    source: str = "points", metres: float = 0.1, degrees: float = 1.0, matched: int = 90, inliers: int = 80,
+    reason: str = "",
+) -> RegistrationResult:  # fmt: skip
     """Of 100 points, so far from the prior; lately 80 % agreed, and 60 % have to find a match."""
     step = se3.make(so3.exp(np.array([0, 0, np.deg2rad(degrees)])), np.array([metres, 0, 0]))
     result = RegistrationResult(
@@ -27,38 +26,50 @@ def judged(
     )
     usual = UsualAgreement(CONFIG.min_agreement)
     usual.observe(0.8)
-    return accepted(result, PRIOR, CONFIG, usual, 0.6, wording)
+    return Acceptance.of(CONFIG, usual, 0.6, source).accepted(result, PRIOR)
 
 
 def test_an_accepted_result_has_its_correction_of_the_prior() -> None:
-    result = judged(OF_POINTS)
+    result = judged()
     assert (result.ok, result.reason, result.inliers) == (True, "", 80)
     np.testing.assert_allclose(result.prior_error, (0.1, np.deg2rad(1.0)))
 
 
 @pytest.mark.parametrize(
-    ("facts", "of_points", "of_features"),
+    ("facts", "reason"),
     [
-        ({"matched": 50, "inliers": 50}, "only 50% of the points overlap the map", "only 50% of the features have a counterpart"),
-        ({"inliers": 20}, "only 22% of the matches agree", "only 22% of the matches agree"),
-        (
-            {"inliers": 35},
-            "only 35% of the points agree with the map, lately 80% did",
-            "only 35% of the features agree, lately 80% did",
-        ),
-        ({"metres": 5.1}, "impossible jump of 5.1 m and 1 deg", "impossible jump of 5.1 m and 1 deg"),
-        ({"degrees": 31.0}, "impossible jump of 0.1 m and 31 deg", "impossible jump of 0.1 m and 31 deg"),
-        ({"reason": "singular", "inliers": 0}, "singular", "singular"),
+        ({"matched": 50, "inliers": 50}, "only 50% of the {} overlap the map"),
+        ({"inliers": 20}, "only 22% of the matches agree"),
+        ({"inliers": 35}, "only 35% of the {} agree with the map, lately 80% did"),
+        ({"metres": 5.1}, "impossible jump of 5.1 m and 1 deg"),
+        ({"degrees": 31.0}, "impossible jump of 0.1 m and 31 deg"),
+        ({"reason": "singular", "inliers": 0}, "singular"),
     ],
-)  # fmt: skip
-def test_a_rejected_result_keeps_the_prior_with_a_reason(
-    facts: dict[str, float], of_points: str, of_features: str
-) -> None:
-    for wording, why in ((OF_POINTS, of_points), (OF_FEATURES, of_features)):
-        result = judged(wording, **facts)  # type: ignore[arg-type]
-        assert (result.ok, result.reason, result.iterations, result.source_points) == (False, why, 7, 100)
+)
+def test_a_rejected_result_keeps_the_prior_with_a_reason(facts: dict[str, float], reason: str) -> None:
+    for source in ("points", "features"):
+        result = judged(source, **facts)  # type: ignore[arg-type]
+        why = (result.ok, result.reason, result.iterations, result.source_points)
+        assert why == (False, reason.format(source), 7, 100)
         np.testing.assert_array_equal(result.T_world_lidar, PRIOR)
         np.testing.assert_array_equal(result.covariance, PRIOR_COVARIANCE)
+
+
+@pytest.mark.parametrize(
+    ("limits", "test"),
+    [
+        ({"max_rmse": 0.1}, "rmse"),
+        ({"needs_all_directions": True}, "directions"),
+        ({"needs_covariance": True}, "solution"),
+        ({"min_overlap": 0.95}, "overlap"),
+        ({"min_inliers": 0.95}, "inliers"),
+        ({}, None),
+    ],
+)
+def test_each_limit_is_a_test_of_its_own(limits: dict[str, float], test: str | None) -> None:
+    result = RegistrationResult(PRIOR, source_points=100, matched=90, inliers=80, rmse=0.2, degenerate=np.eye(6)[:1])
+    rejection = Acceptance(**limits).rejection(result)  # type: ignore[arg-type]
+    assert (rejection and rejection.test) == test
 
 
 def test_a_correction_is_measured_from_the_prior() -> None:

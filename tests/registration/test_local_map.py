@@ -78,14 +78,14 @@ def test_near_its_prior_a_scan_is_placed_well_while_the_map_is_young(scenario: s
 def test_cached_correspondences_are_discarded_when_the_map_changes() -> None:
     target, config = new_map(), RegistrationConfig()
     target.insert(scan(0).map_points, scan(0).source, np.eye(4))
-    alignment, points = MapAlignment(target, config, "plane"), scan(1)
+    alignment, points = MapAlignment(target, config), scan(1)
 
     def align(by: MapAlignment, x: float) -> list[float]:
         found = by.refine(points, pose_at((x, 0.0, 0.0)), 0.5, 10)
         return [*found.T_world_lidar.ravel(), found.rmse, found.matched]
 
     for x in (0.1, 0.05):
-        assert align(alignment, x) == align(MapAlignment(target, config, "plane"), x)
+        assert align(alignment, x) == align(MapAlignment(target, config), x)
     before = align(alignment, 0.1)
     target.insert(scan(2).map_points, scan(2).source, pose_at((0.02, 0.0, 0.0), 0.2))
-    assert before != align(alignment, 0.1) == align(MapAlignment(target, config, "plane"), 0.1)
+    assert before != align(alignment, 0.1) == align(MapAlignment(target, config), 0.1)

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.recovery.policies import RecoveringRegistration as Registration
-from lslam.registration.registration import MIN_SOURCE_POINTS
+from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 Floats = NDArray[np.float64]
 
@@ -77,14 +77,14 @@ def test_unexpected_motion_after_the_start_is_recovered_coarse_to_fine(seed: int
 def test_where_priors_are_right_the_kernel_begins_where_it_ends() -> None:
     """And a surprise of a decimetre is found all the same, in a step or two more."""
     registration, rng = settled(22)
-    assert registration.threshold.width == registration.config.kernel_min
+    assert registration.history.threshold.width == registration.config.kernel_min
     usual = registration.register(seen_from(room(rng), pose_at((2.2, 0.0, 0.0), 11.0)))
     assert usual.iterations <= 2
     T = pose_at((2.42, 0.0, 0.0), 11.5)
     surprised = registration.register(seen_from(room(rng), T))
     assert surprised.iterations <= 4
     assert is_near(T, surprised.T_world_lidar, 0.01, 0.05)
-    assert registration.threshold.width > registration.config.kernel_min
+    assert registration.history.threshold.width > registration.config.kernel_min
 
 
 def test_a_corridor_keeps_the_prior_along_itself_scan_after_scan() -> None:
@@ -249,9 +249,9 @@ def test_a_map_that_fills_asks_for_less_overlap_than_one_that_is_filled(
         {"target": target, "start_scans": 5, "start_overlap": 0.2, "min_overlap": 0.6, "min_inliers": 0.1}
     )
     registration = Registration(config)
-    registration.inserted = scans
+    registration.history.inserted = scans
     result = RegistrationResult(np.eye(4), source_points=100, matched=40, inliers=40)
-    judged = registration.judged(result, np.eye(4))
+    judged = registration.target.limits(registration.history).accepted(result, np.eye(4))
     assert judged.ok == is_believed
     assert ("only 40% of the points overlap the map" in judged.reason) == (not is_believed)
 
@@ -262,12 +262,14 @@ def test_a_tenth_of_the_points_beyond_a_voxel_between_rings_makes_a_sparse_senso
 ) -> None:
     """Rings two degrees apart lie a voxel apart at a distance of 28.6 voxels."""
     registration = Registration(RegistrationConfig(residual="point"))
-    registration.inserted = registration.config.start_scans + 1
-    registration._ring_gap = np.deg2rad(2.0)
+    registration.history.inserted = registration.config.start_scans + 1
+    registration.target._ring_gap = np.deg2rad(2.0)
     limit = registration.map.fine.size / np.deg2rad(2.0)
     distances = np.where(np.arange(1000) < 1000 * share, 1.01, 0.99) * limit
     source = distances[:, None] * [0.6, -0.64, 0.48]
-    found = registration._gaps(PreparedPoints(np.zeros((0, 3), np.float32), source, np.zeros((1000, 6)), 1000))
+    found = registration.target._gaps(
+        PreparedPoints(np.zeros((0, 3), np.float32), source, np.zeros((1000, 6)), 1000), registration.history
+    )
     assert (found is not None) == is_sparse
     if found is not None:
         np.testing.assert_allclose(found, np.deg2rad(2.0) * distances)

@@ -10,15 +10,18 @@ import pytest
 from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, room, seen_from
 from numpy.typing import NDArray
 
+from lslam.config.config import Config
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig, Residual
 from lslam.geometry import se3
+from lslam.odometry.icp import registration_of
+from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.preprocessing.prepare import prepare_points
-from lslam.recovery.policies import RecoveringRegistration as Registration
+from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS as TABLE
+from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
-from lslam.registration.uncertainty import PoseUncertainty
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -29,7 +32,8 @@ ROOM = {"plane": (0.01, 0.05), "point": (0.06, 0.3), "gicp": (0.01, 0.05), "vgic
 
 def in_room(residual: Residual, seed: int = 0, **given: object) -> Registration:
     """A registration that has seen the room from its middle."""
-    registration = Registration(RegistrationConfig.model_validate({"residual": residual, **given}))
+    config = Config.model_validate({"registration": {"residual": residual, **given}})
+    registration = registration_of(config, residual)
     registration.register(room(np.random.default_rng(seed)).astype(np.float32))
     return registration
 
@@ -59,7 +63,7 @@ def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
         points = prepare_points(seen_from(room(rng), T), registration.preprocess)
         slow = Annealing(5.0, 0.15, 0.85, 40)
         coarse = registration.map.coarser[0]
-        found = solve(coarse, points, np.eye(4), slow, sigma=0.03, blob_weight=0.5, weak_share=1e-3, residual=residual)
+        found = solve((coarse,), points, np.eye(4), slow, RegistrationConfig(), residual=residual_named(residual))
         assert distance(T, found.T_world_lidar)[0] < 0.1
 
 

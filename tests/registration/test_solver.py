@@ -18,6 +18,7 @@ from analytic_scenes import (
 )
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.alignment import upright_directions
@@ -35,7 +36,8 @@ def as_source(points: NDArray[np.float32]) -> PreparedPoints:
 
 
 def on(target: GaussianMap, points: NDArray[np.float32], prior: Floats, blob_weight: float = 0.5) -> RegistrationResult:
-    return solve(target, as_source(points), prior, FINE, sigma=NOISE, blob_weight=blob_weight, weak_share=1e-3)
+    config = RegistrationConfig(sigma=NOISE, blob_weight=blob_weight, weak_share=1e-3)
+    return solve((target,), as_source(points), prior, FINE, config)
 
 
 def map_of(world: Floats) -> GaussianMap:
@@ -72,8 +74,8 @@ def test_the_ground_aligns_height_and_tilt_alone(room_map: GaussianMap, weak_sha
     off = se3.exp(np.array([0.12, -0.1, 0.14, 0.02, -0.015, 0.03]))
     start = T @ off
     result = solve(
-        room_map, as_source(seen_from(room(rng, 300), T)), start, FINE, sigma=NOISE, blob_weight=0.5,
-        weak_share=weak_share, allowed=upright_directions(start),
+        (room_map,), as_source(seen_from(room(rng, 300), T)), start, FINE,
+        RegistrationConfig(sigma=NOISE, blob_weight=0.5, weak_share=weak_share), allowed=upright_directions(start),
     )  # fmt: skip
     moved = se3.log(se3.relative(start, result.T_world_lidar))
     left = se3.log(se3.relative(T, result.T_world_lidar))
@@ -124,7 +126,8 @@ def test_a_degenerate_direction_is_estimated_down_to_three_tenths_of_the_thresho
 
     def solved(weak_share: float) -> RegistrationResult:
         annealing = Annealing(0.3, 0.3, 0.5, 20)
-        return solve(target, seen, start, annealing, sigma=NOISE, blob_weight=0.0, weak_share=weak_share)
+        config = RegistrationConfig(sigma=NOISE, blob_weight=0.0, weak_share=weak_share)
+        return solve((target,), seen, start, annealing, config)
 
     first = solved(1e-12)
     assert first.covariance is not None

@@ -8,7 +8,7 @@ from analytic_scenes import is_near, random_pose, room, seen_from
 from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
-from lslam.recovery.policies import RecoveringRegistration
+from lslam.registration.registration import Registration
 from lslam.registration.source_covariance import NEIGHBOURS, Neighbourhood, source_covariance
 
 THIN = 9e-4
@@ -56,7 +56,7 @@ def test_rings_within_two_metres_make_a_surface(apart: float, has_normal: bool) 
 @pytest.mark.parametrize("residual", ["gicp", "vgicp"])
 def test_both_source_covariances_recover_a_known_motion(residual: str, neighbourhood: Neighbourhood) -> None:
     rng = np.random.default_rng(3)
-    registration = RecoveringRegistration(RegistrationConfig(residual=residual, neighbourhood=neighbourhood))
+    registration = Registration(RegistrationConfig(residual=residual, neighbourhood=neighbourhood))
     registration.register(room(np.random.default_rng(0)).astype(np.float32))
     T = random_pose(rng, 0.5, 3.0)
     assert is_near(T, registration.register(seen_from(room(rng), T)).T_world_lidar, 0.01, 0.05)
@@ -67,7 +67,7 @@ def test_voxel_and_neighbour_covariances_give_different_results() -> None:
     for neighbourhood in ("voxel", "knn"):
         rng = np.random.default_rng(3)
         config = RegistrationConfig.model_validate({"residual": "gicp", "neighbourhood": neighbourhood})
-        registration = RecoveringRegistration(config)
+        registration = Registration(config)
         registration.register(room(np.random.default_rng(0)).astype(np.float32))
         poses.append(registration.register(seen_from(room(rng), random_pose(rng, 0.5, 3.0))).T_world_lidar)
     assert not np.array_equal(poses[0], poses[1])

@@ -7,8 +7,8 @@ import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
+from lslam.odometry.keyframe_submap import NEAREST, ON_HULL, KeyframeSubmap, hull_of, spacing_of
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.registration.submap import NEAREST, ON_HULL, SubmapTarget, hull_of, spacing_of
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +32,7 @@ def cloud(away: float) -> PreparedPoints:
     return PreparedPoints(np.full((1, 3), away, np.float32), np.array([[away, 0.0, 0.0]]), np.zeros((1, 6)), 1)
 
 
-def entered(target: SubmapTarget, poses: list[Floats], away: float) -> Listed:
+def entered(target: KeyframeSubmap, poses: list[Floats], away: float) -> Listed:
     listed = Listed()
     for pose in poses:
         target.enter(listed, cloud(away), pose)  # type: ignore[arg-type]
@@ -43,13 +43,13 @@ def entered(target: SubmapTarget, poses: list[Floats], away: float) -> Listed:
 def test_keyframes_stand_closer_where_it_is_narrow(away: float, spacing: float) -> None:
     assert spacing_of(away) == spacing
     for way, count in ((0.9 * spacing, 1), (1.1 * spacing, 2)):
-        target = SubmapTarget()
+        target = KeyframeSubmap()
         entered(target, [pose_at(), pose_at((way, 0.0, 0.0))], away)
         assert len(target.poses) == count
 
 
 def test_spaciousness_follows_a_door_in_a_second_and_not_at_once() -> None:
-    target = SubmapTarget()
+    target = KeyframeSubmap()
     entered(target, [pose_at()], 30.0)
     entered(target, [pose_at()], 2.0)
     assert target.spaciousness == pytest.approx(0.95 * 30.0 + 0.05 * 2.0)
@@ -58,14 +58,14 @@ def test_spaciousness_follows_a_door_in_a_second_and_not_at_once() -> None:
 
 
 def test_a_turn_makes_a_keyframe_once() -> None:
-    target = SubmapTarget()
+    target = KeyframeSubmap()
     entered(target, [pose_at(yaw_deg=a) for a in (0.0, 29.0, 31.0, 62.0, 120.0)], 25.0)
     assert len(target.poses) == 2
 
 
 def test_the_nearest_and_the_hulls_nearest_corners_are_the_map() -> None:
     """A long straight: its ends are the hull. A drive round a square: corners far away belong to it too."""
-    target = SubmapTarget()
+    target = KeyframeSubmap()
     listed = entered(target, [pose_at((6.0 * k, 0.0, 0.0)) for k in range(40)], 15.0)
     assert sorted(x for x, _ in listed.held) == [0.0, *(6.0 * k for k in range(40 - NEAREST, 40))]
     square = [(60.0, 0.0), (60.0, 60.0), (0.0, 60.0), (0.0, 0.0)]
@@ -74,13 +74,13 @@ def test_the_nearest_and_the_hulls_nearest_corners_are_the_map() -> None:
         steps = np.linspace(at, corner, 11)[1:]
         ring += [pose_at((x, y, 0.0)) for x, y in steps]
         at = np.array(corner)
-    listed = entered(SubmapTarget(), ring, 15.0)
+    listed = entered(KeyframeSubmap(), ring, 15.0)
     assert set(square) <= {(round(x, 6), round(y, 6)) for x, y in listed.held}
     assert len(listed.held) <= NEAREST + ON_HULL
 
 
 def test_the_map_is_rebuilt_only_when_a_keyframe_leaves_it() -> None:
-    target = SubmapTarget()
+    target = KeyframeSubmap()
     listed = entered(target, [pose_at((6.0 * k, 0.0, 0.0)) for k in range(NEAREST)], 15.0)
     assert listed.cleared == 0
     way = [pose_at((6.0 * k, 0.0, 0.0)) for k in (*range(NEAREST, 40), *range(40, -1, -1))]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from recovery_drives import driven, seen_by
 
 from lslam.geometry import se3
-from lslam.recovery.policies import RecoveringRegistration
-from lslam.recovery.start_search import MUCH, is_much_more, start_offsets
+from lslam.registration.registration import Registration
+from lslam.registration.start_search import MUCH, is_much_more, start_offsets
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ def at_every_third(scenario: str, seed: int, first: int, prior: Floats | None) -
     """Error of the first step, m, and how many directions nothing observes, with a prior or without one."""
     drive = driven(scenario, seed)
     truth = se3.relative(drive.ground_truth.poses[first], drive.ground_truth.poses[first + STRIDE])
-    registration = RecoveringRegistration()
+    registration = Registration()
     registration.register(drive.scan(first).points)
     result = registration.register(drive.scan(first + STRIDE).points, truth if prior is None else prior)
     assert result.ok
@@ -52,7 +52,7 @@ def test_a_first_turn_of_more_than_twenty_degrees_is_found(seed: int, first: int
 
 def test_unpredicted_rotations_of_thirty_degrees_are_found_during_the_drive() -> None:
     drive = driven("walk", 0)
-    registration = RecoveringRegistration()
+    registration = Registration()
     for i in range(0, 54, STRIDE):
         result = registration.register(drive.scan(i).points)
         truth = se3.relative(drive.ground_truth.poses[0], drive.ground_truth.poses[i])
@@ -73,7 +73,7 @@ MOTORWAYS = [("vlp16", 0), ("vlp16", 1), ("vlp16", 4), ("os1-16", 0), ("os1-16",
 def driven_off(lidar: str, seed: int, noise: int = 0) -> Floats:
     """(10, 3) how far the first scans of a motorway are off: distance, height, m, and tilt, deg."""
     drive = seen_by(lidar, "motorway", seed, noise)
-    registration = RecoveringRegistration()
+    registration = Registration()
     off = []
     for i in range(10):
         result = registration.register(drive.scan(i).points)
@@ -108,7 +108,7 @@ def flown_high(seed: int) -> tuple[Floats, Floats, Floats]:
     flight = simulate("closed", seed=seed, lidar="os1-16", count=40, motion_compensated=True)
     assert flight.ground_truth is not None
     truth = se3.relative(flight.ground_truth.poses[0], flight.ground_truth.poses)
-    alone, led = RecoveringRegistration(), RecoveringRegistration()
+    alone, led = Registration(), Registration()
     scans = [flight.scan(i).points for i in range(len(truth))]
     found = np.stack([alone.register(points).T_world_lidar for points in scans])
     return truth, found, np.stack([led.register(p, pose).T_world_lidar for p, pose in zip(scans, truth, strict=True)])
@@ -139,7 +139,7 @@ def test_a_start_high_above_a_town_keeps_height_and_tilt() -> None:
 
 def test_a_resumed_start_has_its_non_ground_points() -> None:
     drive = seen_by("os1-16", "motorway", 1)
-    first, again = RecoveringRegistration(), RecoveringRegistration()
+    first, again = Registration(), Registration()
     for i in range(2):
         first.register(drive.scan(i).points)
     again.restore(deepcopy(first.state()))
@@ -151,7 +151,7 @@ def test_a_resumed_start_has_its_non_ground_points() -> None:
 def test_a_second_scan_of_another_place_is_rejected(scenario: str) -> None:
     """Somewhere twelve metres around, a tenth of what stands has a point near by: planes refuse the scan with reason."""
     begun, other = (seen_by("vlp16", name) for name in ("street", scenario))
-    registration = RecoveringRegistration()
+    registration = Registration()
     registration.register(begun.scan(0).points)
     result = registration.register(other.scan(100).points)
     assert not result.ok
@@ -169,7 +169,7 @@ def hills(rng: np.random.Generator, at: float) -> NDArray[np.float32]:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_without_non_ground_points_the_ground_decides(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    registration = RecoveringRegistration()
+    registration = Registration()
     registration.register(hills(rng, 0.0))
     result = registration.register(hills(rng, 8.0), np.eye(4))
     assert result.ok, result.reason

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from lslam.config import load_config
 from lslam.geometry import se3, so3
+from lslam.odometry.deskew_uncertainty import DeskewUncertainty
+from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.pipeline.run import run
-from lslam.registration.deskew_uncertainty import DeskewUncertainty
 from lslam.registration.solver import RegistrationResult
-from lslam.registration.uncertainty import PoseUncertainty
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan_result import ScanResult
@@ -182,10 +182,7 @@ def test_the_pose_of_a_rejected_scan_does_not_change_the_estimated_motion() -> N
     """Two decimetres off, as an IMU may be: neither the way to it nor the way from it is an acceleration."""
     C, uncertainty = 1e-8 * np.eye(6), PoseUncertainty()
     for k in range(12):
-        is_denied = k == 7
-        put = ScanResult(
-            k, k * 10**8, at(k + 0.2 * is_denied), "bridged" if is_denied else "ok", registration_covariance=C
-        )
-        located = RegistrationResult(at(k + 3.0 * is_denied), covariance=C, lever_arm=10.0).decided(put)
-        found = uncertainty.stamped(put, located, steady(1.0 * k, 10.0))
-    np.testing.assert_allclose(found.registration_covariance, C, atol=1e-12)
+        is_rejected = k == 7
+        result = RegistrationResult(at(k + 0.2 * is_rejected), covariance=C, lever_arm=10.0, is_rejected=is_rejected)
+        _, own = uncertainty.covariances(result, k * 10**8, steady(1.0 * k, 10.0))
+    np.testing.assert_allclose(own, C, atol=1e-12)

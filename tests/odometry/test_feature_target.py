@@ -14,11 +14,13 @@ from lslam.config.loam import LoamConfig
 from lslam.config.recovery import RecoveryConfig
 from lslam.geometry import se3
 from lslam.odometry.all_points import ALL_POINTS, FED
-from lslam.odometry.feature_registration import LESS_PLANAR, FeatureRegistration
+from lslam.odometry.feature_policies import LessPlanar, feature_policies
 from lslam.odometry.feature_scan import feature_scan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, remap_solution, solve_on_scan
 from lslam.odometry.feature_steps import ScanStep, joint_step, two_steps, upright_directions
+from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.preprocessing.features import Features, extract_features
+from lslam.registration.registration import Registration
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan
@@ -54,8 +56,14 @@ def features_at(pose: Floats, seed: int = 0, with_pillars: bool = True) -> Featu
     return extract_features(scan_of_room(pose, seed, with_pillars))
 
 
-def engine(step: ScanStep | None, with_map: bool, loam: LoamConfig | None = None) -> FeatureRegistration:
-    return FeatureRegistration(Config().registration, loam or LoamConfig(), scan_step=step, with_map=with_map)
+def engine(
+    step: ScanStep | None, with_map: bool, loam: LoamConfig | None = None, recovery: RecoveryConfig | None = None
+) -> Registration:
+    recovery = recovery or RecoveryConfig()
+    config, variant = Config().registration, LoamVariant(step, with_map)
+    with_all_points = recovery.fallback == "all-points"
+    target = FeatureTarget(config, loam or LoamConfig(), variant, with_all_points=with_all_points)
+    return Registration(config, target=target, policies=feature_policies(recovery))
 
 
 VARIANTS = [(joint_step, False), (joint_step, True), (None, True), (two_steps, True)]
@@ -67,11 +75,11 @@ def test_a_known_motion_is_recovered(step: ScanStep | None, with_map: bool, seed
     rng = np.random.default_rng(seed)
     registration = engine(step, with_map)
     first = features_at(np.eye(4))
-    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    registration.update(registration.locate(first, np.eye(4)))
     way, axis = rng.normal(size=(2, 3))
     truth = se3.exp(np.concatenate([0.4 * way / np.linalg.norm(way), np.deg2rad(3.0) * axis / np.linalg.norm(axis)]))
     features = features_at(truth, seed)
-    result = registration.locate(features, np.eye(4), StageClock())
+    result = registration.locate(features, np.eye(4))
     assert result.ok
     assert result.converged
     assert len(result.degenerate) == 0
@@ -94,12 +102,12 @@ def test_neither_a_coarse_grid_nor_a_fine_map_starves_the_registration(
     for k in range(8):
         truth = se3.exp(np.array([0.3 * k, -0.1 * k, 0.02 * k, 0, 0, np.deg2rad(k)]))
         features = extract_features(scan_of_room(truth, k), loam)
-        result = registration.locate(features, prior, StageClock())
+        result = registration.locate(features, prior)
         assert result.ok, result.reason
         metres, degrees = distance(result.T_world_lidar, truth)
         assert metres < 0.05
         assert degrees < 0.3
-        registration.update(features, result)
+        registration.update(result)
         prior = result.T_world_lidar
 
 
@@ -110,12 +118,12 @@ def test_a_coarse_grid_takes_neither_counterparts_nor_normals_from_scan_to_scan(
     loam = LoamConfig(grid_step=grid_step)
     registration = engine(joint_step, False, loam)
     first = extract_features(scan_of_room(np.eye(4)), loam)
-    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
-    target = registration.target
+    registration.update(registration.locate(first, np.eye(4)))
+    target = registration.target.scan
     assert target is not None
     assert np.any(target.normals, axis=1).mean() > 0.6
     truth = se3.exp(np.array([0.2, -0.1, 0.05, 0, 0, np.deg2rad(1)]))
-    result = registration.locate(extract_features(scan_of_room(truth, seed), loam), np.eye(4), StageClock())
+    result = registration.locate(extract_features(scan_of_room(truth, seed), loam), np.eye(4))
     assert not result.reason
     assert result.matched > 0.95 * result.source_points
     assert distance(result.T_world_lidar, truth)[0] < 0.02
@@ -159,7 +167,7 @@ def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() ->
     assert result.covariance[1, 1] < 0.01
 
 
-def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_less_planar_points_may_stand_in_and_leave_a_direction_open() -> None:
     """Floor and long walls, hardly a feature on them: the pose across is found all the same, the prior kept along."""
 
     def between_walls(pose: Floats, seed: int) -> Features:
@@ -173,17 +181,16 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch:
         )  # fmt: skip
 
     registration = engine(None, True)
-    monkeypatch.setattr(registration, "_is_well_constrained", lambda result: True)
     first = between_walls(np.eye(4), 0)
-    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    registration.update(registration.locate(first, np.eye(4)))
     for k in range(1, 8):
         truth = se3.make(np.eye(3), np.array([0.2 * k, 0.03, 0.02]))
         prior = se3.make(np.eye(3), np.array([0.2 * k, 0.0, 0.0]))
         features = between_walls(truth, k)
-        result = registration.locate(features, prior, StageClock())
-        registration.update(features, result)
+        result = registration.locate(features, prior)
+        registration.update(result)
     assert result.ok, result.reason
-    assert (result.posed_by, result.reason) == (LESS_PLANAR, "")
+    assert (result.pose_source, result.reason) == (LessPlanar.name, "")
     assert len(result.degenerate) == 1
     assert abs(result.T_world_lidar[0, 3] - prior[0, 3]) < 5e-3
     assert np.abs(result.T_world_lidar[1:3, 3] - truth[1:3, 3]).max() < 0.01
@@ -192,23 +199,17 @@ def test_less_planar_points_may_stand_in_and_leave_a_direction_open(monkeypatch:
 def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    registration = FeatureRegistration(
-        Config().registration,
-        LoamConfig(),
-        scan_step=None,
-        with_map=True,
-        recovery=RecoveryConfig(fallback="all-points"),
-    )
+    registration = engine(None, True, recovery=RecoveryConfig(fallback="all-points"))
     features = features_at(np.eye(4))
-    registration.update(features, registration.locate(features, np.eye(4), StageClock()))
-    assert registration._all is not None
+    registration.update(registration.locate(features, np.eye(4)))
+    assert registration.target.all_points is not None
     entered = []
     for is_starved in (False, True, *[False] * (FED + 2)):
-        monkeypatch.setattr(registration, "_is_well_constrained", lambda result, starved=is_starved: not starved)
-        result = registration.locate(features, np.eye(4), StageClock())
-        assert (result.posed_by == ALL_POINTS) == is_starved
-        registration.update(features, result)
-        entered.append(registration._all.state()["_icp"]["inserted"])
+        monkeypatch.setattr(RegistrationResult, "is_well_constrained", lambda *_, starved=is_starved: not starved)
+        result = registration.locate(features, np.eye(4))
+        assert (result.pose_source == ALL_POINTS) == is_starved
+        registration.update(result)
+        entered.append(registration.target.all_points.state()["_icp"]["history"]["inserted"])
     assert entered[0] == 0
     assert np.diff(entered[1:]).tolist() == [1] * (FED - 1) + [0] * 3
 
@@ -221,13 +222,13 @@ def test_less_planar_points_are_taken_when_fewer_directions_stay_degenerate(
     monkeypatch: pytest.MonkeyPatch, inliers: int, before: int, after: int, is_taken: bool
 ) -> None:
     registration = engine(None, True)
-    registration._inserted = registration.config.start_scans + 1
-    fallback = RegistrationResult(se3.exp(np.full(6, 0.1)), degenerate=np.eye(6)[:after])
-    monkeypatch.setattr(registration, "_on_planes", lambda *_: fallback)
-    starved = RegistrationResult(np.eye(4), degenerate=np.eye(6)[:before], inliers=inliers)
-    result = registration._fallback(features_at(np.eye(4)), RegistrationResult(np.eye(4)), np.eye(4), starved)
-    assert (result.T_world_lidar is fallback.T_world_lidar) == is_taken
-    assert (result.posed_by == LESS_PLANAR) == is_taken
+    other = RegistrationResult(se3.exp(np.full(6, 0.1)), degenerate=np.eye(6)[:after])
+    monkeypatch.setattr(registration.target, "on_planes", lambda *_: other)
+    few = RegistrationResult(np.eye(4), degenerate=np.eye(6)[:before], inliers=inliers)
+    attempt = registration.attempt(features_at(np.eye(4)), np.eye(4))
+    result = LessPlanar().recover(attempt, few)
+    assert (result.T_world_lidar is other.T_world_lidar) == is_taken
+    assert (result.pose_source == LessPlanar.name) == is_taken
 
 
 def test_what_led_astray_where_nothing_is_observed_is_taken_back_and_nothing_else() -> None:
@@ -254,21 +255,21 @@ def test_the_least_information_of_a_direction_follows_the_error_of_the_prior() -
     registration = engine(joint_step, False)
     for error, least in [(0.3, 0.01), (0.06, 0.25), (0.03, 1.0), (0.001, 1.0), (0.0, 1.0)]:
         for _ in range(4000):
-            registration.threshold.observe(error)
-        assert registration.noise.least == pytest.approx(least)
+            registration.history.threshold.observe(error)
+        assert registration.target.noise(registration.history).least == pytest.approx(least)
 
 
 @pytest.mark.parametrize(("step", "with_map"), VARIANTS)
 def test_no_features_at_all_keep_the_prior_and_its_covariance(step: ScanStep | None, with_map: bool) -> None:
     registration = engine(step, with_map)
     first = features_at(np.eye(4))
-    registration.update(first, registration.locate(first, np.eye(4), StageClock()))
+    registration.update(registration.locate(first, np.eye(4)))
     none = extract_features(scan_of_room(np.eye(4)).select(np.arange(8)))
     prior = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
-    result = registration.locate(none, prior, StageClock())
+    result = registration.locate(none, prior)
     assert not result.ok
     assert "0 edges and 0 planar points" in result.reason
     np.testing.assert_array_equal(result.T_world_lidar, prior)
-    before = registration.target
-    registration.update(none, result)
-    assert registration.target is before
+    before = registration.target.scan
+    registration.update(result)
+    assert registration.target.scan is before

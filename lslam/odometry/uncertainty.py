@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import noise
-from lslam.registration.deskew_uncertainty import DeskewUncertainty
+from lslam.odometry.deskew_uncertainty import DeskewUncertainty
 from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
@@ -57,11 +55,13 @@ class PoseUncertainty(Stateful):
         self._scans = 0
         self.map_age = 1.0
 
-    def stamped(self, result: ScanResult, located: RegistrationResult, prior: MotionPrior) -> ScanResult:
-        """The result of a scan that `prior` deskewed, with the covariances of its pose in the world and on the map."""
-        sweep = self._sweep.observe(prior, result.stamp_ns, located.T_world_lidar, result.status == "ok")
-        own = None if located.covariance is None else located.covariance + sweep
-        return replace(result, covariance=self.add(located, sweep), registration_covariance=own)
+    def covariances(
+        self, result: RegistrationResult, stamp_ns: int, prior: MotionPrior
+    ) -> tuple[Floats | None, Floats | None]:
+        """(6, 6) of the pose in the world, and on the local map, of a scan that `prior` deskewed."""
+        sweep = self._sweep.observe(prior, stamp_ns, result.T_world_lidar, result.is_accepted)
+        own = None if result.covariance is None else result.covariance + sweep
+        return self.add(result, sweep), own
 
     def add(self, result: RegistrationResult, sweep: Floats | None = None) -> Floats | None:
         """(6, 6) covariance of the pose, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.

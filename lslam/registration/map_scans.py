@@ -1,31 +1,31 @@
-"""What a scan is registered against: all scans near by, a submap, the last keyframes, or the last scan alone."""
+"""The scans that a local map is made of: all near by, the last keyframes, or the last scan alone."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
+from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.local_map import LocalMap
-from lslam.registration.submap import SubmapTarget
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
 
-class Target(Protocol):
-    """Enters registered scans into the local map, and takes out what no longer belongs there."""
+class MapScans(Stateful):
+    """Enters registered scans into the local map, and takes out those that no longer belong there."""
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """The prepared points of a scan, LiDAR frame."""
-        ...
+        raise NotImplementedError
 
 
-class MapTarget(Stateful):
+class AllScans(MapScans):
     """Every scan stays until the sensor has left it behind."""
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
@@ -33,7 +33,7 @@ class MapTarget(Stateful):
         target.insert(points.map_points, points.source, T_world_lidar)
 
 
-class ScanTarget(Stateful):
+class LastScan(MapScans):
     """The last scan alone: scan-to-scan registration."""
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
@@ -42,7 +42,7 @@ class ScanTarget(Stateful):
         target.insert(points.map_points, points.source, T_world_lidar)
 
 
-class KeyframeTarget(Stateful):
+class LastKeyframes(MapScans):
     """The last `count` keyframes, a new one where the sensor has moved `move`, m, or turned `turn`, rad, since the newest."""
 
     STATE = ("keyframes",)
@@ -71,10 +71,10 @@ class KeyframeTarget(Stateful):
         target.insert(cloud.map_points, cloud.source, T_world_lidar)
 
 
-def make_target(config: RegistrationConfig) -> Target:
-    """The target that `config.target` names."""
+def make_map_scans(config: RegistrationConfig) -> MapScans:
+    """The choice that `config.target` names. Raises UsageError for a submap, which only methods make."""
     if config.target == "submap":
-        return SubmapTarget()
+        raise UsageError("registration.target = submap is for methods: lslam run --method dlo")
     if config.target == "keyframe":
-        return KeyframeTarget(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
-    return ScanTarget() if config.target == "scan" else MapTarget()
+        return LastKeyframes(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
+    return LastScan() if config.target == "scan" else AllScans()

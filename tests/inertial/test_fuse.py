@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of
@@ -14,9 +12,9 @@ from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start
 from lslam.inertial.integrate import Increments, integrate
+from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
@@ -40,11 +38,6 @@ def behind_third_scan(imu: ImuStream) -> slice:
     return slice(int(np.searchsorted(imu.stamps_ns, drone().stamps_ns[2] + 50_000_000)), None)
 
 
-def result_of(index: int, stamp_ns: int, pose: Floats, covariance: Floats | None, **values: object) -> ScanResult:
-    whole = ScanResult(index, stamp_ns, pose, registration_covariance=covariance)
-    return replace(whole, **values)  # type: ignore[arg-type]
-
-
 def followed(
     motion: InertialMotion, sigma_m: float, sigma_rad: float, seed: int, every: int = 4
 ) -> tuple[Floats, Floats]:
@@ -60,7 +53,7 @@ def followed(
             seen = last @ step
             seen[:3, :3] = so3.exp(rng.normal(0, sigma_rad, 3)) @ seen[:3, :3]
             seen[:3, 3] += rng.normal(0, sigma_m, 3)
-            out = motion.weigh(result_of(k, int(stamp), seen, C), prior)
+            out = motion.fuse(int(stamp), RegistrationResult(seen, covariance=C), prior)
             for found in (seen, out.T_world_lidar):
                 off = se3.relative(last @ step, found)
                 rows.append((np.linalg.norm(off[:3, 3]), so3.angle(off[:3, :3])))
@@ -100,11 +93,11 @@ def test_a_degenerate_direction_is_taken_from_the_imu() -> None:
     C = LEAST + np.outer(weak, weak)
     off = 0.3 * weak
     seen = se3.make(so3.exp(off[3:]) @ true[:3, :3], true[:3, 3] + off[:3])
-    out = motion.weigh(result_of(3, stamp, seen, C), motion.sweep(stamp, Span()))
+    out = motion.fuse(stamp, RegistrationResult(seen, covariance=C), motion.sweep(stamp, Span()))
     assert np.linalg.norm(out.T_world_lidar[:3, 3] - true[:3, 3]) < 0.03
     assert so3.angle(se3.relative(out.T_world_lidar, true)[:3, :3]) < np.deg2rad(0.2)
-    assert out.registration_covariance is not None
-    assert out.registration_covariance[0, 0] < 1e-2
+    assert out.covariance is not None
+    assert out.covariance[0, 0] < 1e-2
 
 
 def test_a_poor_registration_does_not_update_the_gyroscope() -> None:
@@ -114,7 +107,7 @@ def test_a_poor_registration_does_not_update_the_gyroscope() -> None:
     before = motion.estimate.gyroscope
     seen = true @ se3.make(so3.exp(np.array([0, 0, 0.02])), np.zeros(3))
     prior = motion.sweep(stamp, Span())
-    out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1.0] * 3)), prior)
+    out = motion.fuse(stamp, RegistrationResult(seen, covariance=np.diag([1e-6] * 3 + [1.0] * 3)), prior)
     assert so3.angle(se3.relative(out.T_world_lidar, true)[:3, :3]) < 2e-3
     motion.correct(stamp, out.T_world_lidar, prior)
     after = motion.estimate.gyroscope
@@ -130,7 +123,7 @@ def test_a_poorly_constrained_axis_does_not_update_the_velocity_along_it() -> No
     seen = true.copy()
     seen[0, 3] += 0.5
     prior = motion.sweep(stamp, Span())
-    out = motion.weigh(result_of(3, stamp, seen, np.diag([1.0, 1e-6, 1e-6] + [1e-10] * 3)), prior)
+    out = motion.fuse(stamp, RegistrationResult(seen, covariance=np.diag([1.0, 1e-6, 1e-6] + [1e-10] * 3)), prior)
     before = motion.estimate.covariance.copy()
     motion.correct(stamp, out.T_world_lidar, prior)
     after = motion.estimate.covariance
@@ -153,7 +146,7 @@ def test_the_velocity_is_within_its_covariance_with_poor_registration(seed: int)
         prior = motion.sweep(int(stamps[k]), Span())
         seen = poses[k].copy()
         seen[:3, 3] += rng.normal(0, 0.1, 3)
-        out = motion.weigh(result_of(k, int(stamps[k]), seen, C, map_age=1e3), prior)
+        out = motion.fuse(int(stamps[k]), RegistrationResult(seen, covariance=C, map_age=1e3), prior)
         motion.correct(int(stamps[k]), out.T_world_lidar, prior)
         true = (poses[k + 1, :3, 3] - poses[k - 1, :3, 3]) / (1e-9 * float(stamps[k + 1] - stamps[k - 1]))
         off = motion.estimate.velocity - true
@@ -174,7 +167,7 @@ def test_no_interval_is_integrated_twice(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("lslam.inertial.imu_estimate.integrate", counted)
     seen = true @ se3.make(so3.exp(np.array([0, 0, 4e-4])), np.zeros(3))
     prior = motion.refine(motion.sweep(stamp, Span(0.0, 0.1)), stamp, seen)
-    out = motion.weigh(result_of(3, stamp, seen, np.diag([1e-6] * 3 + [1e-8] * 3)), prior)
+    out = motion.fuse(stamp, RegistrationResult(seen, covariance=np.diag([1e-6] * 3 + [1e-8] * 3)), prior)
     assert not np.array_equal(out.T_world_lidar, seen)
     motion.correct(stamp, out.T_world_lidar, prior)
     assert len(calls) == len(set(calls)) == 5
@@ -190,10 +183,10 @@ def test_the_integration_of_another_scan_is_not_reused(why: str) -> None:
     if why == "restored":
         before = motion.state()
         motion.correct(int(stamps[3]), poses[3], motion.sweep(int(stamps[3]), Span()))
-        motion.weigh(result_of(4, int(stamps[4]), poses[4], C), motion.sweep(int(stamps[4]), Span()))
+        motion.fuse(int(stamps[4]), RegistrationResult(poses[4], covariance=C), motion.sweep(int(stamps[4]), Span()))
         motion.restore(before)
     else:
-        motion.weigh(result_of(5, int(stamps[5]), poses[5], C), motion.sweep(int(stamps[5]), Span()))
+        motion.fuse(int(stamps[5]), RegistrationResult(poses[5], covariance=C), motion.sweep(int(stamps[5]), Span()))
     for one in (motion, other):
         one.correct(int(stamps[4]), poses[4])
     np.testing.assert_array_equal(motion.estimate.velocity, other.estimate.velocity)
@@ -209,7 +202,10 @@ def test_registration_on_an_older_map_has_more_weight() -> None:
     moved = [
         so3.angle(
             se3.relative(
-                seen, motion.weigh(result_of(3, stamp, seen, C, map_age=age), motion.sweep(stamp, Span())).T_world_lidar
+                seen,
+                motion.fuse(
+                    stamp, RegistrationResult(seen, covariance=C, map_age=age), motion.sweep(stamp, Span())
+                ).T_world_lidar,
             )[:3, :3]
         )
         for age in (1.0, 30.0)
@@ -217,7 +213,9 @@ def test_registration_on_an_older_map_has_more_weight() -> None:
     assert 0 < moved[1] < 0.4 * moved[0]
 
 
-@pytest.mark.parametrize("why", ["bridged", "no covariance", "switched off", "integrated", "gap", "behind a gap"])
+@pytest.mark.parametrize(
+    "why", ["failed", "rejected", "no covariance", "switched off", "integrated", "gap", "behind a gap"]
+)
 def test_the_registered_pose_stays_where_nothing_can_be_weighed(why: str) -> None:
     keys = {"switched off": {"weigh": False}, "integrated": {"velocity": "integrated"}}.get(why, {})
     imu = motion_of().imu
@@ -227,12 +225,12 @@ def test_the_registered_pose_stays_where_nothing_can_be_weighed(why: str) -> Non
     stamp, true = begun(motion)
     seen = true @ se3.make(so3.exp(np.array([0, 2e-3, 0])), np.zeros(3))
     C = None if why == "no covariance" else np.diag([1e-4] * 3 + [1e-6] * 3)
-    result = result_of(3, stamp, seen, C, status="bridged" if why == "bridged" else "ok")
-    np.testing.assert_array_equal(motion.weigh(result, motion.sweep(stamp, Span())).T_world_lidar, seen)
+    result = RegistrationResult(seen, ok=why != "failed", covariance=C, is_rejected=why == "rejected")
+    np.testing.assert_array_equal(motion.fuse(stamp, result, motion.sweep(stamp, Span())).T_world_lidar, seen)
     good = motion_of()
     begun(good)
     if "gap" in why:
-        weighed = good.weigh(result, good.sweep(stamp, Span()))
+        weighed = good.fuse(stamp, result, good.sweep(stamp, Span()))
         assert not np.array_equal(weighed.T_world_lidar, seen), "with samples it would have been"
 
 
@@ -277,13 +275,13 @@ def test_a_registration_that_contradicts_imu_and_constant_velocity_is_bridged() 
     motion = motion_of()
     stamp, true = begun(motion)
     prior = motion.sweep(stamp, Span())
-    out = motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior)
-    assert (out.status, out.converged) == ("bridged", False)
+    out = motion.fuse(stamp, RegistrationResult(true @ FALSE, covariance=SURE), prior)
+    assert (out.ok, out.is_rejected, out.converged) == (True, True, False)
     assert out.reason == "registration is 2.00 m and 11.5 deg from what the IMU felt"
     np.testing.assert_array_equal(out.T_world_lidar, prior.pose)
     assert np.linalg.norm(out.T_world_lidar[:3, 3] - true[:3, 3]) < 0.03
-    assert out.registration_covariance is not None
-    assert 1e-4 < np.sqrt(np.linalg.eigvalsh(out.registration_covariance[:3, :3])[-1]) < 0.05
+    assert out.covariance is not None
+    assert 1e-4 < np.sqrt(np.linalg.eigvalsh(out.covariance[:3, :3])[-1]) < 0.05
 
 
 def test_a_bridged_scan_has_the_covariance_of_the_imu() -> None:
@@ -291,9 +289,9 @@ def test_a_bridged_scan_has_the_covariance_of_the_imu() -> None:
     for C in (SURE, 0.1 * SURE):
         motion = motion_of()
         stamp, true = begun(motion)
-        bridged.append(motion.weigh(result_of(3, stamp, true @ FALSE, C), motion.sweep(stamp, Span())))
-    assert [out.status for out in bridged] == ["bridged", "bridged"]
-    first, second = (out.registration_covariance for out in bridged)
+        bridged.append(motion.fuse(stamp, RegistrationResult(true @ FALSE, covariance=C), motion.sweep(stamp, Span())))
+    assert [(out.ok, out.is_rejected) for out in bridged] == [(True, True)] * 2
+    first, second = (out.covariance for out in bridged)
     assert first is not None
     assert second is not None
     np.testing.assert_array_equal(first, second)
@@ -310,8 +308,8 @@ def test_an_undecidable_contradiction_keeps_the_registered_pose(why: str) -> Non
     prior = motion.sweep(stamp, span)
     if why == "another scan was expected":
         motion.sweep(int(stamps[4]), Span())
-    out = motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior)
-    assert out.status == "ok"
+    out = motion.fuse(stamp, RegistrationResult(true @ FALSE, covariance=SURE), prior)
+    assert out.is_accepted
     np.testing.assert_array_equal(out.T_world_lidar, true @ FALSE)
 
 
@@ -321,16 +319,18 @@ def test_a_registration_that_persists_is_accepted(is_restored: bool) -> None:
     stamps, poses = truth_of(drone())
     stamp, true = begun(motion)
     prior = motion.sweep(stamp, Span())
-    motion.correct(stamp, motion.weigh(result_of(3, stamp, true @ FALSE, SURE), prior).T_world_lidar, prior, False)
+    motion.correct(
+        stamp, motion.fuse(stamp, RegistrationResult(true @ FALSE, covariance=SURE), prior).T_world_lidar, prior, False
+    )
     if is_restored:
         state, motion = motion.state(), motion_of()
         motion.restore(state)
-    for k, wanted in ((4, "ok"), (5, "bridged")):
+    for k, is_rejected in ((4, False), (5, True)):
         stamp, seen = int(stamps[k]), poses[k] @ FALSE
         prior = motion.sweep(stamp, Span())
-        out = motion.weigh(result_of(k, stamp, seen, SURE), prior)
-        assert out.status == wanted
-        if wanted == "ok":
+        out = motion.fuse(stamp, RegistrationResult(seen, covariance=SURE), prior)
+        assert (out.ok, out.is_rejected) == (True, is_rejected)
+        if not is_rejected:
             np.testing.assert_array_equal(out.T_world_lidar, seen)
             motion.correct(stamp, poses[k], prior)
 
@@ -344,6 +344,6 @@ def test_an_imu_that_contradicts_constant_velocity_keeps_the_registered_pose() -
     stamp, true = begun(motion)
     prior = motion.sweep(stamp, Span())
     assert so3.angle(se3.relative(prior.pose, true)[:3, :3]) > 1.0
-    out = motion.weigh(result_of(3, stamp, true, SURE), prior)
-    assert out.status == "ok"
+    out = motion.fuse(stamp, RegistrationResult(true, covariance=SURE), prior)
+    assert out.is_accepted
     np.testing.assert_array_equal(out.T_world_lidar, true)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.recovery.start_search import NEAR, NonGroundPoints, ground_under, on_ground, sought
+from lslam.registration.start_search import NEAR, NonGroundPoints, ground_under, on_ground, sought
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Target `submap`: keyframes spaced by the room around the sensor, of which the nearest and those of the hull make the map.
+"""Keyframes spaced by the room around the sensor, of which the nearest and those of the hull make the local map.
 
 Chen, Lopez, Agha-mohammadi and Mehta: Direct LiDAR Odometry (RA-L 2022), sections III-D and III-E.
 """
@@ -8,10 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.local_map import LocalMap
-from lslam.types.state import Stateful
+from lslam.registration.map_scans import MapScans
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +29,7 @@ ON_HULL = 10
 FLAT = 0.01
 
 
-class SubmapTarget(Stateful):
+class KeyframeSubmap(MapScans):
     """All keyframes, of which the `NEAREST` and the `ON_HULL` nearest of their convex hull are the map."""
 
     STATE = ("clouds", "poses", "chosen", "spaciousness", "hull")
@@ -39,6 +40,11 @@ class SubmapTarget(Stateful):
         self.chosen: tuple[int, ...] = ()
         self.spaciousness = 0.0
         self.hull: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, config: RegistrationConfig) -> KeyframeSubmap:
+        """An empty one; nothing is configured."""
+        return cls()
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Add a keyframe when it is due; the map is built anew when other keyframes are nearest."""

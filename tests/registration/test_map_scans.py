@@ -8,7 +8,7 @@ from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.registration.target import KeyframeTarget
+from lslam.registration.map_scans import LastKeyframes
 
 Floats = NDArray[np.float64]
 
@@ -33,14 +33,14 @@ POINTS = PreparedPoints(np.zeros((1, 3), np.float32), np.zeros((1, 3)), np.zeros
     ("x", "yaw_deg", "is_new"), [(0.45, 0.0, False), (0.55, 0.0, True), (0.0, 9.0, False), (0.0, 11.0, True)]
 )
 def test_a_keyframe_is_due_after_a_way_or_a_turn(x: float, yaw_deg: float, is_new: bool) -> None:
-    target, listed = KeyframeTarget(5, 0.5, float(np.deg2rad(10.0))), Listed()
+    target, listed = LastKeyframes(5, 0.5, float(np.deg2rad(10.0))), Listed()
     for pose in (pose_at(), pose_at((x, 0.0, 0.0), yaw_deg)):
         target.enter(listed, POINTS, pose)  # type: ignore[arg-type]
     assert len(listed.held) == 1 + is_new
 
 
 def test_the_oldest_leaves_when_there_are_too_many() -> None:
-    target, listed = KeyframeTarget(3, 0.5, 1.0), Listed()
+    target, listed = LastKeyframes(3, 0.5, 1.0), Listed()
     for x in (0.0, 1.0, 1.2, 2.0, 3.0, 4.0):
         target.enter(listed, POINTS, pose_at((x, 0.0, 0.0)))  # type: ignore[arg-type]
     assert listed.held == [2.0, 3.0, 4.0]

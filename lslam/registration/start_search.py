@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.ground import Ground, above_ground, ground_of
 from lslam.preprocessing.prepare import PreparedPoints, subset, thin
 from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
+from lslam.registration.attempt import NEAR_KERNEL, Attempt
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Correspondences, Limits, optimise
-from lslam.registration.registration import NEAR_KERNEL, Registration
 from lslam.registration.residuals import MEANS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve, voxel_terms
@@ -30,6 +31,7 @@ Flags = NDArray[np.bool_]
 NEAR, NO_PLANES = 0.4, 2.0
 # m, from which they find each other.
 REACH = 1.0
+ALL_ALIKE = RegistrationConfig(sigma=NEAR, blob_weight=1.0, weak_share=0.0)
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH = 1.2
 # m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
@@ -74,10 +76,9 @@ class NonGroundPoints:
 
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
-        return solve(
-            self._cells, seen, T_start, Annealing(REACH, NEAR / 2, 0.7, 20), sigma=NEAR, blob_weight=1.0, weak_share=0.0,
-            residual=MEANS, allowed=np.eye(6) - upright_directions(T_start),
-        )  # fmt: skip
+        level = np.eye(6) - upright_directions(T_start)
+        annealing = Annealing(REACH, NEAR / 2, 0.7, 20)
+        return solve((self._cells,), seen, T_start, annealing, ALL_ALIKE, residual=MEANS, allowed=level)
 
 
 def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground:
@@ -106,38 +107,30 @@ class StartSearch:
 
     name = "start search"
 
-    def recover(
-        self, registration: Registration, points: PreparedPoints, T_prior: Floats, found: RegistrationResult
-    ) -> RegistrationResult:
+    def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
         """Acts while the map is made of the first scans and on failed ones; the second scan may lie anywhere in reach."""
-        r, c = registration, registration.config
-        if c.start_reach == 0 or (found.ok and r.inserted > c.start_scans):
-            return found
-        result = held_by_non_ground(r, points, T_prior, found, is_lost=r.inserted == 1)
-        if result is found:
-            return found
-        error = correction(T_prior, result.T_world_lidar) if result.ok else result.prior_error
-        return replace(result, prior_error=error, posed_by=self.name if result.ok else result.posed_by)
+        is_settled = result.ok and not attempt.history.is_young
+        if attempt.config.start_reach == 0 or is_settled:
+            return result
+        found = held_by_non_ground(attempt, result, is_lost=attempt.history.inserted == 1)
+        if found is result:
+            return result
+        error = correction(attempt.T_prior, found.T_world_lidar) if found.ok else found.prior_error
+        return replace(found, prior_error=error, pose_source=self.name if found.ok else found.pose_source)
 
 
-def held_by_non_ground(
-    registration: Registration,
-    points: PreparedPoints,
-    T_prior: Floats,
-    found: RegistrationResult,
-    *,
-    is_lost: bool = False,
-) -> RegistrationResult:
+def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False) -> RegistrationResult:
     """The result, unless significantly more non-ground points of the last scans are inliers elsewhere.
 
     is_lost : whether the sensor may be anywhere within `start_reach`, as after a failed registration
     """
-    r, c = registration, registration.config
-    ground = ground_under(points, r.preprocess)
-    non_ground, seen = NonGroundPoints(r.recent, r.preprocess), sought(points, ground)
+    target, c, points, T_prior = attempt.target, attempt.config, attempt.points, attempt.T_prior
+    ground = ground_under(points, target.preprocess)
+    non_ground, seen = NonGroundPoints(attempt.history.recent, target.preprocess), sought(points, ground)
     if is_lost:
-        found = _best_start(r, points, T_prior, found, non_ground, seen)
-    coarser, flat = r.alignment.coarse_maps(points, T_prior), on_ground(points, ground, r.preprocess.ground_tolerance)
+        result = _best_start(attempt, result, non_ground, seen)
+    coarser = target.coarse_maps(points, T_prior)
+    flat = on_ground(points, ground, target.preprocess.ground_tolerance)
     width = NEAR_KERNEL * c.kernel_min
 
     def placed(start: Floats) -> RegistrationResult:
@@ -146,57 +139,56 @@ def held_by_non_ground(
         return aligned.moved(upright(aligned.T_world_lidar), aligned.covariance)
 
     def upright(pose: Floats) -> Floats:
-        return r.alignment.refine(
-            flat, pose, width, c.start_iterations, coarser, upright_directions(pose)
-        ).T_world_lidar
+        directions = upright_directions(pose)
+        aligned: RegistrationResult = target.refine(flat, pose, width, c.start_iterations, coarser, directions)
+        return aligned.T_world_lidar
 
-    def agreeing(result: RegistrationResult) -> Flags:
-        return non_ground.agreeing(seen, result.T_world_lidar)
+    def agreeing(at: RegistrationResult) -> Flags:
+        return non_ground.agreeing(seen, at.T_world_lidar)
 
     starts = [T_prior]
-    if is_lost or not found.ok:
+    if is_lost or not result.ok:
         starts.append(_likeliest(non_ground, seen, T_prior, c.start_reach))
-    aligned = max(map(placed, starts), key=lambda result: np.count_nonzero(agreeing(result)))
+    aligned = max(map(placed, starts), key=lambda at: np.count_nonzero(agreeing(at)))
     place, most = aligned.T_world_lidar, agreeing(aligned)
-    last = r.recent[-1][1]
-    is_drawn = found.ok and is_at_rest(place, last)
+    last = attempt.history.recent[-1][1]
+    is_drawn = result.ok and is_at_rest(place, last)
     # What rings draw there is no evidence that it is there.
-    margin = CLEARLY if is_at_rest(found.T_world_lidar, last) else MUCH
-    if is_drawn or not is_much_more(most, agreeing(found), margin):
-        return found
-    near = r.alignment.refine(points, place, width, c.start_iterations, r.alignment.coarse_maps(points, place))
-    judged = r.judged(near, place)
-    if not judged.ok and not found.ok:
-        return found
+    margin = CLEARLY if is_at_rest(result.T_world_lidar, last) else MUCH
+    if is_drawn or not is_much_more(most, agreeing(result), margin):
+        return result
+    near = target.refine(points, place, width, c.start_iterations, target.coarse_maps(points, place))
+    judged = attempt.judged(near, place)
+    if not judged.ok and not result.ok:
+        return result
     if not judged.ok or len(judged.degenerate) or is_much_more(most, agreeing(judged)):
         judged = near.moved(place, aligned.covariance)
-    return replace(judged, iterations=found.iterations + near.iterations)
+    return replace(judged, iterations=result.iterations + near.iterations)
 
 
 def _best_start(
-    registration: Registration, points: PreparedPoints, T_prior: Floats, best: RegistrationResult,
-    non_ground: NonGroundPoints, seen: PreparedPoints,
-) -> RegistrationResult:  # fmt: skip
+    attempt: Attempt, best: RegistrationResult, non_ground: NonGroundPoints, seen: PreparedPoints
+) -> RegistrationResult:
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
-    alignment, count = registration.alignment, len(seen.source)
-    coarse_map, few = alignment.coarse_maps(points, T_prior)[0], thin(points, SEARCH_SHARE)
-    slow = alignment.slowly(2 * START_STEP)
+    target, count = attempt.target, len(seen.source)
+    coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_SHARE)
+    slow = target.slowly(2 * START_STEP)
     tried = [
-        alignment.on_planes(coarse_map, few, T_prior @ se3.make(np.eye(3), offset), slow)
-        for offset in start_offsets(registration.config.start_reach, START_STEP)
+        target.on_planes(coarse_map, few, attempt.T_prior @ se3.make(np.eye(3), offset), slow)
+        for offset in start_offsets(attempt.config.start_reach, START_STEP)
     ]
     # Without non-ground points, as in hills, the ground decides.
-    tried.sort(key=lambda found: (-non_ground.share(seen, found.T_world_lidar), -found.inliers))
+    tried.sort(key=lambda at: (-non_ground.share(seen, at.T_world_lidar), -at.inliers))
     for promising in distinct(tried, best.T_world_lidar):
         start = promising.T_world_lidar
         # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
-        found = registration.judged(alignment.coarse_to_fine(points, start, 2 * START_STEP), start)
-        share, known = (non_ground.share(seen, result.T_world_lidar) for result in (found, best))
+        result = attempt.judged(target.coarse_to_fine(attempt.points, start, 2 * START_STEP), start)
+        share, usual = (non_ground.share(seen, at.T_world_lidar) for at in (result, best))
         if count == 0:
-            share, known = found.agreement, best.agreement
+            share, usual = result.agreement, best.agreement
         # A failed one has the prior's pose: fewer inliers than there are no improvement.
-        if found.ok and (share > CLEARLY * known if best.ok else share >= known):
-            best = found
+        if result.ok and (share > CLEARLY * usual if best.ok else share >= usual):
+            best = result
     return best
 
 

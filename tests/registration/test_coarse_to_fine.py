@@ -14,7 +14,7 @@ from recovery_drives import driven
 from lslam.config.recovery import RecoveryConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
-from lslam.recovery.policies import RecoveringRegistration
+from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
@@ -35,22 +35,22 @@ def test_coarse_to_fine_is_accepted_only_with_usual_agreement(
 ) -> None:
     """What hides the map from the fine registration, as passers-by do, hides it from the coarse one, which knows no better."""
     drive = simulate("block", count=8, motion_compensated=True)
-    registration = RecoveringRegistration()
+    registration = Registration()
     last = [registration.register(drive.scan(i).points) for i in range(8)][-1]
-    assert registration.starting == 0
+    assert registration.history.starting == 0
     points = prepare_points(drive.scan(7).points, registration.preprocess, 7)
     found, other = aside(last, 0.6, 0.0), aside(last, coarse)
-    monkeypatch.setattr(registration.alignment, "refine", lambda *_, **__: found)
-    monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: other)
-    registration.agreement.usual = 1.0
+    monkeypatch.setattr(registration.target, "refine", lambda *_, **__: found)
+    monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: other)
+    registration.history.agreement.usual = 1.0
     located = registration.locate(points, last.T_world_lidar)
     assert (located.T_world_lidar is other.T_world_lidar) == is_taken
-    assert located.posed_by == ("coarse-to-fine" if is_taken else "")
+    assert located.pose_source == ("coarse-to-fine" if is_taken else "")
 
 
-def begun() -> tuple[RecoveringRegistration, PreparedPoints, RegistrationResult]:
+def begun() -> tuple[Registration, PreparedPoints, RegistrationResult]:
     """A registration that knows one scan of the room, the next one, and the result with which it agrees best."""
-    registration, rng = RecoveringRegistration(recovery=ALONE), np.random.default_rng(0)
+    registration, rng = Registration(recovery=ALONE), np.random.default_rng(0)
     registration.register(room(rng).astype(np.float32))
     points = prepare_points(seen_from(room(rng), pose_at((0.1, 0.0, 0.0))), registration.preprocess, 1)
     return registration, points, registration.locate(points, np.eye(4))
@@ -64,33 +64,33 @@ def test_at_the_start_the_result_with_the_larger_consensus_is_taken(
 ) -> None:
     """Also the only one that does not fail: of 1 % nothing is believed."""
     registration, points, known = begun()
-    assert registration.starting > 0
+    assert registration.history.starting > 0
     near, far = aside(known, fine, 0.0), aside(known, coarse)
-    monkeypatch.setattr(registration.alignment, "refine", lambda *_, **__: near)
-    monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: far)
+    monkeypatch.setattr(registration.target, "refine", lambda *_, **__: near)
+    monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
     assert located.ok
     assert (located.T_world_lidar is far.T_world_lidar) == is_taken
-    assert located.posed_by == ("coarse-to-fine" if is_taken else "")
+    assert located.pose_source == ("coarse-to-fine" if is_taken else "")
     assert located.iterations == near.iterations + far.iterations
 
 
 def test_a_coarse_result_that_fails_is_not_taken_however_many_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     registration, points, known = begun()
     near, far = aside(known, 0.4, 0.0), aside(known, 0.9, 1.1 * registration.config.max_jump_m)
-    monkeypatch.setattr(registration.alignment, "refine", lambda *_, **__: near)
-    monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: far)
+    monkeypatch.setattr(registration.target, "refine", lambda *_, **__: near)
+    monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
     assert located.ok
     assert located.T_world_lidar is near.T_world_lidar
 
 
 def test_coarse_to_fine_is_not_tried_after_a_confident_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    registration, rng = RecoveringRegistration(), np.random.default_rng(0)
+    registration, rng = Registration(), np.random.default_rng(0)
     for k in range(8):
         registration.register(seen_from(room(rng), pose_at((0.1 * k, 0.0, 0.0))))
-    monkeypatch.setattr(registration.alignment, "coarse_to_fine", lambda *_: pytest.fail("asked"))
-    assert registration.register(seen_from(room(rng), pose_at((0.8, 0.0, 0.0)))).posed_by == ""
+    monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: pytest.fail("asked"))
+    assert registration.register(seen_from(room(rng), pose_at((0.8, 0.0, 0.0)))).pose_source == ""
 
 
 def test_a_standing_start_on_few_planes_does_not_slide() -> None:
@@ -102,10 +102,10 @@ def test_a_standing_start_on_few_planes_does_not_slide() -> None:
     np.testing.assert_allclose(usual.ground_truth.poses[1], usual.ground_truth.poses[0], atol=1e-9)
     slid = []
     for drive in (usual, *(with_other_noise(usual, noise) for noise in range(1, 5))):
-        registration = RecoveringRegistration(recovery=ALONE)
+        registration = Registration(recovery=ALONE)
         registration.register(drive.scan(0).points)
         points = prepare_points(drive.scan(1).points, registration.preprocess, 1)
-        wide = registration.judged(registration.alignment.coarse_to_fine(points, np.eye(4)), np.eye(4))
+        wide = registration.target.coarse_to_fine(points, np.eye(4))
         results = [wide, *(registration.register(drive.scan(i).points) for i in (1, 2))]
         assert all(result.ok for result in results)
         slid.append([np.linalg.norm(result.T_world_lidar[:3, 3]) for result in results])
@@ -117,7 +117,7 @@ def test_a_standing_start_on_few_planes_does_not_slide() -> None:
 def test_missing_scans_do_not_misplace_the_next_ones(seed: int, first: int) -> None:
     # A metre and more beyond the prior a fine map holds a scan by its own rings, with two thirds of the usual points.
     drive = driven("urban", seed)
-    registration = RecoveringRegistration()
+    registration = Registration()
     for i in (*range(first, first + 9), first + 11, first + 14, first + 15):
         result = registration.register(drive.scan(i).points)
         truth = se3.relative(drive.ground_truth.poses[first], drive.ground_truth.poses[i])

@@ -1,0 +1,232 @@
+"""Features on the scan before, on a feature map, or on one after the other: LOAM's target."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.loam import LoamConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.geometry import se3
+from lslam.odometry.all_points import AllPoints
+from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, thinned
+from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
+from lslam.odometry.feature_solver import NONE, FeatureNoise, map_problem, remap_solution, solve_on_map
+from lslam.odometry.feature_steps import ScanStep
+from lslam.preprocessing.features import Features
+from lslam.registration.acceptance import Acceptance
+from lslam.registration.attempt import Attempt, Target
+from lslam.registration.history import History
+from lslam.registration.optimiser import optimise
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult, result_of
+from lslam.registration.start_search import MUCH, START_STEP, start_offsets
+
+Floats = NDArray[np.float64]
+
+# Fewer inliers, ten per degree of freedom, are insignificant.
+MIN_FEATURES = 60
+# A failed scan is no target; after this many in a row the last good one is too far behind.
+PATIENCE = 3
+
+
+@dataclass(frozen=True)
+class LoamVariant:
+    """The parts of a method of the family.
+
+    scan_step : registers a scan on the one before; None leaves that out
+    with_map : whether the pose is found, or refined, on a feature map
+    with_less_planes : whether the map is matched with centroids of the less planar points in place of the planar ones
+    inlier_ratio : share of the correspondences with the map, the nearest, that have a say
+    keyframes : number, m and rad of the keyframes that the feature map is made of; None: of all scans
+    """
+
+    scan_step: ScanStep | None
+    with_map: bool
+    with_less_planes: bool = False
+    inlier_ratio: float = 1.0
+    keyframes: tuple[int, float, float] | None = None
+
+
+class FeatureTarget(Target):
+    """The last scan's features and the feature map.
+
+    reach : m, how far from the sensor the map is kept
+    with_start_search : whether the second scan is sought within `start_reach`
+    with_all_points : whether `icp` on all points is kept beside it
+    """
+
+    source = "features"
+    times_steps = 1
+    STATE = ("map", "scan", "all_points", "_failures", "_keyframes")
+
+    def __init__(
+        self, config: RegistrationConfig, loam: LoamConfig, variant: LoamVariant, reach: float = 120.0, *,
+        with_start_search: bool = True, with_all_points: bool = False,
+    ) -> None:  # fmt: skip
+        self.config, self.loam, self.variant, self._reach = config, loam, variant, reach
+        self.map = self._new_map(1 << 16) if variant.with_map else None
+        self.scan: FeatureScan | None = None
+        self.all_points = AllPoints(config, self._plane_size(config.voxel_size)) if with_all_points else None
+        self._keyframes = None if variant.keyframes is None else FeatureKeyframes(*variant.keyframes)
+        self._failures, self._with_start_search = 0, with_start_search
+
+    def fresh(self) -> FeatureTarget:
+        """An empty one of the same settings."""
+        return FeatureTarget(
+            self.config, self.loam, self.variant, self._reach, with_start_search=self._with_start_search,
+            with_all_points=self.all_points is not None,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return 0 if self.scan is None else len(self.scan.features.less_planes) + len(self.scan.features.less_edges)
+
+    def count(self, points: Features) -> int:
+        """Edges and planar points."""
+        return len(points.edges) + len(points.planes)
+
+    def refusal(self, points: Features) -> str:
+        """Too few features."""
+        if len(points.less_planes) + len(points.less_edges) >= MIN_FEATURES:
+            return ""
+        return f"only {len(points.edges)} edges and {len(points.planes)} planar points"
+
+    def ready(self, points: Features, history: History) -> Features:
+        """As they are."""
+        return points
+
+    def limits(self, history: History) -> Acceptance:
+        """Those configured; less overlap is needed at the start."""
+        c = self.config
+        least = c.start_overlap if history.starting else c.min_overlap
+        return Acceptance.of(c, history.agreement, least, self.source)
+
+    def noise(self, history: History) -> FeatureNoise:
+        """With the recent variance of the motion prior as threshold of degeneracy.
+
+        The prior counts at most as one planar point: a sensor on a straight way need not stay on it.
+        """
+        c, least = self.config, self.config.sigma**2
+        return FeatureNoise(
+            self.loam.edge_sigma, c.sigma, c.weak_share, least / max(history.threshold.mean_square, least)
+        )
+
+    def align(
+        self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None
+    ) -> RegistrationResult:
+        """Align with the scan before and, from there, with the feature map, from `T_start` (4, 4).
+
+        About a prior that is nearly right, that stays along degenerate directions.
+        """
+        assert self.scan is not None
+        features, noise, iterations, c = attempt.points, self.noise(attempt.history), 0, self.config
+        if attempt.is_near:
+            annealing = replace(annealing, steps=c.start_iterations)
+        elif attempt.history.starting > 0:
+            annealing = replace(annealing, start=c.kernel_max)
+        result = RegistrationResult(T_start, ok=False)
+        if self.variant.scan_step is not None:
+            one_to_many = self.loam.matching == "one-to-many"
+            result = self.variant.scan_step(self.scan, features, T_start, annealing, noise, one_to_many, attempt.clock)
+            result = attempt.judged(result)
+            iterations = result.iterations
+        if self.map is not None:
+            start = result.T_world_lidar if result.ok else T_start
+            with attempt.clock.stage("map"):
+                points, scatter = thinned(features) if self.variant.with_less_planes else (features.planes.points, None)
+                problem = map_problem(
+                    self.map, features.edges.points, points, start, annealing, noise, scatter=scatter,
+                    inlier_ratio=self.variant.inlier_ratio,
+                )  # fmt: skip
+                result = result_of(optimise(*problem), start, len(features.edges) + len(points))
+            result = replace(result, iterations=iterations + result.iterations)
+        is_kept = attempt.is_near and len(result.degenerate) > 0
+        return remap_solution(result, attempt.T_prior) if is_kept else result
+
+    def captured(self, attempt: Attempt) -> RegistrationResult:
+        """Less planar points on coarse planes first, then as usual from there, and judged."""
+        with attempt.clock.stage("start" if attempt.history.starting else "recover"):
+            attempt.start = self._start(attempt)
+        return attempt.judged(self.align(attempt, attempt.start.T_world_lidar, attempt.annealing))
+
+    def on_planes(self, attempt: Attempt, T_start: Floats) -> RegistrationResult:
+        """Edges, and centroids of the less planar points, on fine and coarse planes, judged."""
+        c, noise = self.config, self.noise(attempt.history)
+        points, scatter = thinned(attempt.points)
+        annealing = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
+        edges = attempt.points.edges.points
+        return attempt.judged(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
+
+    def enter(self, result: RegistrationResult) -> None:
+        """Into the feature map, and as what the next scan is registered on."""
+        features, T_world_lidar = result.points, result.T_world_lidar
+        if self.map is not None and self._keyframes is not None:
+            self._keyframes.enter(self.map, features, T_world_lidar)
+        elif self.map is not None:
+            self.map.insert(features, T_world_lidar)
+        if self.all_points is not None:
+            self.all_points.enter(result)
+        self.scan, self._failures = feature_scan(features, T_world_lidar, self.loam.grid_step), 0
+
+    def miss(self, result: RegistrationResult) -> None:
+        """A scan failed: after a few in a row the newest is what the next one is registered on."""
+        self._failures += 1
+        if self.scan is not None and self._failures >= PATIENCE:
+            self.scan = feature_scan(result.points, result.T_world_lidar, self.loam.grid_step)
+
+    def cloud(self, points: Features) -> NDArray[np.float32]:
+        """All points (N, 3) of a scan, m, LiDAR frame."""
+        return points.cloud
+
+    def _start(self, attempt: Attempt) -> RegistrationResult:
+        """A start that is metres nearer, where the prior may be metres off: less planar points on coarse planes."""
+        c, history, T_prior = self.config, attempt.history, attempt.T_prior
+        if self.all_points is not None and attempt.is_young:
+            return self.all_points.locate(attempt)
+        points, scatter = thinned(attempt.points)
+        target, noise = self._planes(), self.noise(history)
+
+        def on_coarse(start: Floats, width: float) -> RegistrationResult:
+            slow = Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
+            levels = target.planes.coarser[:1]
+            return attempt.judged(
+                solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels)
+            )
+
+        def edges_at(result: RegistrationResult) -> int:
+            """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""
+            once = Annealing(c.kernel_max / 2, c.kernel_max / 2, 0.5, 1)
+            edges = attempt.points.less_edges.points
+            return solve_on_map(target, edges, NONE, result.T_world_lidar, once, noise).inliers if result.ok else -1
+
+        result = on_coarse(T_prior, c.coarse_kernel)
+        if history.inserted > 1 or not self._with_start_search:
+            return result
+        # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
+        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP)]
+        tried = [on_coarse(T_prior @ T, 2 * START_STEP) for T in offsets]
+        agree = [edges_at(one) for one in tried]
+        most, usual = max(agree, default=0), max(edges_at(result), 0)
+        is_more = most > MUCH * usual and most - usual > 2 * np.sqrt(most + usual)
+        return tried[int(np.argmax(agree))] if is_more else result
+
+    def _planes(self) -> FeatureMap:
+        """The feature map, or one made of the last scan alone."""
+        if self.map is not None and len(self.map):
+            return self.map
+        assert self.scan is not None
+        alone = self._new_map(1 << 14)
+        alone.insert(self.scan.features, self.scan.T_world_lidar)
+        return alone
+
+    def _new_map(self, capacity: int) -> FeatureMap:
+        c, size = self.config, self.loam.feature_map_voxel
+        return FeatureMap(
+            size, plane_size=self._plane_size(size), coarse_factor=c.coarse_factor, min_points=c.min_points,
+            planarity=c.planarity, count_cap=c.count_cap, reach=self._reach, capacity=capacity,
+        )  # fmt: skip
+
+    def _plane_size(self, size: float) -> float:
+        return surface_size(size, self.loam.grid_step)

@@ -1,1 +1,0 @@
-"""Recovery policies of registrations that fail from the motion prior: one policy a class."""

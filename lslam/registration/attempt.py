@@ -1,0 +1,127 @@
+"""One scan on its target: the alignments that are tried, and whether they are accepted."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig
+from lslam.registration.acceptance import Acceptance
+from lslam.registration.history import History
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult
+from lslam.types.stage_clock import StageClock
+from lslam.types.state import Stateful
+
+Floats = NDArray[np.float64]
+
+# The kernel opens so many times its end width around a pose that is nearly right.
+NEAR_KERNEL = 2.0
+
+
+class Target(Stateful, ABC):
+    """The maps that scans are registered on, and the residuals of their points or features there."""
+
+    # Words for what is registered.
+    source: str
+    # Steps as a multiple of those configured.
+    times_steps: int
+
+    @abstractmethod
+    def fresh(self) -> Target:
+        """An empty one of the same settings."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Voxels, or features, of the scans that were entered; 0: empty."""
+
+    @abstractmethod
+    def count(self, points: Any) -> int:
+        """How many of the points, or features, are matched."""
+
+    @abstractmethod
+    def refusal(self, points: Any) -> str:
+        """The reason why a scan cannot be registered; empty where it can."""
+
+    @abstractmethod
+    def ready(self, points: Any, history: History) -> Any:
+        """The points with all that the residual takes of them."""
+
+    @abstractmethod
+    def limits(self, history: History) -> Acceptance:
+        """What a registration must pass."""
+
+    @abstractmethod
+    def align(
+        self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None
+    ) -> RegistrationResult:
+        """Align the scan from `T_start` (4, 4); `information` (6, 6) of it as a prior, world axes, None: only a start."""
+
+    @abstractmethod
+    def captured(self, attempt: Attempt) -> RegistrationResult:
+        """Aligned with the coarse planes first, which catch a scan from metres off, and judged."""
+
+    @abstractmethod
+    def enter(self, result: RegistrationResult) -> None:
+        """Insert a scan at its pose, and take out those that no longer belong there."""
+
+    def miss(self, result: RegistrationResult) -> None:
+        """A scan failed, and is not inserted."""
+
+    @abstractmethod
+    def cloud(self, points: Any) -> NDArray[Any]:
+        """All points (N, 3) of a scan, m, LiDAR frame."""
+
+
+@dataclass
+class Attempt:
+    """A scan, its motion prior (4, 4), and the state of the registration that is to place it.
+
+    start : where the coarse planes put the scan, which the result began from; the prior where they were not tried
+    """
+
+    target: Any
+    points: Any
+    T_prior: Floats
+    config: RegistrationConfig
+    history: History
+    is_near: bool = False
+    clock: StageClock = field(default_factory=StageClock)
+    start: RegistrationResult | None = None
+
+    @property
+    def annealing(self) -> Annealing:
+        """The kernel's schedule: from the recent error of the motion prior, or narrow about one that is nearly right."""
+        c, h = self.config, self.history
+        width = NEAR_KERNEL * c.kernel_min if self.is_near else h.threshold.width
+        steps = c.max_iterations * self.target.times_steps
+        if not self.is_near and h.starting > 0:
+            steps = c.start_iterations
+        return Annealing(width, c.kernel_min, c.kernel_decay, steps)
+
+    def judged(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
+        """The result with its correction of the prior, or a failed one at the prior with the reason."""
+        limits: Acceptance = self.target.limits(self.history)
+        return limits.accepted(result, self.T_prior if T_prior is None else T_prior)
+
+    @property
+    def is_young(self) -> bool:
+        """Whether the map is made of so few scans that the next may lie anywhere within `start_reach`."""
+        return self.config.start_reach > 0 and self.history.is_young
+
+    def is_small(self, result: RegistrationResult) -> bool:
+        """Whether the correction of the motion prior is within the prediction error that is expected of it."""
+        move, turn = result.prior_error
+        return move < self.config.recover_m and turn < np.deg2rad(self.config.recover_deg)
+
+
+class Policy(Protocol):
+    """A recovery policy: tried where a registration from the motion prior may not be enough."""
+
+    def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
+        """A better result, whose `pose_source` is this policy, or the result."""
+        ...

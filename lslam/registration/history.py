@@ -1,0 +1,58 @@
+"""What earlier scans taught about the next one: errors of the prior, the usual inlier share, the last poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig
+from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
+from lslam.registration.solver import RegistrationResult
+from lslam.types.state import Stateful
+
+Floats = NDArray[np.float64]
+
+
+class History(Stateful):
+    """Adapts to registrations, scan after scan.
+
+    threshold : kernel width by the recent errors of the motion prior; agreement : recent inlier share
+    starting : initialisation scans that remain; inserted : scans in the map
+    recent : points (N, 3), LiDAR frame, and pose (4, 4) of the last scans in the map
+    """
+
+    STATE = ("threshold", "agreement", "starting", "inserted", "recent")
+
+    def __init__(self, config: RegistrationConfig) -> None:
+        self.start_scans = config.start_scans
+        self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
+        self.agreement = UsualAgreement(config.min_agreement)
+        self.starting, self.inserted = config.start_scans, 0
+        self.recent: tuple[tuple[NDArray[Any], Floats], ...] = ()
+
+    @property
+    def is_young(self) -> bool:
+        """Whether the map is made of the first scans alone."""
+        return self.inserted <= self.start_scans
+
+    def enter(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
+        """One more scan is in the map."""
+        self.inserted += 1
+        self.recent = (*self.recent, (points, T_world_lidar))[-self.start_scans :]
+
+    def observe(self, result: RegistrationResult) -> None:
+        """Adapt to a registration, unless its pose was rejected."""
+        if not result.ok:
+            self.starting = max(self.starting, 1)
+            self.threshold.widen()
+            self.agreement.relax()
+        elif not result.is_rejected:
+            self.starting = max(self.starting - 1, 0)
+            # All points agree less with their map than features do with theirs.
+            own = result if result.replaced is None else result.replaced
+            if own.ok:
+                self.agreement.observe(own.agreement)
+            move, turn = result.prior_error
+            self.threshold.observe(move + turn * result.lever_arm)

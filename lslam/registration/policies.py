@@ -1,0 +1,47 @@
+"""The recovery policies of points that a configuration switches on, in the order in which they are tried."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from lslam.config.recovery import RecoveryConfig
+from lslam.registration.attempt import Attempt, Policy
+from lslam.registration.solver import RegistrationResult
+from lslam.registration.start_search import StartSearch
+
+
+class CoarseToFine:
+    """Aligns with the coarse planes, annealed slowly, then with the fine ones; of two results the larger consensus is taken.
+
+    Fine registration alone loses a start above 0.7 m per scan: its kernel opens no wider than its voxels.
+    """
+
+    name = "coarse-to-fine"
+
+    def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
+        """Acts while the speed is unknown, and on results that fail, correct their prior by much or agree less than usual."""
+        usual, is_started = attempt.history.agreement, attempt.history.starting == 0
+        is_certain = result.ok and attempt.is_small(result)
+        if is_certain and is_started and not usual.is_less(result.agreement):
+            return result
+        coarse: RegistrationResult = attempt.target.captured(attempt)
+        iterations = result.iterations + coarse.iterations
+        # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it.
+        is_consensus = result.ok and (result.converged or is_started)
+        is_better = coarse.ok and (not is_consensus or coarse.inliers > result.inliers)
+        if is_certain and is_started:
+            # What hides part of the map, as a crowd does, hides it from both.
+            is_better = is_better and not usual.is_less(coarse.agreement)
+        if is_better:
+            return replace(coarse, iterations=iterations, pose_source=self.name)
+        return replace(result, iterations=iterations)
+
+
+def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:
+    """Nearest first: a policy sees what those before it found."""
+    policies: list[Policy] = []
+    if config.coarse_to_fine:
+        policies.append(CoarseToFine())
+    if config.start_search:
+        policies.append(StartSearch())
+    return tuple(policies)

@@ -1,0 +1,125 @@
+"""Points on the local map of Gaussian voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.config.registration import RegistrationConfig
+from lslam.preprocessing.beams import ring_gap
+from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.acceptance import Acceptance
+from lslam.registration.alignment import MapAlignment
+from lslam.registration.attempt import Attempt, Target
+from lslam.registration.history import History
+from lslam.registration.local_map import LocalMap
+from lslam.registration.map_scans import MapScans, make_map_scans
+from lslam.registration.optimiser import optimise
+from lslam.registration.residuals import residual_named
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult, result_of
+from lslam.registration.source_covariance import source_covariance
+
+Floats = NDArray[np.float64]
+
+MIN_SOURCE_POINTS = 30
+# Share of points with a ring spacing above a voxel from which on the coarse level is searched, too.
+SPARSE_SHARE = 0.1
+
+
+class VoxelTarget(MapAlignment, Target):
+    """The local map, the choice of the scans that it is made of, and the residual that the configuration names.
+
+    make_scans : makes what chooses the scans
+    """
+
+    source = "points"
+    STATE = ("map", "scans", "_ring_gap")
+
+    def __init__(
+        self, config: RegistrationConfig, preprocess: PreprocessConfig,
+        make_scans: Callable[[RegistrationConfig], MapScans] = make_map_scans,
+    ) -> None:  # fmt: skip
+        residual = residual_named(config.residual or "plane")
+        local_map = LocalMap(
+            config.voxel_size * residual.voxel_share, coarse_factor=config.coarse_factor,
+            min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
+            reach=1.2 * preprocess.range_max,
+        )  # fmt: skip
+        super().__init__(local_map, config, residual)
+        self.times_steps = residual.times_steps
+        self.preprocess, self._make_scans = preprocess, make_scans
+        self.scans = make_scans(config)
+        # Vertical angular resolution, rad, for point to point; 0 where unknown.
+        self._ring_gap = 0.0
+
+    def fresh(self) -> VoxelTarget:
+        """An empty one of the same settings."""
+        return VoxelTarget(self.config, self.preprocess, self._make_scans)
+
+    def __len__(self) -> int:
+        return len(self.map)
+
+    def count(self, points: PreparedPoints) -> int:
+        """Source points."""
+        return len(points.source)
+
+    def refusal(self, points: PreparedPoints) -> str:
+        """Too few points."""
+        count = len(points.source)
+        return "" if count >= MIN_SOURCE_POINTS else f"{count} usable points, {MIN_SOURCE_POINTS} needed"
+
+    def ready(self, points: PreparedPoints, history: History) -> PreparedPoints:
+        """With the covariance of the surface, or the gap between the rings, at each point, where the residual takes it."""
+        points = self.covered(points)
+        return replace(points, gaps=self._gaps(points, history)) if self.kind.needs_gaps else points
+
+    def covered(self, points: PreparedPoints) -> PreparedPoints:
+        """With the covariance of the surface at each point, where the residual takes it."""
+        if not self.kind.needs_covariance or points.covariance is not None:
+            return points
+        c = self.config
+        covariance = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
+        return replace(points, covariance=covariance)
+
+    def limits(self, history: History) -> Acceptance:
+        """Those configured; less overlap is needed while the map is made of few scans.
+
+        One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share. On keyframes far
+        apart a sparse sensor matches few of its points: only a drop of the inlier share is informative.
+        """
+        c = self.config
+        is_filled = not history.is_young and c.target != "scan"
+        limits = Acceptance.of(c, history.agreement, c.min_overlap if is_filled else c.start_overlap, self.source)
+        return replace(limits, min_inliers=0.0) if c.target == "submap" else limits
+
+    def align(
+        self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None
+    ) -> RegistrationResult:
+        """Align with the map from `T_start` (4, 4); `information` (6, 6) of it as a prior, None: only a start."""
+        points = attempt.points
+        problem = self.problem(points, T_start, annealing.start, annealing.steps, information=information)
+        return result_of(optimise(*problem), T_start, len(points.source))
+
+    def captured(self, attempt: Attempt) -> RegistrationResult:
+        """Aligned with the coarse planes, then with the fine ones, and judged."""
+        return attempt.judged(self.coarse_to_fine(attempt.points, attempt.T_prior))
+
+    def enter(self, result: RegistrationResult) -> None:
+        """Insert a scan at its pose."""
+        self.scans.enter(self.map, result.points, result.T_world_lidar)
+
+    def cloud(self, points: PreparedPoints) -> NDArray[np.float32]:
+        """The points (M, 3) that the map is made of, m, LiDAR frame."""
+        return points.map_points
+
+    def _gaps(self, points: PreparedPoints, history: History) -> Floats | None:
+        """(S,) m, ring spacing at each source point; the angular resolution is estimated from the first scans."""
+        if history.is_young:
+            self._ring_gap = ring_gap(points.map_points)
+        gaps: Floats = self._ring_gap * np.linalg.norm(points.source, axis=1)
+        return gaps if (gaps > self.map.fine.size).mean() > SPARSE_SHARE else None
