@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,8 +81,10 @@ def test_loops_that_an_earlier_run_found_are_not_sought_again(tmp_path: Path, mo
     monkeypatch.setattr(back_end_pass, "find_loops", lambda *_: [*LOOPS, refused])
 
     def loops(store: KeyframeStore, kept: Checkpoints | None) -> list[LoopCandidate]:
-        none = KeyframePairs([], [])
-        return back_end_pass._loops(store, results, config(), (), none, kept, KeyframeClocks(), lambda: False)[0]
+        watch = SimpleNamespace(should_stop=lambda: False)
+        manual = SimpleNamespace(points=())
+        job: Any = SimpleNamespace(store=store, config=config(), kept=lambda _: kept, watch=watch, manual=manual)
+        return back_end_pass._loops(job, results, KeyframePairs([], []), KeyframeClocks())[0]
 
     first = loops(store, kept)
     monkeypatch.setattr(back_end_pass, "find_loops", lambda *_: [])
