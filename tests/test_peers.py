@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from lslam import Registration
 from lslam.config import Config, load_config
+from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.open3d import create as create_open3d
 from lslam.odometry.small_gicp import create as create_small_gicp
 from lslam.readers import open_sequence
-from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 

@@ -16,11 +16,11 @@ from lslam.config.recovery import RecoveryConfig
 from lslam.errors import InputError
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
+from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry import create_odometry
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import gate_points
 from lslam.preprocessing.sweep_clock import SweepClock
-from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from lslam.inertial.constant_velocity import MotionModel
 from lslam.inertial.window_motion import WindowMotion
 from lslam.odometry.base import Deskewing, Odometry, Windowed
-from lslam.registration.constant_velocity import MotionModel
 from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 

@@ -19,12 +19,12 @@ from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
 from lslam.geometry.interpolate import poses_at
+from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
-from lslam.registration.constant_velocity import ConstantVelocity, MotionModel
 from lslam.types.scan import FARTHEST_M, Scan, Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.selection import Selection

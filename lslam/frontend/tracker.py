@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from lslam.frontend import joint
 from lslam.geometry import se3, so3
+from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.sanity import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
-from lslam.registration.constant_velocity import ConstantVelocity, MotionModel, middle_of
 from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import noise
+from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_estimate import PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.inertial.navigation_state import POSE, NavigationState
-from lslam.registration.constant_velocity import middle_of
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
+from lslam.inertial.constant_velocity import ConstantVelocity, middle_of
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_cleaning import covers, gaps
 from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
@@ -18,7 +19,6 @@ from lslam.inertial.kalman import surprise
 from lslam.kernels import kalman
 from lslam.kernels.rotation import apart, vector_between
 from lslam.preprocessing.deskew import knots_over
-from lslam.registration.constant_velocity import ConstantVelocity, middle_of
 from lslam.registration.solver import RegistrationResult
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream

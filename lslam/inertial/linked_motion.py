@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3
+from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
 from lslam.registration.acceptance import PRIOR_COVARIANCE
-from lslam.registration.constant_velocity import middle_of
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from lslam.config.imu import ImuConfig
 from lslam.errors import GraphError
 from lslam.geometry import noise, se3
+from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import BEGIN_SIGMA
-from lslam.registration.constant_velocity import middle_of
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.inertial_state import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise

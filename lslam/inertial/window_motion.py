@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import noise, se3
+from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.navigation_state import POSE
 from lslam.inertial.window import Window, moment_of, off_by
-from lslam.registration.constant_velocity import middle_of
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import noise, se3, so3
+from lslam.inertial.constant_velocity import middle_of
 from lslam.odometry.deskew_uncertainty import USUAL
 from lslam.odometry.elastic_sweep import ElasticSweep
-from lslam.registration.constant_velocity import middle_of
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.state import Stateful
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.interpolate import poses_at
+from lslam.inertial.constant_velocity import MotionModel
 from lslam.preprocessing.deskew import knots_over
-from lslam.registration.constant_velocity import MotionModel
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult

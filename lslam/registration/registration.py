@@ -13,10 +13,10 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.recovery import RecoveryConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
+from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.acceptance import failed
 from lslam.registration.attempt import Attempt, Policy, Target
-from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
 from lslam.registration.policies import policies_of
@@ -26,9 +26,6 @@ from lslam.types.stage_clock import StageClock
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
-
-# Between scans that come without stamps, ns: most sensors turn ten times a second.
-SCAN_NS = 100_000_000
 
 
 class Registration(Stateful):
@@ -45,7 +42,7 @@ class Registration(Stateful):
     (4, 4)
     """
 
-    STATE = ("target", "history", "_motion", "_index")
+    STATE = ("target", "history", "_last", "_index")
 
     def __init__(
         self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None,
@@ -55,7 +52,8 @@ class Registration(Stateful):
         self.target: Any = VoxelTarget(self.config, self.preprocess) if target is None else target
         self.policies = policies_of(recovery or RecoveryConfig()) if policies is None else tuple(policies)
         self.history = History(self.config)
-        self._motion, self._index = ConstantVelocity(), 0
+        # Of `register`: the last two poses, and how many scans there were.
+        self._last, self._index = (np.eye(4), np.eye(4)), 0
 
     def fresh(self) -> Registration:
         """An empty one of the same settings."""
@@ -68,18 +66,18 @@ class Registration(Stateful):
         return local_map
 
     def register(self, points: NDArray[Any], prior: Floats | None = None) -> RegistrationResult:
-        """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the velocity is taken as constant."""
+        """Pose of points (N, 3), m, LiDAR frame; without `prior` (4, 4) the last motion goes on."""
         return self.align(prepare_points(points, self.preprocess, self._index), prior)
 
     def align(self, points: Any, prior: Floats | None = None) -> RegistrationResult:
         """As `register`, for points that are prepared already. Raises InputError for a prior that is no finite (4, 4)."""
-        stamp_ns = self._index * SCAN_NS
-        T_prior = self._motion.predict(stamp_ns) if prior is None else np.asarray(prior, np.float64)
+        before, last = self._last
+        T_prior = se3.normalise(last @ se3.relative(before, last)) if prior is None else np.asarray(prior, np.float64)
         if T_prior.shape != (4, 4) or not np.isfinite(T_prior).all():
             raise InputError(f"the motion prior has shape {T_prior.shape}: a finite (4, 4) pose is needed")
         result = self.locate(points, T_prior)
         self.update(result)
-        self._motion.correct(stamp_ns, result.T_world_lidar)
+        self._last = (last, result.T_world_lidar) if self._index else (result.T_world_lidar, result.T_world_lidar)
         self._index += 1
         return result
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +90,7 @@ class ResidualKind:
         """Whether it takes the gap between the rings at each source point."""
         return self.points is _with_gaps
 
-    @property
+    @cached_property
     def linearise(self) -> Callable[..., None]:
         """The kernel."""
         return getattr(import_module(self.module), self.function)  # type: ignore[no-any-return]

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from lslam.config import Config, load_config
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
+from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry import create_odometry, small_gicp
 from lslam.odometry import open3d as open3d_method
 from lslam.odometry.sanity import measurable
 from lslam.preprocessing.prepare import clean_points
 from lslam.preprocessing.rings import decide_rings
-from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

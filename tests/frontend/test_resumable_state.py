@@ -17,11 +17,11 @@ from lslam.frontend.inertial_start import Inertial, begin_inertial
 from lslam.frontend.register_scans import read_ahead
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
+from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.preprocessing.views import with_rings
-from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate

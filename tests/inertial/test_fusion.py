@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from lslam.config.imu import ImuConfig
 from lslam.geometry import se3, so3
+from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start
-from lslam.registration.constant_velocity import ConstantVelocity, MotionModel
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Span

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.geometry import se3
+from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry import create_odometry
 from lslam.odometry.icp import Icp, create
-from lslam.registration.constant_velocity import ConstantVelocity
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

@@ -22,12 +22,12 @@ from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.geometry import se3
 from lslam.geometry.normal_equations import Normal
+from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.linked_motion import LinkedMotion
 from lslam.kernels import positive
 from lslam.odometry import create_odometry
 from lslam.odometry.lips import Lips
 from lslam.odometry.sanity import fault
-from lslam.registration.constant_velocity import middle_of
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.registration.constant_velocity import ConstantVelocity
+from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 
