@@ -35,7 +35,7 @@ def up_directions(
     keyframes: Sequence[Keyframe], results: Sequence[ScanResult], config: GraphConfig
 ) -> list[UpDirection]:
     """One per keyframe with a direction of gravity; those within the correlation time count as one measurement."""
-    known = [(k, g) for k in keyframes if (g := results[k.scan].gravity) is not None]
+    known = [(k, g) for k in keyframes if (g := results[k.scan].imu.gravity) is not None]
     stamps = np.array([k.stamp_ns for k, _ in known], np.int64)
     half = round(0.5e9 * MEMORY_S)
     alike = np.searchsorted(stamps, stamps + half, side="right") - np.searchsorted(stamps, stamps - half)

@@ -106,10 +106,10 @@ def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
     """
     up = np.zeros(3)
     for r in results:
-        if r.gravity is not None:
-            up -= r.T_world_lidar[:3, :3] @ r.gravity.direction / r.gravity.sigma**2
+        if r.imu.gravity is not None:
+            up -= r.T_world_lidar[:3, :3] @ r.imu.gravity.direction / r.imu.gravity.sigma**2
     norm = float(np.linalg.norm(up))
-    sigmas = [r.gravity.sigma for r in results if r.gravity is not None]
+    sigmas = [r.imu.gravity.sigma for r in results if r.imu.gravity is not None]
     return (up / norm, min(sigmas)) if norm > 0 else (None, 0.0)
 
 

@@ -213,7 +213,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     last = motion.estimate
     errors = motion.prior_errors()
     norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
-    steady = [r.steady_norm for r in results[1:] if r.status == "ok" and r.steady_norm is not None]
+    steady = [r.imu.steady_norm for r in results[1:] if r.status == "ok" and r.imu.steady_norm is not None]
     iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.is_stationary]
     return {
         "used": not motion.refusal,
@@ -239,9 +239,9 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
 def _savings(results: list[ScanResult]) -> dict[str, Any]:
     """What the IMU saved on the scans that were registered from constant velocity too; means over them."""
     sample = [
-        (r.iterations, r.steady_iterations, r.saved_s)
+        (r.iterations, r.imu.steady_iterations, r.imu.saved_s)
         for r in results
-        if r.steady_iterations is not None and r.saved_s is not None
+        if r.imu.steady_iterations is not None and r.imu.saved_s is not None
     ]
     if not sample:
         return {"compared_scans": 0}

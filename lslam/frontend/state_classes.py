@@ -18,7 +18,7 @@ from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gravity import GravityDirection
 from lslam.types.imu import ImuStream
-from lslam.types.imu_state import ImuState
+from lslam.types.imu_state import ImuDiagnostics, ImuState
 from lslam.types.inertial_state import InertialState, InertialStep
 from lslam.types.map_fix import MapFix
 from lslam.types.motion_check import MotionCheck
@@ -27,8 +27,8 @@ from lslam.types.scan_equations import ScanEquations
 from lslam.types.scan_result import ScanResult
 
 STATE_CLASSES = (
-    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuNoise, ImuState, ImuStream,
-    InertialState, InertialStep, Landmarks, LoopCandidate, MapFix, Moment, MotionCheck, MotionState, NavigationState, Past,
-    PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings, InertialStart, Window,
-    WindowPrior, WindowValues,
+    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuDiagnostics, ImuNoise,
+    ImuState, ImuStream, InertialState, InertialStep, Landmarks, LoopCandidate, MapFix, Moment, MotionCheck, MotionState,
+    NavigationState, Past, PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings,
+    InertialStart, Window, WindowPrior, WindowValues,
 )  # fmt: skip

@@ -16,6 +16,7 @@ from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.sanity import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.solver import RegistrationResult
+from lslam.types.imu_state import ImuDiagnostics
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult, Status
@@ -208,16 +209,16 @@ class Tracker:
             for name, seconds in clock.seconds.items()
             if name != "imu" or self.motion.coasting is not None
         }
-        result = replace(
-            result, prior_norm=_matrix_norm(expected.pose, pose),
-            steady_norm=None if steady is None else _matrix_norm(steady, pose),
-            gravity=self.motion.gravity_at(pose) if is_ok else None, imu=self.motion.imu_state(),
-            stages={**result.stages, **own},
+        imu = ImuDiagnostics(
+            self.motion.imu_state(), self.motion.gravity_at(pose) if is_ok else None,
+            None if steady is None else _matrix_norm(steady, pose),
         )  # fmt: skip
-        if trial is None or not trial.is_accepted or result.status == "bridged":
-            return result
-        taken = sum(seconds for name, seconds in result.stages.items() if name not in ("update", "standing"))
-        return replace(result, steady_iterations=trial.iterations, saved_s=sum(trial.stages.values()) - taken)
+        stages = {**result.stages, **own}
+        if trial is not None and trial.is_accepted and result.status != "bridged":
+            taken = sum(seconds for name, seconds in stages.items() if name not in ("update", "standing"))
+            saved_s = sum(trial.stages.values()) - taken
+            imu = replace(imu, steady_iterations=trial.iterations, saved_s=saved_s)
+        return replace(result, prior_norm=_matrix_norm(expected.pose, pose), imu=imu, stages=stages)
 
     def _refined(
         self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, located: RegistrationResult,

@@ -75,7 +75,7 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     """
     names, seconds = stage_matrix(record.results)
     indices, stamps = [r.index for r in record.results], [r.stamp_ns for r in record.results]
-    saved = {k: r.saved_s for k, r in enumerate(record.results) if r.saved_s is not None}
+    saved = {k: r.imu.saved_s for k, r in enumerate(record.results) if r.imu.saved_s is not None}
     folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds, saved))
     # Every number of scans.csv is the same in every run.
     columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
@@ -85,12 +85,12 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
             r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_stationary), int(r.converged), r.iterations,
             r.source_points, r.inliers, f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
             f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
-            "" if r.steady_norm is None else f"{r.steady_norm:.5f}",
-            "" if r.steady_iterations is None else r.steady_iterations, int(r.is_lost),
+            "" if r.imu.steady_norm is None else f"{r.imu.steady_norm:.5f}",
+            "" if r.imu.steady_iterations is None else r.imu.steady_iterations, int(r.is_lost),
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")
-    if any(r.imu is not None for r in record.results):
+    if any(r.imu.state is not None for r in record.results):
         folder.write_text("imu_states.csv", imu_states_text(record.results))
 
 

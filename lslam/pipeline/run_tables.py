@@ -116,7 +116,7 @@ def imu_states_text(results: Iterable[ScanResult]) -> str:
     header = ["index", "stamp_ns", *(column for name in IMU_STATES for column in (name, f"{name}_sigma"))]
     rows = [",".join(header)]
     for r in results:
-        if r.imu is not None:
-            pairs = np.stack([r.imu.values, r.imu.sigmas], axis=1).ravel()
+        if r.imu.state is not None:
+            pairs = np.stack([r.imu.state.values, r.imu.state.sigmas], axis=1).ravel()
             rows.append(",".join([str(r.index), str(r.stamp_ns), *("" if np.isnan(v) else f"{v:.7g}" for v in pairs)]))
     return "\n".join(rows) + "\n"

@@ -42,7 +42,7 @@ _COURSES = (
 
 def imu_figures(record: RunRecord) -> list[Figure]:
     """States of the IMU after each scan with their bands, then its readings; empty without an IMU."""
-    known = [(r.stamp_ns, r.imu) for r in record.results if r.imu is not None]
+    known = [(r.stamp_ns, r.imu.state) for r in record.results if r.imu.state is not None]
     figures = []
     if known:
         seconds = _seconds(np.array([stamp for stamp, _ in known], np.int64), record)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from html import escape
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,17 +139,17 @@ def registration_figures(record: RunRecord) -> list[Figure]:
         ("Overlap", "overlap", "overlap, share of source points", ["overlap"]),
         ("Residual", "rmse", "rmse of the residuals, m", ["rmse"]),
         ("Iterations", "iterations", "iterations", ["iterations"]),
-        ("Motion prior", "prior_norm", "2-norm of inv(prior) pose - I", ["prior_norm", "steady_norm"]),
+        ("Motion prior", "prior_norm", "2-norm of inv(prior) pose - I", ["prior_norm", "imu.steady_norm"]),
     ]
     words = {
         "source_points": "source points",
         "prior_norm": "prior",
-        "steady_norm": "constant velocity, for comparison",
+        "imu.steady_norm": "constant velocity, for comparison",
     }
     figures = []
     for title, _, y_label, fields in series:
         # None, where there is nothing to compare with, becomes NaN.
-        known = {f: np.array([getattr(r, f) for r in results], np.float64) for f in fields}
+        known = {f: np.array([attrgetter(f)(r) for r in results], np.float64) for f in fields}
         fields = [f for f in fields if np.isfinite(known[f]).any()]
         values = [known[f] for f in fields]
         if not any(np.any(np.isfinite(v) & (v != 0)) for v in values):

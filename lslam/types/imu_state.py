@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.gravity import GravityDirection
+
 XYZ = ("x", "y", "z")
 # In the order of the values.
 IMU_STATES = (
@@ -25,3 +27,21 @@ class ImuState:
 
     values: NDArray[np.float64]
     sigmas: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ImuDiagnostics:
+    """What an IMU made of one scan beside its pose, all None without one.
+
+    state : errors of its readings after the scan, until it was refused
+    gravity : the direction down; None where the scan is bridged or the IMU has a gap
+    steady_norm : as `ScanResult.prior_norm`, of constant velocity, which the IMU took the place of
+    steady_iterations : iterations of registration from constant velocity on the same map, of a sample of the scans
+    saved_s : likewise, how much longer that took, s; the IMU's own part counted against it
+    """
+
+    state: ImuState | None = None
+    gravity: GravityDirection | None = None
+    steady_norm: float | None = None
+    steady_iterations: int | None = None
+    saved_s: float | None = None

@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu_state import ImuState
+from lslam.types.imu_state import ImuDiagnostics
 
 Status = Literal["ok", "bridged", "skipped"]
 
@@ -36,12 +35,7 @@ class ScanResult:
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (Girolimetto, equation 5.1)
-    steady_norm : likewise of constant velocity, which an IMU took the place of; None without an IMU
-    steady_iterations : what registration from constant velocity took on the same map; None but for a sample of the scans
-        that an IMU predicted
-    saved_s : likewise, how much longer that took, s; the IMU's own part counted against it
-    gravity : which way is down, when an IMU says so; None where the scan is bridged or the IMU has a gap
-    imu : what was known of the IMU after the scan; None without one, and once it was refused
+    imu : its diagnostics
     stamp_offset : (4, 4) pose at the stamp as the next scan tells it, seen from `T_world_lidar`; None where it tells none
     fault : what was wrong with the scan though it was of use; empty: nothing
     stages : seconds per stage, by name, in the order they ran
@@ -68,11 +62,7 @@ class ScanResult:
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0
-    steady_norm: float | None = None
-    steady_iterations: int | None = None
-    saved_s: float | None = None
-    gravity: GravityDirection | None = None
-    imu: ImuState | None = None
+    imu: ImuDiagnostics = field(default_factory=ImuDiagnostics)
     stamp_offset: NDArray[np.float64] | None = None
     fault: str = ""
     stages: dict[str, float] = field(default_factory=dict)

@@ -23,6 +23,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gnss import GnssStream
 from lslam.types.gravity import GravityDirection
+from lslam.types.imu_state import ImuDiagnostics
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Calibration
@@ -318,7 +319,7 @@ def test_gravity_keeps_it_level_beside_loops() -> None:
     down = -REAL[:, 2, :3]
     results = [
         ScanResult(i, i * 100_000_000, rolled[i], covariance=OWN * (1 + i), registration_covariance=OWN,
-                   gravity=GravityDirection(down[i], 0.003))
+                   imu=ImuDiagnostics(gravity=GravityDirection(down[i], 0.003)))
         for i in range(COUNT)
     ]  # fmt: skip
     done = run_back_end(Stub([]), results, store_of(results), config(), LOOPS[:1])
@@ -336,7 +337,7 @@ def with_gravity(results: list[ScanResult], seed: int, sigma: float = np.deg2rad
     tilt, out = rng.normal(0, sigma, 3), []
     for result, T in zip(results, REAL, strict=True):
         tilt = keep * tilt + np.sqrt(1 - keep**2) * rng.normal(0, sigma, 3)
-        out.append(replace(result, gravity=GravityDirection(so3.exp(tilt) @ -T[2, :3], sigma)))
+        out.append(replace(result, imu=ImuDiagnostics(gravity=GravityDirection(so3.exp(tilt) @ -T[2, :3], sigma))))
     return out
 
 

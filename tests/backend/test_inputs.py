@@ -9,6 +9,7 @@ from lslam.config.graph import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.gravity import GravityDirection
+from lslam.types.imu_state import ImuDiagnostics
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
@@ -46,7 +47,7 @@ def test_ups_of_one_stretch_count_as_one_measurement() -> None:
     tilt = so3.exp(np.array([0.0, 0.1, 0.0]))
     pose = se3.make(tilt, np.zeros(3))
     down = GravityDirection(tilt.T @ np.array([0.0, 0, -1.0]), 0.01)
-    results = [ScanResult(i, i * 10**9, pose, gravity=down if i != 30 else None) for i in range(60)]
+    results = [ScanResult(i, i * 10**9, pose, imu=ImuDiagnostics(gravity=down if i != 30 else None)) for i in range(60)]
     keyframes = [Keyframe(i, i, i * 10**9, pose) for i in range(60)]
     ups = up_directions(keyframes, results, GraphConfig())
     assert [u.keyframe for u in ups] == [i for i in range(60) if i != 30]

@@ -16,6 +16,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se3, so3
 from lslam.types.gravity import GravityDirection
+from lslam.types.imu_state import ImuDiagnostics
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory
@@ -47,7 +48,7 @@ def results_of(level_poses: Floats, spread_deg: float = 0.0) -> list[ScanResult]
         off = so3.exp(np.deg2rad(spread_deg) * rng.normal(size=3))
         covariance = (A := rng.normal(size=(6, 6))) @ A.T
         gravity = GravityDirection(-off @ T[2, :3], np.deg2rad(max(spread_deg, 0.1)))
-        found = ScanResult(k, k * 100_000_000, first @ T, covariance=covariance, gravity=gravity)
+        found = ScanResult(k, k * 100_000_000, first @ T, covariance=covariance, imu=ImuDiagnostics(gravity=gravity))
         out.append(replace(found, registration_covariance=2 * covariance, degenerate=np.eye(6)[1:2]))
     return out
 
@@ -72,9 +73,11 @@ def test_up_directions_are_weighted_by_their_sigmas() -> None:
     results = results_of(bend())
     wrong = so3.exp(np.array([np.deg2rad(5), 0, 0]))
     for k in range(30):
-        g = results[k].gravity
+        g = results[k].imu.gravity
         assert g is not None
-        results[k] = replace(results[k], gravity=GravityDirection(wrong @ g.direction, np.deg2rad(3)))
+        results[k] = replace(
+            results[k], imu=ImuDiagnostics(gravity=GravityDirection(wrong @ g.direction, np.deg2rad(3)))
+        )
     level = find_level(empty(), results, config("imu.use=true"))
     up = level.R @ results[0].T_world_lidar[:3, :3] @ bend()[0][2, :3]
     assert np.rad2deg(np.arccos(up[2])) < 0.1
@@ -88,7 +91,9 @@ def test_a_tilt_that_may_be_a_bias_is_left_alone() -> None:
     sigma = {True: 2.0, False: 0.5}
     for is_doubtful in (True, False):
         gravity = GravityDirection(wrong @ np.array([0, 0, -1.0]), np.deg2rad(sigma[is_doubtful]))
-        level = find_level(empty(), [ScanResult(0, 0, poses[0], gravity=gravity)], config("imu.use=true"))
+        level = find_level(
+            empty(), [ScanResult(0, 0, poses[0], imu=ImuDiagnostics(gravity=gravity))], config("imu.use=true")
+        )
         assert level.is_turned != is_doubtful
         assert ("not levelled: its tilt of 2.50 deg" in level.world) == is_doubtful
 
@@ -108,7 +113,7 @@ def test_only_the_world_turns() -> None:
         assert b is not None
         assert b.rmse == pytest.approx(a.rmse, rel=1e-6)
     assert before.scores["thesis1"].thesis_rmse == pytest.approx(after.scores["thesis1"].thesis_rmse, rel=1e-6)
-    assert turned[5].gravity is results[5].gravity, "in LiDAR axes, so the same"
+    assert turned[5].imu.gravity is results[5].imu.gravity, "in LiDAR axes, so the same"
     # A twist of the pose has the same likelihood in either world.
     T, d = level.R, np.arange(6) / 10
     e = np.concatenate([T @ d[:3], T @ d[3:]])
@@ -148,6 +153,6 @@ def test_auto_without_an_imu_and_none_leave_the_world_alone() -> None:
     for settings in ((), ("imu.use=true", "input.level=none")):
         level = find_level(empty(), results, config(*settings))
         assert (level.is_turned, level.world) == (False, "LiDAR at the first scan, not levelled")
-    blind = [replace(r, gravity=None) for r in results]
+    blind = [replace(r, imu=ImuDiagnostics(gravity=None)) for r in results]
     refused = find_level(empty(), blind, config("imu.use=true"))
     assert (refused.is_turned, refused.problem) == (False, ""), "the refused IMU is a problem of its own"

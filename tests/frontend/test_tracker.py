@@ -218,38 +218,38 @@ def test_a_first_sweep_before_the_imu_is_deskewed_after_the_second() -> None:
 
 def test_one_scan_in_twenty_measures_what_the_imu_saves() -> None:
     oracle, results = braked()
-    sample = [r for r in results if r.steady_iterations is not None]
+    sample = [r for r in results if r.imu.steady_iterations is not None]
     assert [r.index for r in sample] == [19, 39], "one in twenty"
     assert all(oracle.calls.count(r.index) == (2 if r in sample else 1) for r in results[2:])
     for r in sample:
-        assert (r.iterations, r.steady_iterations) == (1, 2), "8 cm take a step more"
-        assert r.saved_s == pytest.approx(0.01 - r.stages["imu"])
+        assert (r.iterations, r.imu.steady_iterations) == (1, 2), "8 cm take a step more"
+        assert r.imu.saved_s == pytest.approx(0.01 - r.stages["imu"])
         np.testing.assert_array_equal(r.T_world_lidar, oracle.poses[r.index])
-    assert all(r.stages["imu"] > 0 and r.saved_s is None for r in results[2:] if r not in sample)
+    assert all(r.stages["imu"] > 0 and r.imu.saved_s is None for r in results[2:] if r not in sample)
 
 
 def test_a_scan_lost_by_constant_velocity_gives_no_comparison() -> None:
     _, results = braked(lost_m=0.06)
-    assert [r.index for r in results[2:] if r.status != "ok" or r.steady_iterations is not None] == []
+    assert [r.index for r in results[2:] if r.status != "ok" or r.imu.steady_iterations is not None] == []
 
 
 def test_over_a_gap_of_the_imu_no_scan_is_compared() -> None:
     """The 20th scan lies in the gap: constant velocity predicts it anyway."""
     oracle, results = braked(gap=(1.65, 2.55))
-    assert [r.index for r in results if r.steady_iterations is not None] == [39]
+    assert [r.index for r in results if r.imu.steady_iterations is not None] == [39]
     assert all(oracle.calls.count(r.index) == 1 for r in results[2:] if r.index != 39)
 
 
 def test_scans_that_are_not_found_are_not_all_tried_twice() -> None:
     oracle, results = braked(missed=frozenset((k, n) for k in range(17, 27) for n in (1, 2)))
-    assert [r.index for r in results if r.steady_iterations is not None] == [39]
+    assert [r.index for r in results if r.imu.steady_iterations is not None] == [39]
     assert [k for k in range(2, 45) if oracle.calls.count(k) > 1] == [19, 39]
 
 
 def test_a_scan_lost_by_the_imu_gives_no_comparison() -> None:
     _, results = braked(missed=frozenset({(19, 2)}))
     assert results[19].status == "bridged"
-    assert [r.index for r in results if r.saved_s is not None] == [39]
+    assert [r.index for r in results if r.imu.saved_s is not None] == [39]
 
 
 class Weighing(Oracle):

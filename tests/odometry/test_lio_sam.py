@@ -74,7 +74,7 @@ def test_a_walk_is_followed_as_closely_as_by_the_same_features_on_a_loose_imu_an
     assert all(result.status == "ok" for result in results)
     assert tight < 1.2 * loose
     assert all(result.covariance is not None and not result.posed_by for result in results)
-    last = results[-1].imu
+    last = results[-1].imu.state
     assert last is not None
     # Of the data sheet: 5 deg/s on each axis.
     np.testing.assert_allclose(last.values[3:6], IMUS["icm20948"].gyro.bias, atol=3e-3)

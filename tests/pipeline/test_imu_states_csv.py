@@ -8,7 +8,7 @@ import io
 import numpy as np
 
 from lslam.pipeline.run_tables import imu_states_text
-from lslam.types.imu_state import IMU_STATES, ImuState
+from lslam.types.imu_state import IMU_STATES, ImuDiagnostics, ImuState
 from lslam.types.scan_result import ScanResult
 
 
@@ -16,7 +16,10 @@ def test_a_state_stands_beside_its_sigma_and_scans_without_one_are_left_out() ->
     values, sigmas = np.arange(13.0), np.arange(13.0) / 100
     values[9:12] = sigmas[9:12] = np.nan
     with_state = ScanResult(
-        index=4, stamp_ns=1_700_000_000_123_456_789, T_world_lidar=np.eye(4), imu=ImuState(values, sigmas)
+        index=4,
+        stamp_ns=1_700_000_000_123_456_789,
+        T_world_lidar=np.eye(4),
+        imu=ImuDiagnostics(ImuState(values, sigmas)),
     )
     without = ScanResult(index=5, stamp_ns=1_700_000_000_223_456_789, T_world_lidar=np.eye(4))
     (row,) = csv.DictReader(io.StringIO(imu_states_text([with_state, without])))

@@ -123,11 +123,11 @@ def test_the_imu_gains_accuracy_and_iterations_on_a_walk() -> None:
     assert iterations[1] < 0.8 * iterations[0]
     norms = [float(np.median([r.prior_norm for r in results[5:]])) for results in (without, with_it)]
     assert norms[1] < 0.5 * norms[0]
-    steady = [r.steady_norm for r in with_it[5:]]
+    steady = [r.imu.steady_norm for r in with_it[5:]]
     assert norms[1] < 0.5 * float(np.median([norm for norm in steady if norm is not None]))
     assert len(steady) == len([norm for norm in steady if norm is not None])
-    assert all((r.steady_norm, r.gravity) == (None, None) for r in without)
-    assert all(r.gravity is not None for r in with_it)
+    assert all((r.imu.steady_norm, r.imu.gravity) == (None, None) for r in without)
+    assert all(r.imu.gravity is not None for r in with_it)
 
 
 def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
@@ -139,7 +139,7 @@ def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
 
 def test_results_are_the_same_twice_and_without_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
     """What constant velocity would have taken is tried on the side: not a bit of the result depends on it."""
-    assert sum(r.saved_s is not None for r in runs()[1].record.results) >= 2
+    assert sum(r.imu.saved_s is not None for r in runs()[1].record.results) >= 2
     monkeypatch.setattr(InertialMotion, "COMPARED", 10**6)
     again = run(with_imu(imu_of(walk())), config_of("input.threads=1"))
     np.testing.assert_array_equal(again.trajectory.poses, runs()[1].trajectory.poses)
@@ -173,12 +173,12 @@ def test_the_manifest_lists_the_estimates_of_the_imu(tmp_path: Path) -> None:
     column = header.split(",").index("prior_norm")
     assert float(rows[20].split(",")[column]) == pytest.approx(outcome.record.results[20].prior_norm, abs=1e-5)
     steady = float(rows[20].split(",")[header.split(",").index("steady_norm")])
-    assert steady == pytest.approx(outcome.record.results[20].steady_norm, abs=1e-5)
+    assert steady == pytest.approx(outcome.record.results[20].imu.steady_norm, abs=1e-5)
     assert imu["median_prior_norm"] < imu["median_constant_velocity_norm"]
-    sample = [r for r in outcome.record.results if r.steady_iterations is not None]
+    sample = [r for r in outcome.record.results if r.imu.steady_iterations is not None]
     assert imu["compared_scans"] == len(sample) > 0
     at = header.split(",").index("steady_iterations")
-    assert [row.split(",")[at] for row in rows] == [str(r.steady_iterations or "") for r in outcome.record.results]
+    assert [row.split(",")[at] for row in rows] == [str(r.imu.steady_iterations or "") for r in outcome.record.results]
     assert imu["compared_iterations"] == pytest.approx(np.mean([r.iterations for r in sample]), abs=0.01)
     assert imu["constant_velocity_iterations"] > 1.2 * imu["compared_iterations"]
     assert imu["mean_iterations"] == pytest.approx(

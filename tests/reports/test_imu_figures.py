@@ -13,7 +13,7 @@ from lslam.reports import imu_figures as module
 from lslam.reports import svg
 from lslam.reports.imu_figures import imu_figures
 from lslam.types.imu import ImuStream
-from lslam.types.imu_state import ImuState
+from lslam.types.imu_state import ImuDiagnostics, ImuState
 
 
 def state(k: int, is_calibrated: bool) -> ImuState:
@@ -29,7 +29,7 @@ def test_states_are_drawn_in_their_units_with_bands(
     make_record: MakeRecord, monkeypatch: pytest.MonkeyPatch, is_calibrated: bool
 ) -> None:
     record = make_record(12)
-    record.results[:] = [replace(r, imu=state(k, is_calibrated)) for k, r in enumerate(record.results)]
+    record.results[:] = [replace(r, imu=ImuDiagnostics(state(k, is_calibrated))) for k, r in enumerate(record.results)]
     drawn: dict[str, tuple[list[svg.Line], list[svg.Band]]] = {}
     chart = svg.line_chart
 
