@@ -16,7 +16,6 @@ from lslam.pipeline.run import run
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan_result import ScanResult
 
 SPAN = 0.1
 
@@ -133,15 +132,14 @@ def test_the_first_sweep_is_in_all_poses() -> None:
     for k in range(10):
         jerk = so3.exp(np.array([0.0, 2e-3 * (-1) ** k, 0.0]))
         located = RegistrationResult(se3.make(jerk, np.array([10.0 * k, 0, 0])), covariance=C, lever_arm=20.0)
-        scan = ScanResult(k, k * 10**8, located.T_world_lidar)
-        one = instant.stamped(scan, located, MotionPrior.at_once(located.T_world_lidar))
-        found = swept.stamped(scan, located, steady(10.0 * k, 100.0))
-    assert one.covariance is not None
-    assert found.covariance is not None
-    assert found.registration_covariance is not None
-    np.testing.assert_allclose(one.registration_covariance, C)
-    assert found.registration_covariance[4, 4] > 1e-7
-    assert found.covariance[2, 2] > one.covariance[2, 2] + 90**2 * found.registration_covariance[4, 4]
+        one, one_own = instant.covariances(located, k * 10**8, MotionPrior.at_once(located.T_world_lidar))
+        found, own = swept.covariances(located, k * 10**8, steady(10.0 * k, 100.0))
+    assert one is not None
+    assert found is not None
+    assert own is not None
+    np.testing.assert_allclose(one_own, C)
+    assert own[4, 4] > 1e-7
+    assert found[2, 2] > one[2, 2] + 90**2 * own[4, 4]
 
 
 def test_later_motion_does_not_change_the_uncertainty_of_the_first_sweep() -> None:
@@ -150,10 +148,10 @@ def test_later_motion_does_not_change_the_uncertainty_of_the_first_sweep() -> No
     for k in range(80):
         pose = at(0.1 * k + (0.02 * rng.normal() if k < 12 else 0.0))
         located = RegistrationResult(pose, covariance=C, lever_arm=1e5)
-        found = uncertainty.stamped(ScanResult(k, k * 10**8, pose), located, steady(pose[0, 3], 1.0))
-        assert found.covariance is not None
-        assert found.registration_covariance is not None
-        doubts.append((found.covariance[0, 0], found.registration_covariance[0, 0]))
+        found, own = uncertainty.covariances(located, k * 10**8, steady(pose[0, 3], 1.0))
+        assert found is not None
+        assert own is not None
+        doubts.append((found[0, 0], own[0, 0]))
     shaken, calm = doubts[11], doubts[-1]
     assert calm[1] < 0.05 * shaken[1]
     # What is left of a shaken pose's doubt is that of the first sweep: four of five parts.
