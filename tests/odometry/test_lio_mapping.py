@@ -84,7 +84,7 @@ def test_the_map_is_of_scans_that_left_the_window_and_a_run_goes_on_where_it_was
         assert stamps == [one.stamp_ns for one in loaded[max(0, k + 1 - WINDOW) : k + 1]]
         # All scans but the first have equations, and each is in the map or waits for it.
         assert all(m.equations is not None for m in motion.window.moments if m.stamp_ns != loaded[0].stamp_ns)
-        assert odometry.registration.inserted + len(odometry.pending) == k + 1
+        assert odometry.registration.history.inserted + len(odometry.pending) == k + 1
         assert all(np.array_equal(T, motion.poses()[stamp]) for stamp, _, T in odometry.pending)
         if k == 11:
             write_state(tmp_path / "12.npz", tracker.state())

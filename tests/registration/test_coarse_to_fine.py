@@ -40,7 +40,7 @@ def test_coarse_to_fine_is_accepted_only_with_usual_agreement(
     assert registration.history.starting == 0
     points = prepare_points(drive.scan(7).points, registration.preprocess, 7)
     found, other = aside(last, 0.6, 0.0), aside(last, coarse)
-    monkeypatch.setattr(registration.target, "refine", lambda *_, **__: found)
+    monkeypatch.setattr(registration.target, "align", lambda *_: found)
     monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: other)
     registration.history.agreement.usual = 1.0
     located = registration.locate(points, last.T_world_lidar)
@@ -66,7 +66,7 @@ def test_at_the_start_the_result_with_the_larger_consensus_is_taken(
     registration, points, known = begun()
     assert registration.history.starting > 0
     near, far = aside(known, fine, 0.0), aside(known, coarse)
-    monkeypatch.setattr(registration.target, "refine", lambda *_, **__: near)
+    monkeypatch.setattr(registration.target, "align", lambda *_: near)
     monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
     assert located.ok
@@ -78,7 +78,7 @@ def test_at_the_start_the_result_with_the_larger_consensus_is_taken(
 def test_a_coarse_result_that_fails_is_not_taken_however_many_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     registration, points, known = begun()
     near, far = aside(known, 0.4, 0.0), aside(known, 0.9, 1.1 * registration.config.max_jump_m)
-    monkeypatch.setattr(registration.target, "refine", lambda *_, **__: near)
+    monkeypatch.setattr(registration.target, "align", lambda *_: near)
     monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
     assert located.ok
