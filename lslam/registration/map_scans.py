@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,12 @@ from lslam.types.state import Stateful
 Floats = NDArray[np.float64]
 
 
-class MapScans(Stateful):
+class MapScans(Stateful, ABC):
     """Enters registered scans into the local map, and takes out those that no longer belong there."""
 
+    @abstractmethod
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
-        """The prepared points of a scan, LiDAR frame."""
-        raise NotImplementedError
+        """Enter the prepared points of a scan, LiDAR frame, at its pose (4, 4)."""
 
 
 class AllScans(MapScans):

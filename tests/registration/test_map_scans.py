@@ -7,8 +7,11 @@ import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
+from lslam.errors import UsageError
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.map_scans import LastKeyframes
+from lslam.registration.registration import Registration
 
 Floats = NDArray[np.float64]
 
@@ -44,3 +47,8 @@ def test_the_oldest_leaves_when_there_are_too_many() -> None:
     for x in (0.0, 1.0, 1.2, 2.0, 3.0, 4.0):
         target.enter(listed, POINTS, pose_at((x, 0.0, 0.0)))  # type: ignore[arg-type]
     assert listed.held == [2.0, 3.0, 4.0]
+
+
+def test_a_registration_on_arrays_has_no_submap() -> None:
+    with pytest.raises(UsageError, match="--method dlo"):
+        Registration(RegistrationConfig(target="submap"))
