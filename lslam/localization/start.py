@@ -126,9 +126,10 @@ class PlaceFinder:
         )
         limits = Acceptance(c.min_overlap, r.min_inliers, needs_covariance=True, needs_all_directions=True)
         rejection = limits.rejection(found)
-        if rejection is not None or found.covariance is None:
-            self.reasons.append("" if rejection is None else rejection.reason)
+        if rejection is not None:
+            self.reasons.append(rejection.reason)
             return None
+        assert found.covariance is not None
         R = self._R_level @ self._poses[b, :3, :3]
         T = found.T_world_lidar @ se3.make(R, np.zeros(3)) @ se3.inverse(self._poses[b])
         return Vote(b, T, found.covariance, support)

@@ -107,19 +107,15 @@ class Verifier:
     def _judge(self, a: LevelSubmap, b: LevelSubmap, found: RegistrationResult) -> Verification:
         """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""
         c = self.config
+        if not found.ok or found.covariance is None:
+            return Verification(LoopStage.REGISTRATION, found.reason or "nothing matches")
         T = found.T_world_lidar
-        if not found.ok:
-            return Verification(LoopStage.REGISTRATION, found.reason)
         there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
         back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
         worse = min(there, back, key=lambda one: one.overlap)
         both = replace(found, rmse=max(there.rmse, back.rmse), matched=worse.matched, source_points=worse.source_points)
-        limits = Acceptance(
-            c.min_overlap, max_rmse=c.max_rmse, needs_covariance=True, needs_all_directions=True, target="other submap"
-        )
+        limits = Acceptance(c.min_overlap, max_rmse=c.max_rmse, needs_all_directions=True, target="other submap")
         rejection = limits.rejection(both)
-        if both.covariance is None:
-            return Verification(LoopStage.REGISTRATION, "nothing matches")
         facts = Verification(LoopStage.REGISTRATION, "", T, found.covariance, both.rmse, both.overlap)
         if rejection is None:
             return facts

@@ -36,7 +36,7 @@ class LessPlanar:
         """Acts on results that fail, have few inliers, or are degenerate on a map."""
         target, are_few = attempt.target, result.inliers < MIN_FEATURES
         is_degenerate = len(result.degenerate) > 0 and target.map is not None
-        if not (not result.ok or are_few or is_degenerate):
+        if result.ok and not are_few and not is_degenerate:
             return result
         with attempt.clock.stage("stand-in"):
             # With all points on a young map these are registered already, and preferred.
@@ -59,8 +59,8 @@ class SolutionRemapping:
         if not (result.ok and len(result.degenerate)):
             return result
         # The first step's prior is a guess, which the search has replaced.
-        is_guess = attempt.start is not None and attempt.history.inserted <= 1
-        expected = attempt.start.T_world_lidar if is_guess and attempt.start is not None else attempt.T_prior
+        start = attempt.start if attempt.history.inserted <= 1 else None
+        expected = attempt.T_prior if start is None else start.T_world_lidar
         return attempt.judged(remap_solution(result, expected))
 
 

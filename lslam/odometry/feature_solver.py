@@ -87,7 +87,7 @@ def map_problem(
     target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
     scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None, inlier_ratio: float = 1.0,
 ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
-    """What `optimise` is asked for by `solve_on_map`."""
+    """The arguments of `optimise` by which `solve_on_map` aligns."""
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
     lines, matches = target.edges, Correspondences(len(planes) + len(edges))

@@ -23,8 +23,9 @@ Floats = NDArray[np.float64]
 
 # Steps beyond these, m and deg, need no test of the next scan: it is not stationary.
 SLOW_M, SLOW_DEG = 0.1, 1.0
-# Of a test.
-LIMITS = Acceptance(min_overlap=0.3, min_inliers=0.7, needs_covariance=True, needs_all_directions=True)
+# Least overlap and inlier share for a test.
+MATCHED, AGREEING = 0.3, 0.7
+LIMITS = Acceptance(MATCHED, AGREEING, needs_covariance=True, needs_all_directions=True)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ class MapAlignment:
         self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
         allowed: Floats = EVERYWHERE, information: Floats | None = None,
     ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
-        """What `optimise` is asked for by `refine`."""
+        """The arguments of `optimise` by which `refine` aligns."""
         c, coarser = self.config, coarser or self.map.coarser
         coarser = coarser if self.kind.is_wide else coarser[:1]
         # The larger the planes, the farther their surface may be from them.
