@@ -18,7 +18,8 @@ LEAST_TURN_RAD, SIGMAS = np.deg2rad(2.0), 4.0
 def mounting_problem(motion: InertialMotion) -> str:
     """A sentence where the turns contradict the rotation of T_lidar_imu and it is not estimated; else empty.
 
-    What it advises is what the method of this motion model takes.
+    Turns about one axis do not tell a turned device from one whose axes are askew; those about a second one do. The advice is
+    one that the method of this motion model takes.
     """
     gyroscope = motion.estimate.gyroscope
     angle, sigma = gyroscope.tilt
@@ -27,10 +28,23 @@ def mounting_problem(motion: InertialMotion) -> str:
     first = "" if motion.HAS_DEVICE else "--method fast-lio2 "
     if motion.config.velocity == "integrated":
         first = "--set imu.velocity=registration "
+    cause = "correct T_lidar_imu, or have it estimated"
+    if not _is_turned(gyroscope):
+        cause = (
+            "the gyroscope's axes are askew or T_lidar_imu is turned, turns about one axis do not tell which; the latter is "
+            "estimated"
+        )
     return (
         f"IMU: it turns about an axis {np.rad2deg(angle):.1f} deg (sigma {np.rad2deg(sigma):.1f}) beside that of the scans: "
-        f"correct T_lidar_imu, or have it estimated by {first}--set imu.estimate_extrinsics=true"
+        f"{cause} by {first}--set imu.estimate_extrinsics=true"
     )
+
+
+def _is_turned(gyroscope: Gyroscope) -> bool:
+    """Whether a rotation of the whole device is certain, whatever its axes may be askew."""
+    rotation, covariance = gyroscope.rotation[0], gyroscope.rotation_covariance
+    angle = float(np.linalg.norm(rotation))
+    return angle**2 > SIGMAS * float(np.sqrt(rotation @ covariance @ rotation))
 
 
 def calibration_found(gyroscope: Gyroscope, begun: InertialStart) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from lslam.frontend.inertial_calibration import mounting_problem
 from lslam.frontend.motion_models import MOTION_MODELS, motion_of
 from lslam.geometry import so3
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.gyroscope import Gyroscope
+from lslam.inertial.gyroscope import AXES_SIGMA, Gyroscope
 from lslam.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.inertial.initialise import InertialStart
 from lslam.odometry import METHODS
@@ -51,6 +51,21 @@ def test_what_is_advised_against_a_turned_imu_is_taken(settings: tuple[str, ...]
     config = config_of(*settings, *advised)
     check_config(config)
     assert config.imu.estimate_extrinsics
+
+
+def test_turns_about_one_axis_do_not_blame_the_mounting() -> None:
+    motion = turned_motion(config_of("odometry.method=fast-lio2"))
+    axes, sigma = np.eye(3), np.full((3, 3), AXES_SIGMA)
+    axes[0, 2], sigma[:, 2] = np.deg2rad(2.5), 1e-3
+    covariance = np.diag(np.concatenate([np.full(3, 1e-8), sigma.ravel() ** 2]))
+    askew = replace(motion.estimate.gyroscope, axes=axes, covariance=covariance)
+    motion.estimate = replace(motion.estimate, gyroscope=askew)
+    assert "2.5 deg (sigma 0.1) beside that of the scans: the gyroscope's axes are askew or T_lidar_imu is turned" in (
+        mounting_problem(motion)
+    )
+    # No axes are askew by eight degrees.
+    axes[0, 2] = np.deg2rad(8.0)
+    assert "correct T_lidar_imu" in mounting_problem(motion)
 
 
 def test_methods_without_states_for_the_device_are_those_whose_motion_models_have_none() -> None:
