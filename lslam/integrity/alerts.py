@@ -112,13 +112,9 @@ def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     steps = np.diff(stamps_ns) * 1e-9
     if len(steps) < 2 or np.any(steps <= 0):
         return []
-    velocity = np.diff(positions, axis=0) / steps[:, None]
-    between = (steps[1:] + steps[:-1]) / 2
-    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    is_jump = (change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M)
-    # The second of three poses that make a jump is scan k + 1; jumps less than three scans apart are one.
-    at = np.flatnonzero(is_jump) + 1
-    groups = np.split(at, np.flatnonzero(np.diff(at) > 3) + 1) if len(at) else []
+    change, between = _velocity_changes(positions, steps)
+    # The second of three poses that make a jump is scan k + 1.
+    at = np.flatnonzero(_is_jump(change, between) & ~_is_by_stamps(positions, steps)) + 1
     return [
         Alert(
             int(group[0]),
@@ -126,8 +122,45 @@ def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
             f"the poses jump, by {np.max(change[group - 1] * between[group - 1]):.1f} m from one scan to the next against "
             "the motion before: a wrong place, or scans out of order",
         )
-        for group in groups
+        for group in _groups(at)
     ]
+
+
+def stamp_faults(positions: Floats, stamps_ns: NDArray[np.int64]) -> tuple[list[int], float]:
+    """Scans whose stamps alone make the poses jump, by their positions in the run, and by how much a step is wrong, s."""
+    steps = np.diff(stamps_ns) * 1e-9
+    if len(steps) < 2 or np.any(steps <= 0):
+        return [], 0.0
+    at = np.flatnonzero(_is_jump(*_velocity_changes(positions, steps)) & _is_by_stamps(positions, steps))
+    if not len(at):
+        return [], 0.0
+    off = np.abs(steps - np.median(steps))
+    return (at + 1).tolist(), float(np.max(np.maximum(off[at], off[at + 1])))
+
+
+def _velocity_changes(positions: Floats, steps: Floats) -> tuple[Floats, Floats]:
+    """(N - 2,) changes of the velocity, m/s, of positions (N, 3), m, and the times in which they happen, s."""
+    velocity = np.diff(positions, axis=0) / steps[:, None]
+    return np.linalg.norm(np.diff(velocity, axis=0), axis=1), (steps[1:] + steps[:-1]) / 2
+
+
+def _is_jump(change: Floats, between: Floats) -> NDArray[np.bool_]:
+    """Whether nothing that carries a sensor changes its velocity so much, m/s, in such a time, s."""
+    return np.asarray((change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M))
+
+
+def _is_by_stamps(positions: Floats, steps: Floats) -> NDArray[np.bool_]:
+    """(N - 2,) whether three poses would not jump had their scans followed each other at the period of the sensor.
+
+    A rotor keeps its period to a thousandth; stamps that a computer gives when packets arrive do not. A wrong place, or scans
+    out of order, stay wrong at any stamps.
+    """
+    return ~_is_jump(*_velocity_changes(positions, np.full(len(steps), np.median(steps))))
+
+
+def _groups(at: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Jumps less than three scans apart are one."""
+    return np.split(at, np.flatnonzero(np.diff(at) > 3) + 1) if len(at) else []
 
 
 def _runs(signs: Floats) -> list[tuple[int, int]]:

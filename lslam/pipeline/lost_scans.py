@@ -6,12 +6,15 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.integrity.alerts import LARGE, Alert, alerts
+from lslam.integrity.alerts import LARGE, Alert, alerts, stamp_faults
 from lslam.pipeline.manifest import Manifest
 from lslam.types.motion_check import MotionCheck, motion_apart
 from lslam.types.scan_result import ScanResult
+
+Floats = NDArray[np.float64]
 
 log = logging.getLogger("lslam")
 
@@ -21,6 +24,7 @@ MOST_SAID = 6
 def mark_lost(results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest) -> list[ScanResult]:
     """The results, those that an alert speaks of marked so; the manifest has a problem for each stretch of them."""
     raised = _alerts(results, checks)
+    _report_stamps(results)
     manifest.integrity = {
         "checks": len(checks),
         "conclusive": sum(check.is_conclusive for check in checks),
@@ -49,9 +53,24 @@ def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionChec
     return replace(check, claimed=motion, claimed_agreement=0.0 if is_moved else check.claimed_agreement)
 
 
-def _alerts(results: list[ScanResult], checks: list[MotionCheck]) -> list[Alert]:
+def _report_stamps(results: list[ScanResult]) -> None:
+    """Warn of stamps that contradict poses which follow each other steadily: the clock is wrong, no scan is lost."""
+    at, off_s = stamp_faults(*_positions(results))
+    if at:
+        log.warning(
+            "the stamps of %d of %d scans, the first is scan %d, are wrong by up to %.0f ms: at the period of the sensor the "
+            "poses follow each other steadily, by their stamps they jump; it spoils speeds, deskewing and the use of an IMU",
+            len(at), len(results), results[at[0]].index, 1e3 * off_s,
+        )  # fmt: skip
+
+
+def _positions(results: list[ScanResult]) -> tuple[Floats, NDArray[np.int64]]:
     positions = np.stack([r.at_stamp.T_world_lidar[:3, 3] for r in results])
-    return alerts(checks, positions, np.array([r.stamp_ns for r in results]))
+    return positions, np.array([r.stamp_ns for r in results])
+
+
+def _alerts(results: list[ScanResult], checks: list[MotionCheck]) -> list[Alert]:
+    return alerts(checks, *_positions(results))
 
 
 def _marked(results: list[ScanResult], raised: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:

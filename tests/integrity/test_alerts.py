@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.integrity.alerts import IN_A_ROW, alerts
+from lslam.integrity.alerts import IN_A_ROW, alerts, stamp_faults
 from lslam.types.motion_check import MotionCheck
 
 Floats = NDArray[np.float64]
@@ -87,3 +88,21 @@ def test_poses_that_jump_raise_an_alert_without_any_check() -> None:
     (alert,) = alerts([], positions, stamps_ns)
     assert (alert.first, alert.last) == (9, 11)
     assert "the poses jump, by 3.0 m" in alert.why
+    assert stamp_faults(positions, stamps_ns) == ([], 0.0)
+
+
+def test_stamps_that_jump_under_steady_poses_are_the_fault_of_the_clock() -> None:
+    positions = np.column_stack([1.3 * np.arange(40.0), np.zeros(40), np.zeros(40)])
+    jitter = np.zeros(40)
+    jitter[[12, 13, 30]] = 0.03, -0.01, -0.045
+    stamps_ns = np.round(1e9 * (0.1 * np.arange(40) + jitter)).astype(np.int64)
+    assert alerts([], positions, stamps_ns) == []
+    at, off_s = stamp_faults(positions, stamps_ns)
+    assert {12, 30} <= set(at) <= {11, 12, 13, 14, 29, 30, 31}
+    assert off_s == pytest.approx(0.045, abs=1e-6)
+    # Poses out of order jump by any stamps; a scan that is missing makes no jump at all.
+    swapped = positions.copy()
+    swapped[[20, 21]] = swapped[[21, 20]]
+    assert [(alert.first, alert.last) for alert in alerts([], swapped, stamps_ns)] == [(19, 23)]
+    kept = np.delete(np.arange(40), [12, 13, 25, 30])
+    assert stamp_faults(positions[kept], stamps_ns[kept]) == ([], 0.0)

@@ -132,6 +132,18 @@ def test_scans_swapped_in_pairs_degrade_the_run() -> None:
     assert sum(r.is_lost for r in outcome.record.results) > 50
 
 
+def test_stamps_that_jitter_are_told_as_the_fault_of_the_clock() -> None:
+    whole = drive("street", 40)
+    late_ns = np.zeros(40, np.int64)
+    late_ns[[12, 13, 25]] = 40_000_000, -40_000_000, 45_000_000
+    scans = [replace(whole.scan(i), stamp_ns=int(whole.scan(i).stamp_ns + late_ns[i])) for i in range(40)]
+    outcome = ended(Holed(scans, None, whole.calibration))
+    manifest = outcome.record.manifest
+    assert manifest["status"] == "done"
+    assert not any(r.is_lost for r in outcome.record.results)
+    assert [p for p in manifest["problems"] if "the stamps of" in p and "wrong by up to 80 ms" in p]
+
+
 @pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
 def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     whole = drive("street", 100, lidar=lidar)
