@@ -248,7 +248,7 @@ MARKS = {
     "FACTORS",
 }
 SECTIONS = ("preprocess", "registration", "recovery", "keyframes", "loops", "graph")
-HELD = ("registration", "recovery", "loops", "graph", "odometry")
+HELD = ("registration", "recovery", "loops", "graph", "odometry", "integrity")
 
 
 def value_in_code(name: str, file: str) -> Any:

@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.motion_check import USUAL, MotionCheck
+from lslam.integrity.pair_registration import is_within
+from lslam.types.motion_check import SAME_M, SAME_RAD, USUAL, MotionCheck
 
 Floats = NDArray[np.float64]
 
@@ -18,10 +19,10 @@ LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
 # One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.array([0.5, 0.5, 0.5, *np.deg2rad([2.0, 2.0, 2.0])])
 SIGMAS_IN_A_ROW, SIGMAS_ALONE, MORE = 3.0, 6.0, 1.15
-# m; a check with a larger sigma of the position confirms nothing.
-OPEN_M = 0.5
 # Five times gravity over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
+# Checks in a row between standing and moving: one is chance.
+OPEN_IN_A_ROW = 2
 AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
 
 
@@ -36,7 +37,9 @@ class Alert:
 
 def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
-    found = [*_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks)]
+    found = [
+        *_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks), *_ambiguous(checks),
+    ]  # fmt: skip
     return sorted(found, key=lambda alert: (alert.first, alert.last))
 
 
@@ -99,12 +102,30 @@ def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
     """Where scans are missing or failed, and a check rejects the motion of the poses before and after."""
     found = []
     for check in checks:
-        is_open = float(np.max(check.sigma[:3])) > OPEN_M or not check.is_conclusive
         is_elsewhere = check.claimed_agreement < USUAL * check.usual
-        if check.is_after_break and check.usual > 0 and (is_open or is_elsewhere):
+        if check.is_after_break and check.usual > 0 and (check.is_open or is_elsewhere):
             why = f"nothing in the scans confirms the motion over the {check.seconds:.1f} s before, in which scans failed or miss"
             found.append(Alert(check.first + 1, check.last, why))
     return found
+
+
+def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:
+    """Where standing and moving explain the scans about equally well: a group of surfaces moves, or the sensor."""
+    conclusive = [check for check in checks if check.is_conclusive]
+    is_open = [check.rival is not None and _is_rest(check.rival) != _is_rest(check.found) for check in conclusive]
+    return [
+        Alert(
+            conclusive[begin].first + 1,
+            conclusive[end - 1].last,
+            "standing and moving explain the scans about equally well: a group of surfaces around the sensor moves, or it does",
+        )
+        for begin, end in _runs(np.array(is_open, np.float64))
+        if end - begin >= OPEN_IN_A_ROW
+    ]
+
+
+def _is_rest(motion: Floats) -> bool:
+    return is_within(motion, SAME_M, SAME_RAD)
 
 
 def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:

@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
-from lslam.geometry import se3, so3
+from lslam.geometry import se3
+from lslam.integrity.pair_registration import PairRegistration, best_of, is_near, is_within, median_range
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
-from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import BREADTH, WIDE
-from lslam.registration.robust import Annealing, UsualAgreement
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.robust import UsualAgreement
 from lslam.types.motion_check import MotionCheck
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -24,28 +21,35 @@ from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 
-# A scan is compared with the one so many scans and seconds before; with fewer scans between where these are far apart in time.
-EVERY, LAG_S = 5, 0.45
-FEWEST, LONGEST_S = 2, 0.9
+# A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
+# scans lie closer.
+LAG_S, REACH_SHARE = 0.45, 0.75
+# s; the motion of an earlier check is no start over a longer time.
+LONGEST_S = 1.35
+# A pair whose time differs by less than this part has the motion of the one before.
+JITTER = 0.02
 # Points that make the planes of the first scan, and of the last scan those that are laid on them.
 PLANE_POINTS, LAID_POINTS = 5000, 1200
 # m and rad; poses that move by less state no motion, which is tested against a motion of metres.
 STILL_M, STILL_RAD = 0.05, float(np.deg2rad(0.3))
-# Another motion than the one found first must explain so many times more points.
+# Another motion than the one found from the claim must explain so many times more points.
 MORE = 1.1
+# m/s2; a vehicle comes to rest no faster, its tyres do not hold.
+MOST_BRAKING = 10.0
 # s; a longer pause between two scans is a break.
 PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A scan as the monitor keeps it: when and where, and its points (S, 3) with their scatter, deskewed."""
+    """A scan as the monitor keeps it: when and where, and its points (S, 3) with their scatter, deskewed; median range, m."""
 
     position: int
     stamp_ns: int
     pose: Floats
     source: Floats
     scatter: Floats
+    range_m: float
 
     @property
     def points(self) -> PreparedPoints:
@@ -54,34 +58,34 @@ class Seen:
 
 
 class IntegrityMonitor(Stateful):
-    """Registers every fifth scan on the planes of the scan half a second before, and keeps these checks of the claims.
+    """Registers pairs of scans, at a rate and by settings of its own, and keeps these checks of the claimed motions.
 
-    Planes that one ring could make by itself are left out (`BREADTH`), so that a sensor's own pattern does not confirm
-    standing still. Of a claim of no motion, and where a scan fits less than usual, two more are weighed: the motion of the
-    last conclusive check, and what is found from metres away.
+    Every pair is registered from the claimed motion, and from none where the sensor can have come to rest since the last check.
+    Where the claim is none, fits less than usual, or is a change of motion that no vehicle makes, it is registered from the
+    motion of the last conclusive check as well, and one is searched for some metres around. The motion that explains most
+    points is the one found, and another one that explains as many is its rival.
+
+    Planes that one ring could make by itself are left out (`BREADTH`), so that a sensor's own pattern does not confirm standing
+    still. Some of it remains, so that standing is a rival of any motion along a bare motorway.
+
+    preprocess : tells which points are the vehicle's; the rest of it is not taken
     """
 
-    STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_usual")
+    STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_may_stand", "_usual")
 
-    def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
-        self._preprocess = preprocess
-        self._config = registration.model_copy(update={"blob_weight": 0.0})
-        # One scan has no fine planes.
-        self._planes = tuple(
-            GaussianMap(
-                registration.voxel_size * registration.coarse_factor * wider, min_points=registration.min_points,
-                planarity=registration.planarity, count_cap=registration.count_cap, reach=1.2 * preprocess.range_max,
-                capacity=1 << 13, breadth=BREADTH,
-            )
-            for wider in (1, *WIDE)
-        )  # fmt: skip
+    def __init__(self, preprocess: PreprocessConfig) -> None:
+        self._preprocess = PreprocessConfig(range_min=preprocess.range_min, ego_box=preprocess.ego_box)
+        self._is_prepared = preprocess == self._preprocess
+        self._pair = PairRegistration()
         self.checks: list[MotionCheck] = []
         self._reference: Seen | None = None
         self._is_broken = False
         self._last_ns = 0
-        # What the last conclusive check found, per second.
-        self._motion: Floats | None = None
-        self._usual = UsualAgreement(registration.min_agreement)
+        # The motion (4, 4) that the last conclusive check found, and the seconds it took.
+        self._motion: tuple[Floats, float] | None = None
+        # Whether no motion was its rival.
+        self._may_stand = False
+        self._usual = UsualAgreement(0.0)
 
     def see(self, position: int, scan: Scan | None, prepared: object, result: ScanResult, sweep: MotionPrior) -> None:
         """The next scan of the run, None when it could not be read, and its result.
@@ -89,11 +93,10 @@ class IntegrityMonitor(Stateful):
         prepared : what its method made of it, taken where it fits; sweep : the motion within the scan
         """
         stamp_ns, is_ok = result.stamp_ns, result.status == "ok"
-        is_paused = position > 0 and (stamp_ns - self._last_ns) * 1e-9 > PAUSE_S
+        step_s = (stamp_ns - self._last_ns) * 1e-9
         self._last_ns = stamp_ns
-        self._is_broken |= is_paused or not is_ok
-        # The first scan may have been taken at a speed that nobody knew yet.
-        if scan is None or not is_ok or not self._is_due(position, stamp_ns):
+        self._is_broken |= (position > 0 and step_s > PAUSE_S) or not is_ok
+        if scan is None or not is_ok or not self._is_due(position, result, step_s):
             return
         now = self._seen(position, scan, prepared, result, sweep)
         if self._reference is not None:
@@ -104,72 +107,80 @@ class IntegrityMonitor(Stateful):
         """Compile or load the kernels with a small room."""
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[:, 2] = np.where(room[:, 2] > 0, 8.0, -8.0)
-        trial = IntegrityMonitor(self._preprocess, self._config)
+        trial = IntegrityMonitor(self._preprocess)
         for k in range(2):
-            at, scan = k * EVERY + 1, Scan(room, round(1e9 * k), k)
+            at, scan = k + 1, Scan(room, round(1e9 * k), k)
             trial.see(at, scan, None, ScanResult(k, scan.stamp_ns, np.eye(4)), MotionPrior.at_once(np.eye(4)))
 
-    def _is_due(self, position: int, stamp_ns: int) -> bool:
-        if self._reference is None:
+    def _is_due(self, position: int, result: ScanResult, step_s: float) -> bool:
+        first = self._reference
+        if first is None:
+            # The first scan may have been taken at a speed that nobody knew yet.
             return position > 0
-        if self._is_broken:
+        if self._is_broken or not self.checks or not self.checks[-1].is_conclusive:
             return True
-        scans, seconds = position - self._reference.position, (stamp_ns - self._reference.stamp_ns) * 1e-9
-        return (scans >= EVERY and seconds >= LAG_S) or (scans >= FEWEST and seconds >= LONGEST_S)
+        seconds = (result.stamp_ns - first.stamp_ns) * 1e-9
+        claimed = float(np.linalg.norm(se3.relative(first.pose, result.T_world_lidar)[:3, 3])) / max(seconds, 1e-3)
+        # By the next scan the sensor is too far away, whichever of both motions is right.
+        is_far = max(self._speed, claimed) * (seconds + step_s) > REACH_SHARE * first.range_m
+        return seconds >= LAG_S or is_far
+
+    @property
+    def _speed(self) -> float:
+        """m/s; of the last conclusive check."""
+        return 0.0 if self._motion is None else float(np.linalg.norm(self._motion[0][:3, 3])) / self._motion[1]
+
+    def _expected(self, seconds: float) -> Floats | None:
+        """The motion (4, 4) over so many seconds if it goes on as before; None where nobody knows."""
+        if self._motion is None or seconds > LONGEST_S:
+            return None
+        motion, before = self._motion
+        share = seconds / before
+        return motion if abs(share - 1) < JITTER else se3.exp(share * se3.log(motion))
 
     def _seen(self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior) -> Seen:
-        if not isinstance(prepared, PreparedPoints):
+        if not (self._is_prepared and isinstance(prepared, PreparedPoints)):
             prepared = prepare_points(scan.points, self._preprocess, scan.index, scan.times)
         points = thin(prepared, 1 + len(prepared.source) // PLANE_POINTS)
         source = deskew_points(points.source, points.source_times, sweep)
-        return Seen(position, result.stamp_ns, result.T_world_lidar, source, points.scatter)
+        return Seen(position, result.stamp_ns, result.T_world_lidar, source, points.scatter, median_range(source))
 
     def _compare(self, first: Seen, last: Seen) -> None:
         """Test the motion of the poses between two scans."""
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
-        for level in self._planes:
-            level.clear()
-            level.insert(first.source.astype(np.float32), np.eye(4))
-        points = thin(last.points, 1 + len(last.source) // LAID_POINTS)
-        found = self._lay(points, claimed, self._quick())
-        usual = self._usual.usual
-        if is_still(claimed) or self._usual.is_less(found.agreement):
-            starts = [(claimed, self._slow())]
-            if self._motion is not None and seconds < LONGEST_S + LAG_S:
-                starts.append((se3.exp(seconds * self._motion), self._quick()))
-            others = [self._lay(points, start, annealing) for start, annealing in starts]
-            best = max(others, key=lambda other: other.inliers)
-            found = best if best.inliers > MORE * found.inliers else found
-        if found.covariance is None:
+        pair = self._pair
+        pair.begin(first.source, thin(last.points, 1 + len(last.source) // LAID_POINTS))
+        near_claim = pair.near(claimed)
+        hypotheses = [near_claim]
+        is_odd = is_still(claimed) or self._usual.is_less(near_claim.result.agreement)
+        if not is_still(claimed) and (self._may_stand or self._speed < MOST_BRAKING * seconds):
+            hypotheses.append(pair.at_rest())
+        if self._motion is None:
+            hypotheses.append(pair.far(np.eye(4)))
+        elif (expected := self._expected(seconds)) is not None:
+            change = float(np.linalg.norm(expected[:3, 3] - claimed[:3, 3])) / seconds**2
+            if (is_odd or change > MOST_BRAKING) and not is_near(near_claim.motion, expected):
+                hypotheses.append(pair.near(expected))
+        if is_odd and (is_still(claimed) or self._usual.is_less(max(h.result.agreement for h in hypotheses))):
+            hypotheses.append(pair.far(claimed))
+        best, rival = best_of(hypotheses, MORE)
+        if best.sigma is None:
             return
-        as_claimed = self._lay(points, claimed, self._at_once())
-        self._usual.observe(found.agreement)
-        self.checks.append(
-            MotionCheck(
-                first.position, last.position, seconds, claimed, found.T_world_lidar,
-                np.sqrt(np.diag(found.covariance)), found.agreement, as_claimed.agreement, usual, self._is_broken,
-            )
+        usual = self._usual.usual
+        self._usual.observe(best.result.agreement)
+        is_as_claimed = is_still(se3.relative(claimed, near_claim.motion))
+        as_claimed = (near_claim if is_as_claimed else pair.at(claimed)).result
+        check = MotionCheck(
+            first.position, last.position, seconds, claimed, best.motion, best.sigma, best.result.agreement,
+            as_claimed.agreement, usual, self._is_broken, None if rival is None else rival.motion,
         )  # fmt: skip
-        if self.checks[-1].is_conclusive and seconds > 0:
-            self._motion = se3.log(found.T_world_lidar) / seconds
-
-    def _lay(self, points: PreparedPoints, start: Floats, annealing: Annealing) -> RegistrationResult:
-        return solve(self._planes, points, start, annealing, self._config)
-
-    def _quick(self) -> Annealing:
-        c = self._config
-        return Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.max_iterations)
-
-    def _slow(self) -> Annealing:
-        c = self._config
-        return Annealing(c.coarse_kernel, c.kernel_min, c.coarse_decay, c.start_iterations)
-
-    def _at_once(self) -> Annealing:
-        c = self._config
-        return Annealing(c.kernel_min, c.kernel_min, c.kernel_decay, 1)
+        self.checks.append(check)
+        if check.is_conclusive and seconds > 0:
+            self._motion = best.motion, seconds
+            self._may_stand = rival is not None and is_still(rival.motion)
 
 
 def is_still(motion: Floats) -> bool:
     """Whether the motion (4, 4) is none."""
-    return bool(np.linalg.norm(motion[:3, 3]) < STILL_M and so3.angle(motion[:3, :3]) < STILL_RAD)
+    return is_within(motion, STILL_M, STILL_RAD)

@@ -57,7 +57,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     if osm is not None:
         osm.begin(None if folder is None else folder / REPLIES)
     stationary = StationaryDetector(config.preprocess, config.registration) if config.preprocess.skip_standing else None
-    monitor = IntegrityMonitor(config.preprocess, config.registration) if config.odometry.integrity else None
+    monitor = IntegrityMonitor(config.preprocess) if config.odometry.integrity else None
     _warm_up(job, stationary, monitor)
 
     if osm is not None and checkpoints is not None:

@@ -12,6 +12,10 @@ from lslam.geometry import portable, so3
 # What explains less than this part of what is usual, or less than a share of the points, is rejected, as is what
 # leaves the turn open, rad.
 USUAL, FEWEST, UNTURNED = 0.7, 0.15, float(np.deg2rad(1.0))
+# m; a check with a larger sigma of the position confirms nothing.
+OPEN_M = 0.5
+# m and rad; two motions of a pair of scans that differ by less are one.
+SAME_M, SAME_RAD = 0.2, float(np.deg2rad(1.0))
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class MotionCheck:
     sigma : (6,) standard deviation of what was found, about a metre along directions that the scans do not hold
     agreement : share of the points that lie on surfaces of the first scan as found; claimed_agreement : as claimed
     usual : what the agreement lately was; is_after_break : whether scans are missing or failed just before the last
+    rival : (4, 4) another motion that explains the last scan about as well as the one found
     """
 
     first: int
@@ -35,11 +40,17 @@ class MotionCheck:
     claimed_agreement: float
     usual: float
     is_after_break: bool = False
+    rival: NDArray[np.float64] | None = None
 
     @property
     def is_conclusive(self) -> bool:
         """Whether enough points are inliers, and the rotation is constrained well enough, to accept it."""
         return self.agreement >= max(USUAL * self.usual, FEWEST) and float(np.max(self.sigma[3:])) < UNTURNED
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the scans do not tell the motion, or tell it only along some directions."""
+        return not self.is_conclusive or float(np.max(self.sigma[:3])) > OPEN_M
 
     @property
     def apart(self) -> NDArray[np.float64]:

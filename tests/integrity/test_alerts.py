@@ -80,6 +80,14 @@ def test_a_break_over_which_nothing_confirms_the_motion_raises_an_alert() -> Non
     assert spans([*checks[:2], replace(checks[2], is_after_break=True), checks[3]]) == []
 
 
+def test_standing_that_explains_as_much_as_moving_raises_an_alert_when_it_does_so_twice() -> None:
+    checks = checks_of([0.0] * 8)
+    still, on = shifted(0.0), shifted(2.0)
+    assert spans([*checks[:3], replace(checks[3], rival=still), *checks[4:]]) == []
+    assert spans([*checks[:3], *(replace(check, rival=on) for check in checks[3:6]), *checks[6:]]) == []
+    assert spans([*checks[:3], *(replace(check, rival=still) for check in checks[3:5]), *checks[5:]]) == [(16, 25)]
+
+
 def test_poses_that_jump_raise_an_alert_without_any_check() -> None:
     positions = np.column_stack([np.arange(20.0), np.zeros(20), np.zeros(20)])
     stamps_ns = 100_000_000 * np.arange(20, dtype=np.int64)

@@ -144,6 +144,13 @@ def test_stamps_that_jitter_are_told_as_the_fault_of_the_clock() -> None:
     assert [p for p in manifest["problems"] if "the stamps of" in p and "wrong by up to 80 ms" in p]
 
 
+@pytest.mark.parametrize("preset", ["thesis-icp", "thesis-loam"])
+def test_the_settings_of_a_method_that_loses_its_way_do_not_blind_the_monitor(preset: str) -> None:
+    outcome = ended(open_sequence(SAMPLE), f"odometry.preset={preset}")
+    assert any("m ahead" in problem for problem in problems(outcome))
+    assert sum(r.is_lost for r in outcome.record.results) > 12
+
+
 @pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
 def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     whole = drive("street", 100, lidar=lidar)
@@ -172,7 +179,7 @@ def test_the_first_alerts_are_listed_and_the_others_counted(more: int) -> None:
     """One check in six finds the sensor a metre ahead: the scans of each are marked, also of those that are not told."""
     stretches = MOST_SAID + more
     cfg = config()
-    monitor = IntegrityMonitor(cfg.preprocess, cfg.registration)
+    monitor = IntegrityMonitor(cfg.preprocess)
     for k in range(6 * stretches):
         found, is_ahead = np.eye(4), k % 6 == 5
         found[0, 3] = is_ahead
