@@ -23,6 +23,8 @@ SIGMAS_IN_A_ROW, SIGMAS_ALONE, MORE = 3.0, 6.0, 1.15
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
 # Checks in a row between standing and moving: one is chance.
 OPEN_IN_A_ROW = 2
+# Share of the directions that empty, far from the few per cent of dropouts and from the nine tenths of a cloud that leaves.
+EMPTIED = 0.25
 AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
 
 
@@ -38,7 +40,7 @@ class Alert:
 def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
     found = [
-        *_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks), *_ambiguous(checks),
+        *_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks), *_ambiguous(checks), *_foreign(checks),
     ]  # fmt: skip
     return sorted(found, key=lambda alert: (alert.first, alert.last))
 
@@ -126,6 +128,20 @@ def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:
 
 def _is_rest(motion: Floats) -> bool:
     return is_within(motion, SAME_M, SAME_RAD)
+
+
+def _foreign(checks: list[MotionCheck]) -> list[Alert]:
+    """Where the poses stand and the directions in which the sensor saw something empty: clouds of another frame."""
+    return [
+        Alert(
+            checks[begin].first + 1,
+            checks[end - 1].last,
+            f"the poses stand, yet {100 * max(check.emptied for check in checks[begin:end]):.0f} % of the directions in which "
+            "there were points are empty: the clouds are not in the frame of the sensor, perhaps in that of a world",
+        )
+        for begin, end in _runs(np.array([check.emptied > EMPTIED for check in checks], np.float64))
+        if end - begin >= IN_A_ROW
+    ]
 
 
 def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3
+from lslam.integrity.directions import emptied, filled_directions
 from lslam.integrity.pair_registration import PairRegistration, best_of, is_near, is_within, median_range
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
@@ -71,7 +72,7 @@ class IntegrityMonitor(Stateful):
     preprocess : tells which points are the vehicle's; the rest of it is not taken
     """
 
-    STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_may_stand", "_usual")
+    STATE = ("checks", "_reference", "_is_broken", "_last_ns", "_motion", "_may_stand", "_stand", "_usual")
 
     def __init__(self, preprocess: PreprocessConfig) -> None:
         self._preprocess = PreprocessConfig(range_min=preprocess.range_min, ego_box=preprocess.ego_box)
@@ -83,6 +84,8 @@ class IntegrityMonitor(Stateful):
         self._last_ns = 0
         # The motion (4, 4) that the last conclusive check found, and the seconds it took.
         self._motion: tuple[Floats, float] | None = None
+        # Where the poses stand, if they do, and the directions that were filled then.
+        self._stand: tuple[Floats, NDArray[np.int64]] | None = None
         # Whether no motion was its rival.
         self._may_stand = False
         self._usual = UsualAgreement(0.0)
@@ -100,7 +103,7 @@ class IntegrityMonitor(Stateful):
             return
         now = self._seen(position, scan, prepared, result, sweep)
         if self._reference is not None:
-            self._compare(self._reference, now)
+            self._compare(self._reference, now, self._emptied(self._reference, now, scan))
         self._reference, self._is_broken = now, False
 
     def warm_up(self) -> None:
@@ -145,7 +148,15 @@ class IntegrityMonitor(Stateful):
         source = deskew_points(points.source, points.source_times, sweep)
         return Seen(position, result.stamp_ns, result.T_world_lidar, source, points.scatter, median_range(source))
 
-    def _compare(self, first: Seen, last: Seen) -> None:
+    def _emptied(self, first: Seen, last: Seen, scan: Scan) -> float:
+        """Share of directions that were filled when the poses came to a stand, and are empty now that they still stand."""
+        if self._stand is not None and is_still(se3.relative(self._stand[0], last.pose)):
+            return emptied(self._stand[1], filled_directions(scan.points))
+        stands = is_still(se3.relative(first.pose, last.pose))
+        self._stand = (last.pose, filled_directions(scan.points)) if stands else None
+        return 0.0
+
+    def _compare(self, first: Seen, last: Seen, emptied_share: float) -> None:
         """Test the motion of the poses between two scans."""
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
@@ -173,7 +184,7 @@ class IntegrityMonitor(Stateful):
         as_claimed = (near_claim if is_as_claimed else pair.at(claimed)).result
         check = MotionCheck(
             first.position, last.position, seconds, claimed, best.motion, best.sigma, best.result.agreement,
-            as_claimed.agreement, usual, self._is_broken, None if rival is None else rival.motion,
+            as_claimed.agreement, usual, self._is_broken, None if rival is None else rival.motion, emptied_share,
         )  # fmt: skip
         self.checks.append(check)
         if check.is_conclusive and seconds > 0:

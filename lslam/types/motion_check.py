@@ -28,6 +28,7 @@ class MotionCheck:
     agreement : share of the points that lie on surfaces of the first scan as found; claimed_agreement : as claimed
     usual : what the agreement lately was; is_after_break : whether scans are missing or failed just before the last
     rival : (4, 4) another motion that explains the last scan about as well as the one found
+    emptied : share of the directions that held points since the poses stand, and hold none now
     """
 
     first: int
@@ -41,6 +42,7 @@ class MotionCheck:
     usual: float
     is_after_break: bool = False
     rival: NDArray[np.float64] | None = None
+    emptied: float = 0.0
 
     @property
     def is_conclusive(self) -> bool:

@@ -88,6 +88,12 @@ def test_standing_that_explains_as_much_as_moving_raises_an_alert_when_it_does_s
     assert spans([*checks[:3], *(replace(check, rival=still) for check in checks[3:5]), *checks[5:]]) == [(16, 25)]
 
 
+def test_directions_that_empty_while_the_poses_stand_raise_an_alert() -> None:
+    checks = checks_of([0.0] * 8)
+    assert spans([replace(check, emptied=0.1) for check in checks]) == []
+    assert spans([replace(check, emptied=0.4 if k > 3 else 0.0) for k, check in enumerate(checks)]) == [(21, 40)]
+
+
 def test_poses_that_jump_raise_an_alert_without_any_check() -> None:
     positions = np.column_stack([np.arange(20.0), np.zeros(20), np.zeros(20)])
     stamps_ns = 100_000_000 * np.arange(20, dtype=np.int64)

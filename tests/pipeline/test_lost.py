@@ -151,6 +151,18 @@ def test_the_settings_of_a_method_that_loses_its_way_do_not_blind_the_monitor(pr
     assert sum(r.is_lost for r in outcome.record.results) > 12
 
 
+def test_clouds_in_the_frame_of_a_world_are_reported() -> None:
+    sequence = open_sequence(SAMPLE)
+    assert sequence.ground_truth is not None
+    scans = []
+    for k, T in enumerate(sequence.ground_truth.poses[:50]):
+        scan = sequence.scan(k)
+        scans.append(replace(scan, points=(scan.points[:, :3] @ T[:3, :3].T + T[:3, 3]).astype(np.float32)))
+    outcome = ended(Stub(scans, None, sequence.calibration, motion_compensated=True))
+    (problem,) = problems(outcome)
+    assert "the clouds are not in the frame of the sensor" in problem
+
+
 @pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
 def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     whole = drive("street", 100, lidar=lidar)

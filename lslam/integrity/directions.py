@@ -1,0 +1,40 @@
+"""Directions in which a sensor sees something: a sensor that stands goes on seeing something there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+# Edge of a cell of directions, rad: two rings of sixteen beams, a hundred shots.
+CELL_RAD = float(np.deg2rad(5.0))
+# Points that tell the directions of a scan, and that fill a cell.
+POINTS, FILLING = 20_000, 3
+# Cells are numbered by row, from the pole below upwards.
+_ROWS = round(np.pi / CELL_RAD)
+_COLUMNS = 2 * _ROWS
+
+
+def filled_directions(points: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Numbers of the cells of directions, of about the same size, that hold some of the points (N, 3), m, seen from 0."""
+    few = points[:: 1 + len(points) // POINTS, :3].astype(np.float64)
+    ranges = np.linalg.norm(few, axis=1)
+    is_known = np.isfinite(ranges) & (ranges > 0)
+    few, ranges = few[is_known], ranges[is_known]
+    row = np.minimum((np.arcsin(few[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
+    count = np.maximum(np.round(_COLUMNS * np.cos((row + 0.5) * CELL_RAD - np.pi / 2)), 1)
+    column = np.minimum((np.arctan2(few[:, 1], few[:, 0]) / (2 * np.pi) + 0.5) * count, count - 1).astype(np.int64)
+    cells, filling = np.unique(row * _COLUMNS + column, return_counts=True)
+    return np.asarray(cells[filling >= FILLING])
+
+
+def emptied(before: NDArray[np.int64], now: NDArray[np.int64]) -> float:
+    """Share of the directions that were filled before and are empty now, in that half of them, lower or upper, where it is less.
+
+    What leaves in front of the sky empties directions, what leaves in front of the ground, or below a ceiling, does not.
+    """
+    is_lower = before < _ROWS // 2 * _COLUMNS
+    is_empty = ~np.isin(before, now)
+    halves = [is_empty[half] for half in (is_lower, ~is_lower) if half.any()]
+    return min((float(half.mean()) for half in halves), default=0.0)
