@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from lslam.errors import InputError
 
 LARGEST_NS = 2**62
-_DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*(?:Z|UTC|([+-])(\d\d):?(\d\d))?$")
+DAY = r"\d{4}[-/]\d\d[-/]\d\d"
+_DATE = re.compile(
+    r"(\d{4})[-/](\d\d)[-/](\d\d)[ T](\d\d):(\d\d):(\d\d)(?:\.(\d{1,9}))?\s*(?:Z|UTC|([+-])(\d\d):?(\d\d))?$"
+)
 # Unix time has had 10 digits before the point since 2001-09-09; no sensor has been switched on for so many seconds.
 _FIRST_NS = 10**18
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
-from lslam.formats.stamp_texts import date_to_ns, seconds_text
+from lslam.formats.stamp_texts import DAY, date_to_ns, seconds_text
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
-_DATE_AND_TIME = re.compile(r"(\d{4}-\d\d-\d\d) (\d\d:\S+)")
+_DATE_AND_TIME = re.compile(rf"({DAY}) (\d\d:\S+)")
 # What tools write where a number is missing.
 _MISSING = frozenset(("", "nan", "+nan", "-nan", "null", "none", "na", "n/a", "<na>"))
 
@@ -161,7 +162,18 @@ def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
     names = split_cells(header, separator_of(header)) if header else []
     if rows and not names:
         names = _names_in(comments, len(rows[0].cells))
+    rows, names = _whole_dates(rows, names)
     return TextTable(path, tuple(names), rows, separator, first, comments)
+
+
+def _whole_dates(rows: list[Row], names: list[str]) -> tuple[list[Row], list[str]]:
+    """Rows and names with a day and the time of day in the column behind it as one column."""
+    cells = rows[0].cells if rows else []
+    for k, (day, time) in enumerate(pairwise(cells)):
+        if re.fullmatch(DAY, day) and re.match(r"\d\d:", time):
+            rows = [r._replace(cells=[*r.cells[:k], "T".join(r.cells[k : k + 2]), *r.cells[k + 2 :]]) for r in rows]
+            return rows, [*names[:k], "datetime", *names[k + 2 :]] if len(names) == len(cells) else names
+    return rows, names
 
 
 def _names_in(comments: list[str], width: int) -> list[str]:

@@ -5,6 +5,7 @@ One rule for trajectories, IMU, fixes and stamps files. A name proposes; what st
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Collection
 from dataclasses import replace
@@ -19,6 +20,7 @@ from lslam.formats.stamp_texts import date_to_ns, seconds_to_ns
 from lslam.formats.text_tables import Row, TextTable, read_rows, text_table
 from lslam.remote import as_path
 
+log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 # The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
 Units = dict[int, int | None]
@@ -62,7 +64,8 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     candidates = _by_name(table, taken) if table.names else _by_place(table, taken)
     good = [c for c in candidates if _increases(np.sum([table.numbers(k) * (c[k] or 1) for k in c], axis=0))]
     # An index increases as well: it is the time only where nothing else is.
-    good.sort(key=lambda c: len(c) == 1 and is_index(table.numbers(*c)))
+    is_dated = any(_is_since_1970(table.numbers(next(iter(c)))) for c in good)
+    good.sort(key=lambda c: len(c) == 1 and is_index(table.numbers(*c), is_dated))
     chosen = next(iter(good or candidates), None)
     if chosen is None:
         return None
@@ -97,20 +100,28 @@ def read_stamps(path: Path, must_increase: bool = False) -> NDArray[np.int64]:
     clock = find_clock(table) or find_clock(replace(table, names=()))
     if clock is None:
         raise table.error(0, "no column is a time (s, ns or date)")
+    beside = max(clock.columns) + 1
+    if clock.note:
+        log.info("%s: %s", path, clock.note)
+    elif not table.names and not (clock.stamps_ns % SECOND_NS).any() and table.numbers(beside)[:1] >= 0:
+        log.warning(
+            "%s: whole seconds, column %d beside them is not read: if it is their fraction, name the columns (sec,usec)",
+            path, beside + 1,
+        )  # fmt: skip
     if must_increase:
         table.check_increasing(clock.stamps_ns)
     return clock.stamps_ns
 
 
-def is_index(values: Floats) -> bool:
+def is_index(values: Floats, is_beside_date: bool = False) -> bool:
     """Whether a column counts rows: whole numbers one apart but where rows are lost, three at least, smaller than any time
-    since 1970.
+    since 1970; in steps of any length beside times since 1970.
     """
     steps = np.diff(values)
     is_count = (
         len(values) > 2 and bool(np.all((steps >= 1) & (values[1:] == np.rint(values[1:])))) and abs(values[0]) < 1e8
     )
-    return is_count and float(np.mean(steps == 1)) > 0.5
+    return is_count and (is_beside_date or float(np.mean(steps == 1)) > 0.5)
 
 
 def unread_columns(table: TextTable, columns: Collection[int]) -> list[str]:
@@ -119,20 +130,30 @@ def unread_columns(table: TextTable, columns: Collection[int]) -> list[str]:
     return [table.names[k] for k in others if not is_index(table.numbers(k))]
 
 
-def is_fraction(whole: Floats, rest: Floats, unit_ns: int | None = None) -> bool:
-    """Whether `rest` (N,), in a unit that its name states, is the fraction of the whole seconds `whole` (N,).
+def unit_of_fraction(whole: Floats, rest: Floats, unit_ns: int | None = None) -> int | None:
+    """Nanoseconds in the unit in which `rest` (N,) is the fraction of the whole seconds `whole` (N,); None when it is none.
 
-    Without a unit it is in ns and must reach beyond a million, and not merely count. Rows without a number do not count.
+    unit_ns : that which the name of `rest` states. Without it, fractions are whole ns that reach beyond a million and do not
+    merely count; where the seconds repeat, decimals of a second, or whole ms or us, too. Rows without a number do not count.
     """
     both = np.isfinite(whole) & np.isfinite(rest)
     whole, rest = whole[both], rest[both]
-    if not len(whole) or np.any(whole != np.rint(whole)) or np.any(rest != np.rint(rest)):
-        return False
-    if rest.min() < 0 or rest.max() * (unit_ns or 1) >= SECOND_NS or np.abs(whole).max() >= 1e11:
-        return False
+    if not len(whole) or np.any(whole != np.rint(whole)) or rest.min() < 0 or np.abs(whole).max() >= 1e11:
+        return None
+    is_whole = not np.any(rest != np.rint(rest))
     if unit_ns is not None:
-        return True
-    return bool(rest.max() >= 1e6) and len(rest) > 2 and not is_index(rest) and _increases(whole + rest * 1e-9)
+        return unit_ns if is_whole and rest.max() * unit_ns < SECOND_NS else None
+    # As many ms or us as make a second at least, or the decimals.
+    largest = 1 if not is_whole else next((n for n in (10**3, 10**6, SECOND_NS) if rest.max() < n), 0)
+    is_long = (len(rest) > 2 and not is_index(rest)) or _is_since_1970(whole)
+    if not is_long or rest.max() >= largest or (largest < SECOND_NS and _increases(whole)):
+        return None
+    return SECOND_NS // largest if _increases(whole + rest / largest) else None
+
+
+def _is_since_1970(values: Floats) -> bool:
+    """Whether a column has the size of times since 1970 in seconds, which have ten digits, or in finer units."""
+    return bool(len(values)) and bool(np.all(values >= SECOND_NS))
 
 
 def unit_ns_of(name: str) -> int | None:
@@ -183,9 +204,10 @@ def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[
     if k + 1 in free and words[k + 1] and _rank(words[k + 1]) is None:
         parts[k + 1] = None
     whole = table.numbers(k)
-    for j, unit_ns in parts.items():
-        if is_fraction(whole, table.numbers(j), unit_ns):
-            return {k: SECOND_NS, j: unit_ns or 1}
+    for j, stated in parts.items():
+        unit_ns = unit_of_fraction(whole, table.numbers(j), stated)
+        if unit_ns is not None:
+            return {k: SECOND_NS, j: unit_ns}
     return {k: stated_ns}
 
 
@@ -197,10 +219,10 @@ def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
     for k in range(width):
         if np.isnan(numbers[k]).all() and k + 1 < width:
             continue
-        if out and not is_index(numbers[k - 1]):
+        if out and not is_index(numbers[k - 1], _is_since_1970(numbers[k])):
             break
-        is_pair = k + 1 < width and is_fraction(numbers[k], numbers[k + 1])
-        out.append({k: SECOND_NS, k + 1: 1} if is_pair else {k: None})
+        unit_ns = unit_of_fraction(numbers[k], numbers[k + 1]) if k + 1 < width else None
+        out.append({k: None} if unit_ns is None else {k: SECOND_NS, k + 1: unit_ns})
     return out
 
 

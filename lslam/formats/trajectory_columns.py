@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.text_tables import TextTable
-from lslam.formats.time_columns import is_fraction, is_index, tokens_of
+from lslam.formats.time_columns import SECOND_NS, is_index, tokens_of, unit_of_fraction
 from lslam.geometry import so3
 
 Floats = NDArray[np.float64]
@@ -155,9 +155,10 @@ def _leading_times(values: Floats) -> list[int]:
     if values.shape[1] < 4:
         return []
     a, b, c = values[np.isfinite(values[:, :3]).all(axis=1), :3].T
-    is_numbered = is_index(a)
+    is_numbered = is_index(a, bool(len(b)) and b.min() >= SECOND_NS)
     rises = len(b) > 1 and bool(np.all(np.diff(b) > 0))
-    may_be = [True, (is_numbered and rises) or is_fraction(a, b), is_numbered and is_fraction(b, c)]
+    pairs = [unit_of_fraction(whole, rest) is not None for whole, rest in ((a, b), (b, c))]
+    may_be = [True, (is_numbered and rises) or pairs[0], is_numbered and pairs[1]]
     return [n for n, is_time in enumerate(may_be, start=1) if is_time]
 
 

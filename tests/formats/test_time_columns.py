@@ -30,6 +30,9 @@ CLOCKS: dict[str, Clock] = {
     "t,timestamp": lambda k, t: f"{k},{t // 10**9}.{t % 10**9:09d}",
     "%time,field.header.stamp": lambda k, t: f"{t + 5_000_000},{t}",
     ",time": lambda k, t: f"{k},{np.datetime64(t, 'ns')}",
+    "frame,timestamp": lambda k, t: f"{10 * k},{t}",
+    "date,time": lambda k, t: f"{np.datetime64(t, 'ns')}".replace("T", ","),
+    "sec,fraction": lambda k, t: f"{t // 10**9},0.{t % 10**9:09d}",
 }
 
 
@@ -68,6 +71,10 @@ def test_stamps_files_have_the_time_of_the_table(names: str, more: str, tmp_path
         lambda k, t: f"{t // 10**9} {t % 10**9} scan_{k}.pcd",
         lambda k, t: f"{k} {t // 10**9}.{t % 10**9:09d}",
         lambda k, t: f"{k},{t}",
+        lambda k, t: f"{10 * k} {t}",
+        lambda k, t: f"{5 * k + 100},{t // 10**9},{t % 10**9}",
+        lambda k, t: f"{t // 10**9},0.{t % 10**9:09d}",
+        lambda k, t: f"{np.datetime64(t, 'ns')}".replace("T", ",").replace("-", "/"),
         lambda k, t: f"{k + k // 7} {t // 10**9}.{t % 10**9:09d}",
         lambda k, t: f"scan_{k}.pcd,{t}",
         lambda k, t: f"scan_{k}.pcd {t // 10**9} {t % 10**9}",
@@ -87,6 +94,24 @@ def test_one_hertz_is_no_index_and_a_second_column_of_something_else_no_fraction
     assert read_stamps(tmp_path / "stamps.txt").tolist() == [(1_700_000_000 + k) * 10**9 for k in range(9)]
     (tmp_path / "imu.csv").write_text(f"sec,nsec,{IMU}\n" + "".join(f"{k * 0.5},0,0,0,9.8,0,0,0\n" for k in range(9)))
     assert read_imu_csv(tmp_path / "imu.csv").stamps_ns.tolist() == [k * 500_000_000 for k in range(9)]
+
+
+@pytest.mark.parametrize("unit", [10**3, 10**6])
+def test_us_and_ms_without_names_beside_seconds_that_repeat(unit: int, tmp_path: Path) -> None:
+    path = tmp_path / "times.txt"
+    path.write_text("\n".join(f"{t // 10**9} {t % 10**9 // unit}" for t in STAMPS))
+    assert read_stamps(path).tolist() == [t // unit * unit for t in STAMPS]
+
+
+def test_whole_seconds_say_that_the_column_beside_them_is_not_read(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "times.txt"
+    path.write_text("\n".join(f"{1_700_000_000 + k} {450_000 + 7 * k % 5}" for k in range(9)))
+    assert read_stamps(path).tolist() == [(1_700_000_000 + k) * 10**9 for k in range(9)]
+    assert "column 2 beside them is not read" in caplog.text
+    path.write_text("\n".join(f"{1_700_000_000 + k} {450_000_000 + 7 * k % 5}" for k in range(2)))
+    assert read_stamps(path).tolist() == [1_700_000_000_450_000_000, 1_700_000_001_450_000_002]
 
 
 def test_a_row_without_its_fraction_is_named(tmp_path: Path) -> None:
