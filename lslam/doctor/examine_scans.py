@@ -161,8 +161,8 @@ def _ranges(scans: list[Facts]) -> Facts | None:
 
 
 def _limits(pairs: list[list[float] | None]) -> list[float] | None:
-    """Smallest and largest value over scans; None when any of them lacks the field."""
+    """Smallest and largest value over scans; None when half of them or more lack the field."""
     known = [p for p in pairs if p is not None]
-    if not known or len(known) < len(pairs):
+    if 2 * len(known) <= len(pairs):
         return None
     return [min(p[0] for p in known), max(p[1] for p in known)]

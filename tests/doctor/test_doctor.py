@@ -227,6 +227,17 @@ def test_point_times_fill_a_sweep_that_holds_the_stamp(healthy: Sequence, limits
     assert is_sound or "from the scan's stamp" in findings[0].way_out
 
 
+def test_a_scan_without_times_rings_and_intensity_does_not_speak_for_the_others(healthy: Sequence) -> None:
+    def scan(index: int) -> Scan:
+        read = healthy.scan(index)
+        return read if index else replace(read, times=None, rings=None, intensity=None, fault="no times")
+
+    whole, facts = (inspect(s, samples=4, is_quick=True) for s in (healthy, spoilt(healthy, scan=scan)))
+    assert [f["code"] for f in facts["findings"]] == [*(f["code"] for f in whole["findings"]), "scan-faults"]
+    assert facts["points"]["per_point_times"] == pytest.approx(whole["points"]["per_point_times"], abs=1e-3)
+    assert facts["points"]["rings"] == whole["points"]["rings"]
+
+
 def test_points_that_no_lidar_sees(healthy: Sequence) -> None:
     def scan(index: int) -> Scan:
         found = healthy.scan(index)

@@ -148,6 +148,17 @@ def test_nothing_is_registered_where_times_are_there_or_are_not_wanted(monkeypat
     assert with_point_times(quick, PREPROCESS, is_stated_only=True) is quick  # type: ignore[arg-type, comparison-overlap]
 
 
+@pytest.mark.parametrize("kind", [None, "field"])
+def test_a_first_message_without_times_does_not_speak_for_the_field_of_the_others(
+    kind: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("lslam.frontend.point_times.choose_clock", None)
+    sequence = SequenceView(drive(), stated_times=StatedTimes(kind))
+    read = sequence.scan
+    monkeypatch.setattr(sequence, "scan", lambda k: read(k) if k else replace(read(0), times=None))
+    assert with_point_times(sequence, PREPROCESS) is sequence
+
+
 @pytest.mark.parametrize("kind", ["order", "azimuth"])
 def test_a_stated_clock_is_taken_without_evidence(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lslam.frontend.point_times.choose_clock", None)
