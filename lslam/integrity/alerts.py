@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import se3
 from lslam.integrity.pair_registration import is_within
 from lslam.types.motion_check import SAME_M, SAME_RAD, USUAL, MotionCheck
 
@@ -39,9 +40,8 @@ class Alert:
 
 def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
-    found = [
-        *_unconfirmed(checks), *_jumps(positions, stamps_ns), *_inconsistent(checks), *_ambiguous(checks), *_foreign(checks),
-    ]  # fmt: skip
+    told = [rule(checks) for rule in (_unconfirmed, _inconsistent, _ambiguous, _open, _foreign)]
+    found = [alert for alerts_of_rule in (*told, _jumps(positions, stamps_ns)) for alert in alerts_of_rule]
     return sorted(found, key=lambda alert: (alert.first, alert.last))
 
 
@@ -123,6 +123,40 @@ def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:
         )
         for begin, end in _runs(np.array(is_open, np.float64))
         if end - begin >= OPEN_IN_A_ROW
+    ]
+
+
+def _open(checks: list[MotionCheck]) -> list[Alert]:
+    """Where the poses begin to move along a direction that the scans leave open; checks one after the other make one alert."""
+    spans: list[tuple[int, int, float, str]] = []
+    told: MotionCheck | None = None
+    for check in checks:
+        if not check.is_open:
+            told = check
+            continue
+        if told is None or min(told.seconds, check.seconds) <= 0:
+            continue
+        longer = check.seconds / told.seconds
+        more = (check.claimed - se3.exp(longer * se3.log(told.claimed)))[:3, 3]
+        axis = int(np.argmax(np.abs(more)))
+        # What a shorter pair does not tell grows with the time.
+        if abs(more[axis]) <= LARGE[axis] * max(longer, 1.0):
+            continue
+        if spans and spans[-1][1] == check.first:
+            spans[-1] = (
+                spans[-1][0],
+                check.last,
+                *max(spans[-1][2:], (more[axis], AXES[axis]), key=lambda m: abs(m[0])),
+            )
+        else:
+            spans.append((check.first, check.last, more[axis], AXES[axis]))
+    return [
+        Alert(
+            first + 1,
+            last,
+            f"the scans leave open whether the sensor began to move by {off:+.2f} m {axis}, as its poses do",
+        )
+        for first, last, off, axis in spans
     ]
 
 

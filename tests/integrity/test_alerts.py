@@ -88,6 +88,27 @@ def test_standing_that_explains_as_much_as_moving_raises_an_alert_when_it_does_s
     assert spans([*checks[:3], *(replace(check, rival=still) for check in checks[3:5]), *checks[5:]]) == [(16, 25)]
 
 
+def test_poses_that_begin_to_move_where_the_scans_leave_it_open_raise_an_alert() -> None:
+    across = np.array([0.01, 1.0, 0.01, *SURE[3:]])
+    checks = checks_of([0.0] * 8)
+    on, sideways = shifted(1.0), shifted(1.0)
+    sideways[1, 3] = -1.2
+
+    def along(*claimed: Floats) -> list[MotionCheck]:
+        parts = [replace(c, claimed=T, found=T, sigma=across) for c, T in zip(checks[3:], claimed, strict=False)]
+        return [*checks[:3], *parts, *checks[3 + len(parts) :]]
+
+    assert spans(along(on, on, on)) == []
+    assert spans(along(on, sideways, sideways)) == [(21, 30)]
+    (alert,) = alerts(along(sideways), np.zeros((41, 3)), 100_000_000 * np.arange(41, dtype=np.int64))
+    assert alert.why == "the scans leave open whether the sensor began to move by -1.20 m to the left, as its poses do"
+    # The same said by scans that tell it raises none; nor does what a pair of a fifth of the time would not tell.
+    told = along(sideways, sideways)
+    assert spans([*told[:3], *(replace(c, sigma=SURE) for c in told[3:5]), *told[5:]]) == []
+    brief = replace(checks[2], seconds=0.1, claimed=shifted(0.2), found=shifted(0.2))
+    assert spans([*checks[:2], brief, *told[3:5], *checks[5:]]) == []
+
+
 def test_directions_that_empty_while_the_poses_stand_raise_an_alert() -> None:
     checks = checks_of([0.0] * 8)
     assert spans([replace(check, emptied=0.1) for check in checks]) == []
