@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.errors import InputError
+from lslam.integrity.directions import MOST_EMPTIED, emptied, filled_directions
 from lslam.preprocessing.rings import RingRule
 from lslam.preprocessing.views import with_rings
 from lslam.types.scan import FARTHEST_M, NO_RING, Scan
@@ -74,6 +75,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
             f"{FARTHEST_M / 1e3:g} km, where no LiDAR sees"
         )
         findings.append(Finding("points-far", what, "a run leaves them out; check the type and unit of x, y, z"))
+    _examine_frame([s["directions"] for s in full if s["valid"]], findings)
     total = sum(s["count"] for s in full)
     measured = [s for s in full if s["valid"]]
     return {
@@ -89,6 +91,19 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
         "per_point_times": _limits([s["times"] for s in full]),
         "rings": _limits([s["rings"] for s in full]),
     }
+
+
+def _examine_frame(directions: list[NDArray[np.int64]], findings: list[Finding]) -> None:
+    """Whether the scans are seen from their sensor, which sees something below it, or above, wherever it goes."""
+    shares = [emptied(directions[0], later) for later in directions[1:]]
+    if len(shares) > 1 and np.median(shares) > MOST_EMPTIED:
+        findings.append(
+            Finding(
+                "points-frame",
+                f"{100 * np.median(shares):.0f} % of the directions that hold points in the first scan hold none in others",
+                "the clouds seem to be in the frame of a world, where a run finds no motion: give them in the sensor's",
+            )
+        )
 
 
 def examine_times(sequence: Sequence, points: Facts, findings: list[Finding]) -> None:
@@ -139,6 +154,7 @@ def _scan_facts(scan: Scan) -> Facts:
     facts: Facts = {"count": len(scan), "valid": len(good), "nan": int((~finite).sum()), "zero": int(zero.sum())}
     facts |= {"far": int(far.sum()), "index": scan.index, "fault": scan.fault}
     if len(good):
+        facts["directions"] = filled_directions(good.astype(np.float32))
         facts["ranges"] = [float(v) for v in np.percentile(ranges, [0, 5, 50, 95, 100])]
         # One per cent on either side: single points close by have wild elevations.
         facts["low"], facts["high"] = (float(v) for v in np.percentile(elevation, [1, 99]))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.integrity.directions import MOST_EMPTIED
 from lslam.integrity.pair_registration import is_within
 from lslam.types.motion_check import SAME_M, SAME_RAD, USUAL, MotionCheck
 
@@ -24,8 +25,6 @@ SIGMAS_IN_A_ROW, SIGMAS_ALONE, MORE = 3.0, 6.0, 1.15
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
 # Checks in a row between standing and moving: one is chance.
 OPEN_IN_A_ROW = 2
-# Share of the directions that empty, far from the few per cent of dropouts and from the nine tenths of a cloud that leaves.
-EMPTIED = 0.25
 AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
 
 
@@ -173,7 +172,7 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
             f"the poses stand, yet {100 * max(check.emptied for check in checks[begin:end]):.0f} % of the directions in which "
             "there were points are empty: the clouds are not in the frame of the sensor, perhaps in that of a world",
         )
-        for begin, end in _runs(np.array([check.emptied > EMPTIED for check in checks], np.float64))
+        for begin, end in _runs(np.array([check.emptied > MOST_EMPTIED for check in checks], np.float64))
         if end - begin >= IN_A_ROW
     ]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lslam.doctor.examine_gnss import examine_gnss
 from lslam.doctor.examine_imu import examine_imu
-from lslam.doctor.examine_scans import examine_stamps, examine_times
+from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times
 from lslam.doctor.examine_turns import compare, examine_turns
 from lslam.doctor.findings import Facts, Finding
 from lslam.doctor.inspect import inspect
@@ -246,6 +246,20 @@ def test_points_that_no_lidar_sees(healthy: Sequence) -> None:
     facts = inspect(spoilt(healthy, scan=scan), samples=4, is_quick=True)
     assert [f["code"] for f in facts["findings"]] == ["points-far"]
     assert "points of 2 of the 4 scans looked at lie beyond 10 km" in facts["problems"][0]
+
+
+def test_clouds_in_the_frame_of_a_world(healthy: Sequence) -> None:
+    assert healthy.ground_truth is not None
+    poses, read = healthy.ground_truth.poses, healthy.scan
+
+    def moved(i: int) -> Scan:
+        scan = read(i)
+        return replace(scan, points=(scan.points @ poses[i, :3, :3].T + poses[i, :3, 3]).astype(np.float32))
+
+    for scan, expected in ((read, []), (moved, ["points-frame"])):
+        findings: list[Finding] = []
+        examine_points(spoilt(healthy, scan=scan), np.arange(0, 80, 8), findings)
+        assert codes(findings) == expected
 
 
 def test_satellite_fixes(healthy: Sequence) -> None:
