@@ -65,6 +65,10 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
     if not period or _in_parts(h):
         return headers
     if not _SLOWEST <= speed <= _FASTEST:
+        # A clock that stands still for a part of the drive seems slow.
+        moves = np.diff(h, prepend=h[0] - 1) != 0
+        period, speed = _period_and_speed(h[moves], w[moves])
+    if not _SLOWEST <= speed <= _FASTEST:
         voice.notes.append(
             f"{what}: {witness.name} run {speed:.3g} times as fast as the stamps of the headers, as of a recording that was "
             "played back or written anew: the headers count"

@@ -47,6 +47,7 @@ FAULTS: dict[str, tuple[Callable[[], Stamps], str]] = {
     "is wrong once": (lambda: TRUE - S37 * (K == 12), "step by -36.900 s at message 12 and at 1 more,"),
     "has no stamps at first": (lambda: TRUE * (K >= 5), "stand still at message 1 and at 4 more,"),
     "stands still for a while": (lambda: np.where((K > 9) & (K < 16), TRUE[9], TRUE), "at message 10 and at 6 more,"),
+    "stands still from the middle on": (lambda: TRUE[np.minimum(K, 14)], "stand still at message 15 and at 14 more,"),
     "two clocks in turns": (lambda: np.where(K % 2, 12 * SECOND + K * STEP_NS, TRUE), "at message 1 and at 28 more,"),
     "two clocks in turns that interleave": (lambda: TRUE + 33 * 10**7 * (K % 2), "at message 1 and at 28 more,"),
     "two clocks in turns by chance": (
