@@ -54,17 +54,25 @@ def stamps_in_names(files: list[Path]) -> NameStamps | None:
 
 
 def _dates(stems: list[str]) -> Iterator[tuple[list[int], str]]:
-    stamps = []
+    begins, fractions, counts = [], [], []
     for stem in stems:
         match = _DATE.search(stem)
         if match is None:
             return
-        year, _, month, day, hour, _, minute, second, fraction, zone = match.groups()
+        year, _, month, day, hour, separator, minute, second, fraction, zone = match.groups()
         try:
             begin = datetime.fromisoformat(f"{year}-{month}-{day}T{hour}:{minute}:{second}{zone or 'Z'}")
         except ValueError:
             return
-        stamps.append(int(begin.timestamp()) * 10**9 + int((fraction or "").ljust(9, "0")))
+        begins.append(int(begin.timestamp()) * 10**9)
+        fractions.append(fraction or "")
+        counts.append("".join((hour, separator, minute, second)))
+    # A number behind the day, or behind the second, that counts the files is none of the time.
+    if all(count.isdigit() and count.startswith("0000") for count in counts) and _counts(counts):
+        return
+    if all(fractions) and _counts(fractions):
+        fractions = [""] * len(fractions)
+    stamps = [begin + int(fraction.ljust(9, "0")) for begin, fraction in zip(begins, fractions, strict=True)]
     if min(stamps) >= _EARLIEST_NS and max(stamps) <= _LATEST_NS:
         yield stamps, "dates, UTC where they state no other zone"
 
@@ -76,7 +84,8 @@ def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[i
         if separator not in tuple("._-,") or max(lengths) > 9 or max(map(len, whole)) > 10 or _counts(rest):
             continue
         decimals = [int(a) * 10**9 + int(b.ljust(9, "0")) for a, b in zip(whole, rest, strict=True)]
-        units = [int(a) * 10**9 + int(b) for a, b in zip(whole, rest, strict=True)]
+        unit = min((n for n in _UNITS if n != "seconds"), key=lambda n: _unevenness(_in_unit(whole, rest, _UNITS[n])))
+        units = _in_unit(whole, rest, _UNITS[unit])
         a, b = _unevenness(decimals), _unevenness(units)
         is_decimal = a < b if min(a, b) < _CLEARLY * max(a, b) else max(lengths) < 9
         if len(lengths) == 1:
@@ -84,13 +93,17 @@ def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[i
         elif is_decimal or any(text[0] == "0" and text != "0" for text in rest):
             stamps, words = decimals, "decimal seconds"
         else:
-            stamps, words = units, "seconds and nanoseconds without leading zeros"
+            stamps, words = units, f"seconds and {unit} without leading zeros"
         if _is_time(whole, 10**9):
             yield stamps, words
         elif len(groups) == 2 and (
             lengths == {9} or (separator == "." and len(set(rest)) > 1 and min(a, b) < _CLEARLY and _is_rate(stamps))
         ):
             yield stamps, f"{words} of a clock that began elsewhere"
+
+
+def _in_unit(whole: list[str], rest: list[str], unit_ns: int) -> list[int]:
+    return [int(a) * 10**9 + int(b) * unit_ns for a, b in zip(whole, rest, strict=True)]
 
 
 def _numbers(groups: list[list[str]]) -> list[tuple[list[int], str]]:

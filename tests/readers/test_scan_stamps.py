@@ -36,6 +36,9 @@ NAMES = {
     "sec_nanosec unpadded with a prefix": (
         lambda ns: f"cloud_{ns // 10**9}_{ns % 10**9}", 1, "seconds and nanoseconds without leading zeros"
     ),
+    "seconds and microseconds unpadded": (
+        lambda ns: f"{ns // 10**9}_{ns % 10**9 // 1000}", 1_000, "seconds and microseconds without leading zeros"
+    ),
     "decimals without zeros at the end": (
         lambda ns: f"{ns // 10**9}.{ns % 10**9 // 1000:06d}".rstrip("0"), 1_000, "decimal seconds"
     ),
@@ -82,6 +85,8 @@ def test_the_number_of_a_scan_is_no_stamp() -> None:
         [f"{k * 100:010d}" for k in range(20)],
         [f"1670403902_{k:06d}" for k in range(20)],
         [f"map_{k}.{k}" for k in range(20)],
+        [f"20231114_{k:06d}" for k in range(20)],
+        [f"2023-11-14-221320_{k:06d}" for k in range(20)],
         [f"tile_{k // 4}.{k % 4}" for k in range(20)],
         [f"scan_{k}.2022" for k in range(20)],
     ):
