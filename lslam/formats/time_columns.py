@@ -70,10 +70,11 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     if chosen is None:
         return None
     others = {k for candidate in candidates for k in candidate if k not in chosen}
+    # The index of pandas has no name.
+    named = [table.names[k] for k in sorted(others) if table.names and table.names[k]]
     note = ""
-    if table.names and others:
-        note = f"the time is {' and '.join(table.names[k] for k in chosen)}; "
-        note += f"left out: {', '.join(table.names[k] for k in sorted(others))}"
+    if named:
+        note = f"the time is {' and '.join(table.names[k] for k in chosen)}; left out: {', '.join(named)}"
     return RowTimes(_stamps(table, chosen, default_ns), note, others.union(chosen))
 
 

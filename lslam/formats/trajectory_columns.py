@@ -132,9 +132,8 @@ def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
             f"position; commas: EuRoC or named columns); {_WAY_OUT} in a first line, or --format forces a format",
         )
     n = fits[0] if fits else 1
-    order = scalar
-    if table.separator is not None or not scalar:
-        order = _scalar_by_motion(values[:, n : n + 3], values[:, n + 3 : n + 7]) or scalar
+    by_motion = _scalar_by_motion(values[:, n : n + 3], values[:, n + 3 : n + 7])
+    order = (by_motion or scalar) if table.separator is not None or not scalar else scalar
     if not order:
         raise table.error(
             0,
@@ -144,6 +143,11 @@ def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
     if scalar and order != scalar:
         notes.append(
             f"quaternions are read with w {order}, which fits the motion; --format euroc or tum decides otherwise"
+        )
+    elif by_motion not in ("", order):
+        notes.append(
+            f"quaternions are read with w {order}, the order of TUM, though w {by_motion} fits the motion better: --format "
+            "euroc, or names of the columns, decide otherwise"
         )
     if width > n + 7:
         notes.append(f"{width} columns, of which those from column {n + 8} on are left out")

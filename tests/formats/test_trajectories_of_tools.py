@@ -146,6 +146,14 @@ def test_what_was_chosen_is_said(kind: str, note: str, tmp_path: Path) -> None:
     assert note in "; ".join(read_trajectory(tmp_path / "gt.csv").notes)
 
 
+def test_an_order_of_quaternions_that_the_motion_denies_is_said(tmp_path: Path) -> None:
+    (tmp_path / "gt.tum").write_text(lines(lambda i: [seconds(i), *pose(i, "wxyz")]))
+    trajectory = read_trajectory(tmp_path / "gt.tum")
+    assert "w first fits the motion better: --format euroc" in "; ".join(trajectory.notes)
+    (tmp_path / "gt.tum").write_text(FILES["pandas"])
+    assert not read_trajectory(tmp_path / "gt.tum").notes
+
+
 @pytest.mark.parametrize("step_ns", [1_000_000_000, 200_000_000, 2_500_000])
 def test_any_rate_in_two_columns(step_ns: int, tmp_path: Path) -> None:
     """At 1 Hz the seconds alone increase too: 0.45 s off without the other column."""
