@@ -92,11 +92,11 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
     ]
     drive = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
     if drive is None:
-        looked = ", ".join(str(f / "oxts") for f in folders if f.parent.parent.name == "raw")
+        named = ", ".join(map(str, dict.fromkeys([*roots, Path.cwd()])))
         raise InputError(
-            f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and the raw drive in "
-            f"{looked}, and there without raw/ and {date}/; fetch {date}_drive_{number:04d}_sync or _extract, or run "
-            f"without {kind.wish}"
+            f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and for the raw drive "
+            f"raw/{date}/{date}_drive_{number:04d}_sync or _extract, with or without raw/ and {date}/, in {named}, that folder "
+            f"and the {_UPWARDS} above it; fetch the drive, or run without {kind.wish}"
         )
     beside = [folder / CALIBRATION for folder in (drive.parent, drive, drive.parent / date, drive.parent.parent)]
     calibration = next((path for path in beside if path.is_file()), None)
