@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from lslam.errors import InputError, UsageError, cause, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.stamp_texts import seconds_to_ns
+from lslam.formats.text_tables import separator_of, split_cells
 from lslam.geometry.crs_names import parse_crs
 from lslam.types.manual import ControlPoint, ControlResidual, Instant, NamedPair
 from lslam.untrusted import whole_number
@@ -151,7 +151,7 @@ def _seen(row: _Row) -> NDArray[np.float64]:
 def _is_comment(line: str, names: set[str]) -> bool:
     """Whether a line begins with # and is no header that does."""
     text = line.strip()
-    return text.startswith("#") and not names & {word.strip().lower() for word in re.split("[;,]", text.lstrip("#"))}
+    return text.startswith("#") and not names & {word.strip().lower() for word in re.split("[;,\\s]", text.lstrip("#"))}
 
 
 def _rows(path: Path, needed: Sequence[tuple[str, ...]]) -> Iterator[_Row]:
@@ -164,11 +164,8 @@ def _rows(path: Path, needed: Sequence[tuple[str, ...]]) -> Iterator[_Row]:
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not _is_comment(line, names)]
     if not numbered:
         raise InputError(f"{path} is empty")
-    separator = ";" if ";" in numbered[0][1] else ","
-    try:
-        table = [next(csv.reader([line], delimiter=separator, strict=True)) for _, line in numbered]
-    except csv.Error as error:
-        raise InputError(f"{path} is no CSV: {error}") from None
+    separator = separator_of(numbered[0][1])
+    table = [split_cells(line.strip(), separator) for _, line in numbered]
     header = [name.strip().lstrip("#").strip().lower() for name in table[0]]
     missing = [names for names in needed if not any(name in header for name in names)]
     if missing:
@@ -180,4 +177,4 @@ def _rows(path: Path, needed: Sequence[tuple[str, ...]]) -> Iterator[_Row]:
     for (number, _), cells in zip(numbered[1:], table[1:], strict=True):
         if len(cells) > len(header):
             raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")
-        yield _Row(path, number, dict(zip(header, (cell.strip() for cell in cells), strict=False)))
+        yield _Row(path, number, dict(zip(header, cells, strict=False)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -139,13 +141,23 @@ def split_cells(text: str, separator: str | None) -> list[str]:
 
     >>> split_cells("1700000000,5; 2", ";"), split_cells("2011-09-26 13:04:32.5 7", None)
     (['1700000000.5', '2'], ['2011-09-26T13:04:32.5', '7'])
+    >>> split_cells('1, "base, left", 2', ",")
+    ['1', 'base, left', '2']
     """
     if separator is None:
         text = _DATE_AND_TIME.sub(r"\1T\2", text, count=1)
-    cells = [cell.strip().strip("\"'") for cell in text.split(separator)]
+    cells = [cell.strip().strip("\"'") for cell in _split(text, separator)]
     if separator != ",":
         cells = [cell.replace(",", ".") if _DECIMAL_COMMA.fullmatch(cell) else cell for cell in cells]
     return cells
+
+
+def _split(text: str, separator: str | None) -> list[str]:
+    """Parts between separators; one within quotes is a part of its cell."""
+    if separator is not None and '"' in text:
+        with suppress(csv.Error):
+            return next(csv.reader([text], delimiter=separator, skipinitialspace=True))
+    return text.split(separator)
 
 
 def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:

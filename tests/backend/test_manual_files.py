@@ -53,6 +53,14 @@ def test_a_german_table_of_control_points(tmp_path: Path) -> None:
     np.testing.assert_array_equal(point.seen, [1.0, 2.0, -1.5])
 
 
+@pytest.mark.parametrize("separator", [";", "\t", " "])
+def test_decimal_commas_of_control_points(separator: str, tmp_path: Path) -> None:
+    rows = ("scan x y z sigma crs", f"12 457799,014 5428861,26 115,006 0,01 {CRS}")
+    (point,) = read_control_points(written(tmp_path, "\n".join(row.replace(" ", separator) for row in rows)))
+    np.testing.assert_array_equal(point.position, [457799.014, 5428861.26, 115.006])
+    np.testing.assert_array_equal(point.sigma, [0.01, 0.01, 0.01])
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
