@@ -74,21 +74,16 @@ class RegistrationConfig(Section):
     coarse_decay: float = Field(0.85, gt=0, lt=1, description="factor of the width per coarse step")
     recover_m: float = Field(0.3, gt=0, description="m; a correction beyond this is checked coarse to fine")
     recover_deg: float = Field(3.0, gt=0, description="deg; likewise for rotation")
-    min_inliers: float = Field(
-        0.3, ge=0, le=1, description="share of matched points within the kernel below which a scan fails"
-    )
     min_overlap: float = Field(
-        0.2, ge=0, le=1, description="share of points that found a voxel below which a scan fails"
-    )
-    start_overlap: float = Field(
-        0.05, ge=0, le=1, description="likewise while the map stands on the first scans alone and has few planes"
+        0.05, ge=0, le=1, description="share of points that found a voxel below which a scan fails"
     )
     min_agreement: float = Field(
         0.5,
         ge=0,
         lt=1,
         description="a scan fails when the share of its points on the map's surfaces drops below this part of what it "
-        "was lately, as when the sensor was carried elsewhere; 0 switches it off",
+        "was lately, at the start of what the first scan has on its own surfaces, as when the sensor was carried elsewhere; "
+        "0 switches it off",
     )
     max_jump_m: float = Field(6.0, gt=0, description="m; a correction of the motion prior beyond this fails")
     max_jump_deg: float = Field(45.0, gt=0, description="deg; likewise for rotation")

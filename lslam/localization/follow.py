@@ -15,7 +15,7 @@ from lslam.graph.drift import drift_covariance
 from lslam.graph.odometry_constraints import growth
 from lslam.localization.prior_map import LocalView
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.registration.acceptance import Acceptance, correction
+from lslam.registration.acceptance import MAP_MIN_INLIERS, MAP_MIN_OVERLAP, Acceptance, correction
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import NEAR_KERNEL
 from lslam.registration.robust import UsualAgreement
@@ -115,9 +115,8 @@ class MapFollower(Stateful):
 
     def _judge(self, found: RegistrationResult) -> tuple[FixStatus, str]:
         """What the map says of a scan, and why not more."""
-        c = self.config.registration
         limits = Acceptance(
-            c.min_overlap, c.min_inliers, needs_covariance=True, usual=self.usual, is_usual_of_matches=True
+            MAP_MIN_OVERLAP, MAP_MIN_INLIERS, needs_covariance=True, usual=self.usual, is_usual_of_matches=True
         )
         rejection = limits.rejection(found)
         if rejection is not None:

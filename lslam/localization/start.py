@@ -17,7 +17,7 @@ from lslam.localization.place_search import APART, PlaceSearch, Region
 from lslam.loops.level import find_up, level_rotation
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
 from lslam.preprocessing.prepare import PreparedPoints, thin
-from lslam.registration.acceptance import Acceptance
+from lslam.registration.acceptance import MAP_MIN_INLIERS, Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
@@ -124,7 +124,7 @@ class PlaceFinder:
         found = self._solve(
             query.source, rough, Annealing(r.kernel_max, r.kernel_min, r.kernel_decay, c.max_iterations)
         )
-        limits = Acceptance(c.min_overlap, r.min_inliers, needs_covariance=True, needs_all_directions=True)
+        limits = Acceptance(c.min_overlap, MAP_MIN_INLIERS, needs_covariance=True, needs_all_directions=True)
         rejection = limits.rejection(found)
         if rejection is not None:
             self.reasons.append(rejection.reason)

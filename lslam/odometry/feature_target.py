@@ -98,10 +98,8 @@ class FeatureTarget(Target):
         return points
 
     def limits(self, history: History) -> Acceptance:
-        """Those configured; less overlap is needed at the start."""
-        c = self.config
-        least = c.start_overlap if history.starting else c.min_overlap
-        return Acceptance.of(c, history.agreement, least, self.source)
+        """Those of odometry."""
+        return Acceptance.of(self.config, history, self.source)
 
     def noise(self, history: History) -> FeatureNoise:
         """With the recent variance of the motion prior as threshold of degeneracy.

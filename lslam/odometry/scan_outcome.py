@@ -39,7 +39,7 @@ def judged(
 
     found : pose, points that were offered, and inliers, those with a partner within reach
     """
-    limits = Acceptance(min_overlap=c.start_overlap, max_jump_m=c.max_jump_m, max_jump_deg=c.max_jump_deg)
+    limits = Acceptance(min_overlap=c.min_overlap, max_jump_m=c.max_jump_m, max_jump_deg=c.max_jump_deg)
     count = found.source_points
     if count < MIN_SOURCE_POINTS:
         result = failed(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")

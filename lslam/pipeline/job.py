@@ -21,6 +21,7 @@ from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.frontend.inertial_start import with_imu_settings
 from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import sweep_of
+from lslam.frontend.scene_scale import with_scene_scale
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
@@ -81,6 +82,7 @@ def prepare(
     sequence = with_streams(sequence, config.imu.use, config.gnss.mode != "off")
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if truth is None else truth
+    config = with_scene_scale(config, sequence)
     odometry = create_odometry(with_imu_settings(config))
     given: Trajectory | None = None
     if isinstance(odometry, GivenPoses):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
+from lslam.registration.history import History
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 
@@ -18,6 +19,10 @@ Test = Literal["solution", "directions", "rmse", "overlap", "inliers", "agreemen
 
 # Of a pose from the motion prior alone: sigmas of half a metre and two degrees.
 PRIOR_COVARIANCE = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+
+# On a map of another day no earlier scan tells how many points can agree: the shares of a scan that the map has, and that agree.
+MAP_MIN_OVERLAP = 0.2
+MAP_MIN_INLIERS = 0.3
 
 
 @dataclass(frozen=True)
@@ -53,11 +58,11 @@ class Acceptance:
     target: str = "map"
 
     @classmethod
-    def of(cls, config: RegistrationConfig, usual: UsualAgreement, min_overlap: float, source: str) -> Acceptance:
+    def of(cls, config: RegistrationConfig, history: History, source: str) -> Acceptance:
         """The limits of odometry."""
         return cls(
-            min_overlap, config.min_inliers, max_jump_m=config.max_jump_m, max_jump_deg=config.max_jump_deg,
-            usual=usual, source=source,
+            config.min_overlap, history.matches.least, max_jump_m=config.max_jump_m, max_jump_deg=config.max_jump_deg,
+            usual=history.agreement, source=source,
         )  # fmt: skip
 
     def rejection(self, result: RegistrationResult, jump: tuple[float, float] = (0.0, 0.0)) -> Rejection | None:

@@ -98,7 +98,7 @@ class MapAlignment:
         c, coarser = self.config, self.map.coarser
         once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
         for k, level in enumerate(coarser):
-            if self.on_planes(level, points, T_prior, once).overlap >= c.start_overlap:
+            if self.on_planes(level, points, T_prior, once).overlap >= c.min_overlap:
                 return coarser[k:]
         return coarser[-1:]
 

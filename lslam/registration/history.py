@@ -18,17 +18,18 @@ Floats = NDArray[np.float64]
 class History(Stateful):
     """Adapts to registrations, scan after scan.
 
-    threshold : kernel width by the recent errors of the motion prior; agreement : recent inlier share
+    threshold : kernel width by the recent errors of the motion prior
+    agreement, matches : recent inlier shares, of all source points and of those with a match
     starting : initialisation scans that remain; inserted : scans in the map
     recent : points (N, 3), LiDAR frame, and pose (4, 4) of the last scans in the map
     """
 
-    STATE = ("threshold", "agreement", "starting", "inserted", "recent")
+    STATE = ("threshold", "agreement", "matches", "starting", "inserted", "recent")
 
     def __init__(self, config: RegistrationConfig) -> None:
         self.start_scans = config.start_scans
         self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
-        self.agreement = UsualAgreement(config.min_agreement)
+        self.agreement, self.matches = (UsualAgreement(config.min_agreement) for _ in range(2))
         self.starting, self.inserted = config.start_scans, 0
         self.recent: tuple[tuple[NDArray[Any], Floats], ...] = ()
 
@@ -54,5 +55,6 @@ class History(Stateful):
             own = result if result.replaced is None else result.replaced
             if own.ok:
                 self.agreement.observe(own.agreement)
+                self.matches.observe(own.inlier_share)
             move, turn = result.prior_error
             self.threshold.observe(move + turn * result.lever_arm)

@@ -72,9 +72,14 @@ class UsualAgreement(Stateful):
         """Whether `share` is so far below the usual one that the scan may lie in the wrong place."""
         return share < self.LESS * self.usual
 
+    @property
+    def least(self) -> float:
+        """`drop` times the usual share: what is below has collapsed."""
+        return self.drop * self.usual
+
     def is_collapse(self, share: float) -> bool:
         """Whether `share` is below `drop` times the usual one."""
-        return share < self.drop * self.usual
+        return share < self.least
 
     def observe(self, share: float) -> None:
         """Learn from a good scan: at once what is more than usual, by and by what is less.

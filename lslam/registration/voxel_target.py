@@ -87,15 +87,8 @@ class VoxelTarget(MapAlignment, Target):
         return replace(points, covariance=covariance)
 
     def limits(self, history: History) -> Acceptance:
-        """Those configured; less overlap is needed while the map is made of few scans.
-
-        One scan of a sparse sensor makes few planes: what matches them may be right and yet a small share. On keyframes far
-        apart a sparse sensor matches few of its points: only a drop of the inlier share is informative.
-        """
-        c = self.config
-        is_filled = not history.is_young and c.target != "scan"
-        limits = Acceptance.of(c, history.agreement, c.min_overlap if is_filled else c.start_overlap, self.source)
-        return replace(limits, min_inliers=0.0) if c.target == "submap" else limits
+        """Those of odometry."""
+        return Acceptance.of(self.config, history, self.source)
 
     def align(
         self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None

@@ -8,10 +8,10 @@ import pytest
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.registration.acceptance import PRIOR_COVARIANCE, Acceptance, correction
-from lslam.registration.robust import UsualAgreement
+from lslam.registration.history import History
 from lslam.registration.solver import RegistrationResult
 
-CONFIG = RegistrationConfig(min_inliers=0.3, min_agreement=0.5, max_jump_m=5.0, max_jump_deg=30.0)
+CONFIG = RegistrationConfig(min_overlap=0.6, min_agreement=0.5, max_jump_m=5.0, max_jump_deg=30.0)
 PRIOR = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
 
 
@@ -19,14 +19,24 @@ def judged(
     source: str = "points", metres: float = 0.1, degrees: float = 1.0, matched: int = 90, inliers: int = 80,
     reason: str = "",
 ) -> RegistrationResult:  # fmt: skip
-    """Of 100 points, so far from the prior; lately 80 % agreed, and 60 % have to find a match."""
+    """Of 100 points, so far from the prior; lately 80 % of all and 60 % of the matches agreed, and 60 % have to find one."""
     step = se3.make(so3.exp(np.array([0, 0, np.deg2rad(degrees)])), np.array([metres, 0, 0]))
     result = RegistrationResult(
         PRIOR @ step, reason=reason, iterations=7, source_points=100, matched=matched, inliers=inliers
     )
-    usual = UsualAgreement(CONFIG.min_agreement)
-    usual.observe(0.8)
-    return Acceptance.of(CONFIG, usual, 0.6, source).accepted(result, PRIOR)
+    history = History(CONFIG)
+    history.agreement.observe(0.8)
+    history.matches.observe(0.6)
+    return Acceptance.of(CONFIG, history, source).accepted(result, PRIOR)
+
+
+def test_the_share_of_matches_that_agree_is_judged_by_the_share_of_earlier_scans() -> None:
+    """16 % is right in a small room, where the first scan has no more on its own planes, and wrong in a street."""
+    result = RegistrationResult(PRIOR, source_points=100, matched=100, inliers=16)
+    for usual, is_accepted in ((0.2, True), (0.7, False)):
+        history = History(RegistrationConfig())
+        history.matches.observe(usual)
+        assert Acceptance.of(RegistrationConfig(), history, "points").accepted(result, PRIOR).ok == is_accepted
 
 
 def test_an_accepted_result_has_its_correction_of_the_prior() -> None:

@@ -1,0 +1,53 @@
+"""Lengths that follow the scene: by the median range of a few scans, unless they are set."""
+
+from __future__ import annotations
+
+import numpy as np
+from stub_sequences import Stub
+
+from lslam.config import Config
+from lslam.frontend.scene_scale import median_range, with_scene_scale
+from lslam.types.scan import Scan
+
+
+def ball(range_m: float, index: int = 0) -> Scan:
+    """Points in all directions, half of them within this range, and some that measured nothing."""
+    rng = np.random.default_rng(index)
+    directions = rng.normal(size=(999, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    points = directions * np.linspace(0.5, 1.5, 999)[:, None] * range_m
+    return Scan(
+        np.concatenate([points, np.zeros((50, 3)), np.full((50, 3), np.nan)]).astype(np.float32), index * 10**8, index
+    )
+
+
+def test_lengths_are_in_proportion_to_the_range_of_half_of_the_points() -> None:
+    room = Stub([ball(2.0, i) for i in range(3)])
+    config = with_scene_scale(Config(), room)
+    assert (config.registration.voxel_size, config.preprocess.map_leaf, config.preprocess.range_min) == (
+        0.2,
+        0.075,
+        0.25,
+    )
+    assert (config.loam.feature_map_voxel, config.registration.sigma) == (0.25, Config().registration.sigma)
+    assert room.notes[-1] == "half of the points lie within 2.0 m: the voxels of the local map are 0.2 m wide"
+
+
+def test_lengths_that_are_set_are_kept() -> None:
+    given = Config.model_validate({"registration": {"voxel_size": 0.8}, "preprocess": {"map_leaf": 0.1}})
+    config = with_scene_scale(given, Stub([ball(2.0)]))
+    assert (config.registration.voxel_size, config.preprocess.map_leaf, config.preprocess.range_min) == (0.8, 0.1, 0.25)
+
+
+def test_streets_keep_the_configuration() -> None:
+    street = Stub([ball(9.0)], notes=[])
+    config = Config()
+    assert with_scene_scale(config, street) is config
+    assert street.notes == []
+
+
+def test_a_covered_or_unreadable_scan_decides_nothing() -> None:
+    scans: list[Scan | str] = [ball(0.2), "cut short", ball(9.0, 2)]
+    np.testing.assert_allclose(median_range(Stub(scans)), 9.0, rtol=1e-2)
+    assert with_scene_scale(Config(), Stub(["cut short"])) == Config()
+    assert with_scene_scale(Config(), Stub([Scan(np.zeros((5, 3), np.float32), 0, 0)])) == Config()
