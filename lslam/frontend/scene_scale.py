@@ -48,9 +48,9 @@ def with_scene_scale(config: Config, sequence: Sequence) -> Config:
 def median_range(sequence: Sequence) -> float:
     """Median range of the points, m: the largest of the first, middle and last scan, so that a covered sensor decides nothing.
 
-    Infinite where none of them can be read.
+    One of `USUAL_RANGE_M` or more is enough. Infinite where none of them can be read.
     """
-    medians = [np.nan]
+    largest = 0.0
     for i in sorted({0, len(sequence) // 2, len(sequence) - 1}):
         try:
             points = sequence.scan(i).points[:, :3]
@@ -58,5 +58,7 @@ def median_range(sequence: Sequence) -> float:
             continue
         ranges = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
         measured = ranges[ranges > 0]
-        medians.append(float(np.median(measured)) if len(measured) else np.nan)
-    return float(np.nanmax(medians)) if np.isfinite(medians).any() else np.inf
+        largest = max(largest, float(np.median(measured)) if len(measured) else 0.0)
+        if largest >= USUAL_RANGE_M:
+            break
+    return largest or np.inf

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 from stub_sequences import Stub
 
+import lslam
 from lslam.config import Config
 from lslam.frontend.scene_scale import median_range, with_scene_scale
 from lslam.types.scan import Scan
@@ -40,10 +44,10 @@ def test_lengths_that_are_set_are_kept() -> None:
 
 
 def test_streets_keep_the_configuration() -> None:
-    street = Stub([ball(9.0)], notes=[])
+    street = Stub([ball(9.0, i) for i in range(3)], notes=[])
     config = Config()
     assert with_scene_scale(config, street) is config
-    assert street.notes == []
+    assert (street.notes, street.reads) == ([], [0])
 
 
 def test_a_covered_or_unreadable_scan_decides_nothing() -> None:
@@ -51,3 +55,12 @@ def test_a_covered_or_unreadable_scan_decides_nothing() -> None:
     np.testing.assert_allclose(median_range(Stub(scans)), 9.0, rtol=1e-2)
     assert with_scene_scale(Config(), Stub(["cut short"])) == Config()
     assert with_scene_scale(Config(), Stub([Scan(np.zeros((5, 3), np.float32), 0, 0)])) == Config()
+
+
+def test_a_sensor_that_stands_on_a_desk_registers_all_scans(recordings: Any, tmp_path: Path) -> None:
+    """Half of the points lie nearer than 0.9 m, with gaps of up to 0.8 s."""
+    outcome = lslam.run(recordings("robosense_helios") / "robosense_helios", out=tmp_path / "run")
+    assert [result.status for result in outcome.record.results] == ["ok"] * 8
+    positions = outcome.record.trajectory.poses[:, :3, 3]
+    assert np.linalg.norm(positions, axis=1).max() < 0.05
+    assert np.linalg.norm(np.diff(positions, axis=0), axis=1).sum() < 0.1

@@ -57,12 +57,12 @@ def begun() -> tuple[Registration, PreparedPoints, RegistrationResult]:
 
 
 @pytest.mark.parametrize(
-    ("fine", "coarse", "is_taken"), [(0.6, 0.7, True), (0.7, 0.6, False), (0.7, 0.7, False), (0.01, 0.4, True)]
+    ("fine", "coarse", "is_taken"), [(0.6, 0.7, True), (0.7, 0.6, False), (0.7, 0.7, False), (0.01, 0.6, True)]
 )
 def test_at_the_start_the_result_with_the_larger_consensus_is_taken(
     fine: float, coarse: float, is_taken: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also the only one that does not fail: of 1 % nothing is believed."""
+    """Also the only one that does not fail: of 1 % nothing is believed where nearly all agree on the room's own walls."""
     registration, points, known = begun()
     assert registration.history.starting > 0
     near, far = aside(known, fine, 0.0), aside(known, coarse)
@@ -77,7 +77,7 @@ def test_at_the_start_the_result_with_the_larger_consensus_is_taken(
 
 def test_a_coarse_result_that_fails_is_not_taken_however_many_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     registration, points, known = begun()
-    near, far = aside(known, 0.4, 0.0), aside(known, 0.9, 1.1 * registration.config.max_jump_m)
+    near, far = aside(known, 0.6, 0.0), aside(known, 0.9, 1.1 * registration.config.max_jump_m)
     monkeypatch.setattr(registration.target, "align", lambda *_: near)
     monkeypatch.setattr(registration.target, "coarse_to_fine", lambda *_: far)
     located = registration.locate(points, np.eye(4))
