@@ -19,6 +19,7 @@ from lslam.simulation.curve import RouteCurve, stretched
 from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
 from lslam.simulation.hall import build_hall
 from lslam.simulation.kinematics import PosePath
+from lslam.simulation.living_room import build_room
 from lslam.simulation.moving import Mover, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
@@ -143,6 +144,8 @@ def _city(scenario: Scenario, street: RouteCurve, terrain: Terrain, rng: np.rand
         return build_hall(street, terrain, rng)
     if world.kind == "stairwell":
         return build_stairwell(street, terrain, rng)
+    if world.kind == "room":
+        return build_room(street, terrain, rng)
     return build_town([stretched(street, SPARE)], terrain, scenario.layout, rng, world.spacing, world.levels)
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.geometry import portable
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
+from lslam.simulation.living_room import room_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
 from lslam.simulation.stairwell import stairs_line
@@ -96,6 +97,9 @@ def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = 
     if path.shape == "stairs":
         line, heights = stairs_line(path.heights[0])
         return Route(line, line, heights)
+    if path.shape == "room":
+        line = room_line()
+        return Route(line, line)
     if path.shape == "eights":
         line = smooth_curve(np.array([[0.0, 0.0], [path.length or HALL, 0.0]]), closed=False)
         return Route(line, line)

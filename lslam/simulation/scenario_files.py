@@ -137,10 +137,10 @@ SHAPES: dict[str, tuple[Shape, bool]] = {
 
 
 # `block` and `street` draw their lines from the seed, `out-and-back` is as long as speed and scans need, `stairs` leads through
-# a stairwell and `eights` round the middle of a hall; the other shapes are way-points.
-LINES = ("block", "street", "out-and-back", "stairs", "eights", *SHAPES)
+# a stairwell, `eights` round the middle of a hall and `room` through a room; the other shapes are way-points.
+LINES = ("block", "street", "out-and-back", "stairs", "eights", "room", *SHAPES)
 # Places that are built round a line of their own.
-INDOORS = {"stairwell": "stairs", "hall": "eights"}
+INDOORS = {"stairwell": "stairs", "hall": "eights", "room": "room"}
 
 
 class PathSection(Section):
@@ -171,7 +171,7 @@ class WorldSection(Section):
     roughness : standard deviation of the surface itself, m, of a car park
     """
 
-    kind: Literal["street", "town", "motorway", "corridor", "carpark", "woods", "hall", "stairwell"] = "town"
+    kind: Literal["street", "town", "motorway", "corridor", "carpark", "woods", "hall", "stairwell", "room"] = "town"
     spacing: float = Field(80.0, ge=30, le=1000)
     levels: int = Field(1, ge=0, le=3)
     relief: float = Field(0.35, ge=0, le=20)
