@@ -164,7 +164,7 @@ def _measured(table: Floats) -> Floats:
 def _candidates(files: Sequence[NDArray[np.uint8]]) -> list[PointRecord]:
     """Records of mixed types, and those of one type with their columns named by the values."""
     candidates = [parse_record(text) for text in _MIXED]
-    for code, counts in (("<f4", _COLUMNS_F4), ("<f8", _COLUMNS_F8)):
+    for code, counts in (("<f4", _COLUMNS_F4), ("<f8", _COLUMNS_F8), (">f4", (3, 4, *_COLUMNS_F4[1:]))):
         for count in counts:
             tables = _whole(PointRecord(("_",) * count, (code,) * count), files)
             names = name_columns(tables) if tables else ()

@@ -41,7 +41,7 @@ def revolution(seed: int = 0, turns: int = 512, rings: int = 16) -> dict[str, ND
 def packed(columns: dict[str, NDArray[np.float64]], words: str, count: int | None = None) -> bytes:
     """Rows of the columns that `words` name, with their types."""
     parts = [word.split(":") for word in words.split()]
-    table = np.zeros(len(columns["x"]), [(str(k), "<" + (p[1] if len(p) > 1 else "f4")) for k, p in enumerate(parts)])
+    table = np.zeros(len(columns["x"]), [(str(k), p[1] if len(p) > 1 else "f4") for k, p in enumerate(parts)])
     for k, (name, *_) in enumerate(parts):
         if name != "pad":
             table[str(k)] = columns[name]
@@ -66,6 +66,10 @@ def as_bytes(words: str, seeds: tuple[int, ...] = (0, 1, 2)) -> list[NDArray[np.
         ("x:f8 y:f8 z:f8", "x:f8 y:f8 z:f8"),
         ("x:f8 y:f8 z:f8 intensity:f8", "x:f8 y:f8 z:f8 intensity:f8"),
         ("x:f8 y:f8 z:f8 intensity:f8 ring:f8 stamp:f8", "x:f8 y:f8 z:f8 intensity:f8 ring:f8 time:f8"),
+        *(
+            (" ".join(f"{name}:>f4" for name in names), " ".join(f"{name}:>f4" for name in names))
+            for names in (("x", "y", "z", "intensity"), ("x", "y", "z", "intensity", "ring", "time"))
+        ),
         ("x y z intensity ring:u2 time", "x y z intensity ring:u2 time"),
         ("x y z intensity ring:u2 stamp:f8", "x y z intensity ring:u2 time:f8"),
         ("x y z intensity time_ns:u4 pad:u2 ring:u2 pad:u2", "x y z intensity time:u4 _:u2 ring:u2 _:u2"),
