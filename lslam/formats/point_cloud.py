@@ -18,7 +18,9 @@ from lslam.types.scan import NO_RING, is_measured
 
 AXES = ("x", "y", "z")
 # Names as `plain_name` makes them, the likeliest first. docs/conventions.md, "Fields of points", says whose they are.
-AXIS_NAMES = {axis: (axis, f"pos_{axis}", f"position_{axis}", f"point_{axis}") for axis in AXES}
+AXIS_NAMES = {
+    axis: (axis, f"pos_{axis}", f"position_{axis}", f"point_{axis}", f"p{axis}", f"{axis}_m") for axis in AXES
+}
 INTENSITY_NAMES = (
     "intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "remittance", "amplitude", "signal",
     "echo_intensity",
@@ -32,7 +34,8 @@ RING_NAMES = (
 TIME_NAMES = (
     "t", "time", "times", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "stamp", "ts",
     "point_time_offset", "relative_timestamp", "relative_time", "rel_time", "point_time", "point_timestamp", "gps_time",
-    "gpstime", "utc_time", "delta_time", "curvature",
+    "gpstime", "utc_time", "delta_time", "delta_t", "dt", "lidar_timestamp", "sensor_timestamp", "firing_time", "fire_time",
+    "capture_time", "offset_ns", "offset_us", "curvature",
 )  # fmt: skip
 # FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
 _DOUBTFUL_TIMES = {"curvature": "ms"}

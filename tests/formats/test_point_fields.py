@@ -56,6 +56,9 @@ CLOCKS: dict[str, tuple[Columns, str, float, bool]] = {
     "cloudcompare": ({"scalar_GPSTime": 300_000 + SECONDS}, "scalar_GPSTime", 1e9, True),
     "cloudcompare, spaced": ({"Scalar field: x": RINGS, "scalar_Time-Stamp": SECONDS}, "scalar_Time-Stamp", 1e9, False),
     "microseconds by name": ({"t_us": SECONDS * 1e6}, "t_us", 1e3, False),
+    "an offset in ns": ({"offset_ns": NS.astype("u4")}, "offset_ns", 1, False),
+    "a clock of the sensor": ({"lidar_timestamp": START_S + SECONDS}, "lidar_timestamp", 1e9, True),
+    "a step since the first": ({"deltaT": SECONDS.astype("f4")}, "deltaT", 1e9, False),
     "the field that is filled": ({"time": np.zeros(N, "f4"), "timestamp": START_S + SECONDS}, "timestamp", 1e9, True),
     "curvature beside times": ({"curvature": (1e3 * SECONDS).astype("f4"), "time": SECONDS}, "time", 1e9, False),
 }  # fmt: skip
@@ -65,6 +68,12 @@ CLOCKS: dict[str, tuple[Columns, str, float, bool]] = {
 def test_times_of_every_driver(driver: str) -> None:
     columns, *expected = CLOCKS[driver]
     assert rule_of(columns) == tuple(expected)
+
+
+@pytest.mark.parametrize("names", [("px", "py", "pz"), ("X_m", "Y_m", "Z_m")])
+def test_places_of_other_names(names: tuple[str, ...]) -> None:
+    cloud = cloud_from_fields(Path("a"), dict(zip(names, PLACES.values(), strict=True)))
+    np.testing.assert_array_equal(cloud.points, np.stack(list(PLACES.values()), axis=1).astype(np.float32))
 
 
 def test_seconds_and_nanoseconds_carry_over() -> None:
