@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from lslam.config import Config
+from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
+from lslam.preprocessing.beams import ring_gap
 from lslam.types.sequence import Sequence
 
-# m; where half of the points of a scan lie farther, as in streets, the configured lengths hold. Nearer surfaces are smaller.
-USUAL_RANGE_M = 8.0
+# rad that a voxel spans at the median range: small against the scene, and as wide as several rings are apart, since a plane
+# needs a few of them.
+VOXEL_RAD, RINGS = 0.1, 5
+USUAL_RANGE_M = RegistrationConfig().voxel_size / VOXEL_RAD
 # Keys, by section, that shrink with the range, unless they are set.
 LENGTHS = {
     "registration": ("voxel_size",),
@@ -27,28 +31,24 @@ def with_scene_scale(config: Config, sequence: Sequence) -> Config:
         name: [key for key in keys if key not in getattr(config, name).model_fields_set]
         for name, keys in LENGTHS.items()
     }
-    range_m = median_range(sequence) if any(free.values()) else np.inf
-    if range_m >= USUAL_RANGE_M:
+    scale = scene_scale(sequence) if any(free.values()) else 1.0
+    if scale >= 1.0:
         return config
     sections = {
-        name: section.model_copy(
-            update={key: round(getattr(section, key) * range_m / USUAL_RANGE_M, 3) for key in free[name]}
-        )
+        name: section.model_copy(update={key: round(getattr(section, key) * scale, 3) for key in free[name]})
         for name in LENGTHS
         if free[name] and (section := getattr(config, name))
     }
     changed = config.model_copy(update=sections)
     voxel_m = changed.registration.voxel_size
-    sequence.notes.append(
-        f"half of the points lie within {range_m:.1f} m: the voxels of the local map are {voxel_m:g} m wide"
-    )
+    sequence.notes.append(f"a small scene: the voxels of the local map are {voxel_m:g} m wide")
     return changed
 
 
-def median_range(sequence: Sequence) -> float:
-    """Median range of the points, m: the largest of the first, middle and last scan, so that a covered sensor decides nothing.
+def scene_scale(sequence: Sequence) -> float:
+    """The configured lengths in the scene, as a part of those in streets, at most 1.
 
-    One of `USUAL_RANGE_M` or more is enough. Infinite where none of them can be read.
+    The largest of the first, middle and last scan, so that a covered sensor decides nothing; 1 where none can be read.
     """
     largest = 0.0
     for i in sorted({0, len(sequence) // 2, len(sequence) - 1}):
@@ -56,9 +56,13 @@ def median_range(sequence: Sequence) -> float:
             points = sequence.scan(i).points[:, :3]
         except InputError:
             continue
-        ranges = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
-        measured = ranges[ranges > 0]
-        largest = max(largest, float(np.median(measured)) if len(measured) else 0.0)
-        if largest >= USUAL_RANGE_M:
+        ranges = np.linalg.norm(points, axis=1)
+        is_measured = np.isfinite(ranges) & (ranges > 0)
+        if not is_measured.any():
+            continue
+        range_m = float(np.median(ranges[is_measured]))
+        span = VOXEL_RAD if range_m >= USUAL_RANGE_M else max(VOXEL_RAD, RINGS * ring_gap(points[is_measured]))
+        largest = max(largest, span * range_m / RegistrationConfig().voxel_size)
+        if largest >= 1.0:
             break
-    return largest or np.inf
+    return min(largest, 1.0) or 1.0

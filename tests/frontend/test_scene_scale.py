@@ -10,7 +10,7 @@ from stub_sequences import Stub
 
 import lslam
 from lslam.config import Config
-from lslam.frontend.scene_scale import median_range, with_scene_scale
+from lslam.frontend.scene_scale import scene_scale, with_scene_scale
 from lslam.types.scan import Scan
 
 
@@ -34,7 +34,19 @@ def test_lengths_are_in_proportion_to_the_range_of_half_of_the_points() -> None:
         0.25,
     )
     assert (config.loam.feature_map_voxel, config.registration.sigma) == (0.25, Config().registration.sigma)
-    assert room.notes[-1] == "half of the points lie within 2.0 m: the voxels of the local map are 0.2 m wide"
+    assert room.notes[-1] == "a small scene: the voxels of the local map are 0.2 m wide"
+
+
+def test_a_voxel_spans_several_rings() -> None:
+    """Rings two degrees apart, 3 m away: five of them are 0.52 m apart, where a tenth of the range is 0.3 m."""
+    azimuth, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 400), np.deg2rad(np.arange(-15.0, 16.0, 2.0)))
+    points = 3.0 * np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
+    )
+    sparse = Stub([Scan(points.reshape(-1, 3).astype(np.float32), 0, 0)])
+    np.testing.assert_allclose(
+        with_scene_scale(Config(), sparse).registration.voxel_size, 5 * 3 * np.deg2rad(2), atol=2e-3
+    )
 
 
 def test_lengths_that_are_set_are_kept() -> None:
@@ -52,7 +64,7 @@ def test_streets_keep_the_configuration() -> None:
 
 def test_a_covered_or_unreadable_scan_decides_nothing() -> None:
     scans: list[Scan | str] = [ball(0.2), "cut short", ball(9.0, 2)]
-    np.testing.assert_allclose(median_range(Stub(scans)), 9.0, rtol=1e-2)
+    assert scene_scale(Stub(scans)) == 1.0
     assert with_scene_scale(Config(), Stub(["cut short"])) == Config()
     assert with_scene_scale(Config(), Stub([Scan(np.zeros((5, 3), np.float32), 0, 0)])) == Config()
 

@@ -31,7 +31,7 @@ def test_what_is_walked_is_free(seed: int) -> None:
 
 def test_a_walk_through_the_room_is_followed_with_voxels_of_its_size() -> None:
     """Voxels of 0.8 m, which hold cupboards and not planes, err by several times as much."""
-    drive = simulate("room", seed=2, count=25, lidar="os1-32", motion_compensated=True)
+    drive = simulate("room", seed=2, count=25, motion_compensated=True)
     errors = []
     for settings in ([], ["registration.voxel_size=0.8", "preprocess.map_leaf=0.3", "preprocess.range_min=1.0"]):
         config = lslam.load_config(settings=[*settings, "map.write=false", "loops.use=false"])
