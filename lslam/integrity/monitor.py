@@ -99,7 +99,7 @@ class IntegrityMonitor(Stateful):
         step_s = (stamp_ns - self._last_ns) * 1e-9
         self._last_ns = stamp_ns
         self._is_broken |= (position > 0 and step_s > PAUSE_S) or not is_ok
-        if scan is None or not is_ok or not self._is_due(position, result, step_s):
+        if scan is None or not is_ok or not self._is_due(position, scan, result, step_s):
             return
         now = self._seen(position, scan, prepared, result, sweep)
         if self._reference is not None:
@@ -115,11 +115,11 @@ class IntegrityMonitor(Stateful):
             at, scan = k + 1, Scan(room, round(1e9 * k), k)
             trial.see(at, scan, None, ScanResult(k, scan.stamp_ns, np.eye(4)), MotionPrior.at_once(np.eye(4)))
 
-    def _is_due(self, position: int, result: ScanResult, step_s: float) -> bool:
+    def _is_due(self, position: int, scan: Scan, result: ScanResult, step_s: float) -> bool:
         first = self._reference
         if first is None:
-            # The first scan may have been taken at a speed that nobody knew yet.
-            return position > 0
+            # The motion within the first scan is not known yet.
+            return position > 0 or scan.span.seconds == 0
         if self._is_broken or not self.checks or not self.checks[-1].is_conclusive:
             return True
         seconds = (result.stamp_ns - first.stamp_ns) * 1e-9

@@ -51,16 +51,19 @@ def test_true_poses_are_confirmed() -> None:
     monitor, (_, true) = new_monitor(), street()
     see(monitor, true)
     # Neighbours first, as nobody knows how fast the sensor moves.
-    assert [(check.first, check.last) for check in monitor.checks] == [(1, 2), (2, 7), (7, 12), (12, 17), (17, 22)]
+    assert [(check.first, check.last) for check in monitor.checks] == [
+        (0, 1),
+        *((k, k + 5) for k in (1, 6, 11, 16, 21)),
+    ]
     assert all(check.is_conclusive for check in monitor.checks)
     assert np.abs([check.apart for check in monitor.checks]).max() < 0.05
 
 
 def test_frozen_poses_are_inconsistent() -> None:
     monitor, (_, true) = new_monitor(), street()
-    see(monitor, np.concatenate([true[:13], np.repeat(true[12:13], COUNT - 13, axis=0)]))
+    see(monitor, np.concatenate([true[:12], np.repeat(true[11:12], COUNT - 12, axis=0)]))
     assert np.abs([check.apart for check in monitor.checks[:3]]).max() < 0.05
-    assert len(monitor.checks) == 5
+    assert len(monitor.checks) == 6
     for check in monitor.checks[3:]:
         moved = true[check.last, :3, 3] - true[check.first, :3, 3]
         assert check.is_conclusive
@@ -71,7 +74,7 @@ def test_the_first_check_after_failed_scans_is_marked() -> None:
     monitor, (_, true) = new_monitor(), street()
     see(monitor, true, lost=range(8, 10))
     assert [(check.last, check.is_after_break) for check in monitor.checks[1:4]] == [
-        (7, False),
+        (6, False),
         (10, True),
         (15, False),
     ]
@@ -84,23 +87,38 @@ def test_the_monitor_resumes_to_the_last_bit(tmp_path: Path) -> None:
     again.restore(read_state(tmp_path / "monitor.npz", (MotionCheck, PreparedPoints, Seen)))
     for monitor in (whole, again):
         see(monitor, true, begin=13)
-    assert len(again.checks) == len(whole.checks) == 5
+    assert len(again.checks) == len(whole.checks) == 6
     for one, other in zip(whole.checks, again.checks, strict=True):
         np.testing.assert_equal(vars(other), vars(one))
 
 
-def test_scans_that_lie_far_apart_are_compared_with_their_neighbours_and_not_from_the_claim() -> None:
+def test_scans_that_lie_far_apart_are_compared_within_reach_and_not_from_the_claim_alone() -> None:
     """Every fourth scan of the street, at poses that go sideways and turn from the first scan on."""
     monitor, (scans, true) = new_monitor(), street()
     for k, scan in enumerate(scans[::4]):
         wrong = se3.make(so3.exp(np.array([0.0, 0.0, -0.1 * k])), np.array([0.5 * k, 1.5 * k, 0.0]))
         monitor.see(k, scan, None, ScanResult(k, scan.stamp_ns, wrong), MotionPrior.at_once(wrong))
-    assert [(check.first, check.last) for check in monitor.checks] == [(1, 2), (2, 4), (4, 6)]
+    assert [(check.first, check.last) for check in monitor.checks] == [(0, 1), (1, 3), (3, 5)]
     for check in monitor.checks:
         moved = se3.relative(true[4 * check.first], true[4 * check.last])
         np.testing.assert_allclose(check.found[:3, 3], moved[:3, 3], atol=0.1)
         assert check.is_conclusive
         assert check.agreement > 2 * check.claimed_agreement
+
+
+def test_the_first_scan_is_compared_where_no_motion_is_left_in_it() -> None:
+    scans, true = street()
+    turned = true.copy()
+    turned[0] = true[0] @ se3.make(so3.exp(np.array([0.0, 0.0, np.deg2rad(15.0)])), np.zeros(3))
+    for times_s, first in ((0.1, (1, 2)), (None, (0, 1))):
+        monitor = new_monitor()
+        for k in range(3):
+            times = None if times_s is None else np.linspace(0, times_s, len(scans[k]), dtype=np.float32)
+            scan = replace(scans[k], times=times)
+            monitor.see(k, scan, None, ScanResult(k, scan.stamp_ns, turned[k]), MotionPrior.at_once(turned[k]))
+        assert (monitor.checks[0].first, monitor.checks[0].last) == first
+    assert monitor.checks[0].apart[5] == pytest.approx(np.deg2rad(15.0), abs=np.deg2rad(0.3))
+    assert monitor.checks[0].agreement > 1.15 * monitor.checks[0].claimed_agreement
 
 
 def queue(ahead: float, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -136,5 +154,5 @@ def test_a_truck_that_drives_off_leaves_standing_and_moving_open() -> None:
         assert abs(check.rival[0, 3]) < 0.02
     stamps_ns = 100_000_000 * np.arange(count, dtype=np.int64)
     (alert,) = alerts(monitor.checks, np.column_stack([-ahead, np.zeros(count), np.zeros(count)]), stamps_ns)
-    assert (alert.first, alert.last) == (13, 32)
+    assert (alert.first, alert.last) == (12, 31)
     assert "standing and moving explain the scans about equally well" in alert.why

@@ -144,11 +144,11 @@ def test_stamps_that_jitter_are_told_as_the_fault_of_the_clock() -> None:
     assert [p for p in manifest["problems"] if "the stamps of" in p and "wrong by up to 80 ms" in p]
 
 
-@pytest.mark.parametrize("preset", ["thesis-icp", "thesis-loam"])
-def test_the_settings_of_a_method_that_loses_its_way_do_not_blind_the_monitor(preset: str) -> None:
+@pytest.mark.parametrize(("preset", "lost"), [("thesis-icp", 12), ("thesis-loam", 12), ("thesis-loam-map", 1)])
+def test_the_settings_of_a_method_that_loses_its_way_do_not_blind_the_monitor(preset: str, lost: int) -> None:
     outcome = ended(open_sequence(SAMPLE), f"odometry.preset={preset}")
     assert any("m ahead" in problem for problem in problems(outcome))
-    assert sum(r.is_lost for r in outcome.record.results) > 12
+    assert sum(r.is_lost for r in outcome.record.results) >= lost
 
 
 def test_clouds_in_the_frame_of_a_world_are_reported() -> None:
