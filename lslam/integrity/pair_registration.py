@@ -28,6 +28,8 @@ SETTINGS = RegistrationConfig(blob_weight=0.0)
 EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, 2.4
 # Half of an edge is how far a plane reaches.
 CAPTURE = 0.4
+# Steps that settle a scan which lies within its noise of where it was.
+STEPS_AT_REST = 4
 # Two motions are one also where they differ by less than so many sigma more.
 SAME_SIGMAS = 3.0
 
@@ -107,7 +109,7 @@ class PairRegistration:
     def at_rest(self) -> MotionHypothesis:
         """The motion that fits if the sensor stands: its points lie within their noise of where they were."""
         s = SETTINGS
-        return self._lay(np.eye(4), Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, s.max_iterations))
+        return self._lay(np.eye(4), Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, STEPS_AT_REST))
 
     def at(self, motion: Floats) -> MotionHypothesis:
         """How the scan fits at a motion (4, 4)."""
