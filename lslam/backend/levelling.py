@@ -105,6 +105,7 @@ def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
     Its sigma, rad, is that of the best measurement, since their errors are correlated.
     """
     up = np.zeros(3)
+    results = [r for r in results if not r.frame]
     for r in results:
         if r.imu.gravity is not None:
             up -= r.T_world_lidar[:3, :3] @ r.imu.gravity.direction / r.imu.gravity.sigma**2
@@ -116,7 +117,7 @@ def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:
 def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config) -> Floats | None:
     """The dominant plane below the first scan that was registered."""
     for number, result in enumerate(results):
-        if result.status != "ok":
+        if result.status != "ok" or result.frame:
             continue
         with suppress(InputError), jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
             R, height = levelling(sequence.scan(number).points, config.preprocess.ground_tolerance, CELLS)

@@ -22,6 +22,9 @@ FOLDER = "presets"
 SUMMARY, BASE = "summary", "base"
 Tree = dict[str, Any]
 
+# Keys of earlier versions, and what became of them.
+REMOVED = {"odometry.max_failures": "a lost run begins a new segment and goes on to its last scan; leave the key out"}
+
 
 def known_presets() -> dict[str, str]:
     """Names and one-line summaries of the presets that ship with lslam."""
@@ -178,6 +181,8 @@ def _merge(tree: Tree, more: Tree, where: str) -> None:
         assert isinstance(model, type)
         assert issubclass(model, BaseModel)
         for key, value in values.items():
+            if f"{section}.{key}" in REMOVED:
+                raise ConfigError(f"{where}: there is no {section}.{key} any more: {REMOVED[f'{section}.{key}']}")
             if key not in model.model_fields:
                 raise ConfigError(f"{where}: unknown key {section}.{key}; {nearest(key, model.model_fields)}")
             tree.setdefault(section, {})[key] = value

@@ -1,4 +1,4 @@
-"""Section `odometry`: the method and when a run is given up."""
+"""Section `odometry`: the method, and what is kept and checked beside it."""
 
 from __future__ import annotations
 
@@ -25,4 +25,3 @@ class OdometryConfig(Section):
         True,
         description="compare pairs of scans beside the method, whatever it is, and say where they contradict its poses",
     )
-    max_failures: int = Field(20, ge=1, description="failed scans in a row after which the run counts as diverged")

@@ -6,6 +6,7 @@ A new one is one function and one line here, and its method's name in `TIGHTLY_C
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 
 from lslam.config import Config
 from lslam.graph.inertial_smoother import InertialSmoother
@@ -57,3 +58,10 @@ MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
 def motion_of(begun: InertialStart, config: Config) -> InertialMotion:
     """The motion model that the method asks for."""
     return MOTION_MODELS.get(config.odometry.method, _loose)(begun, config)
+
+
+def copy_of(motion: InertialMotion, begun: InertialStart, config: Config) -> InertialMotion:
+    """A second model of the same IMU that goes on where `motion` is."""
+    other = motion_of(begun, config)
+    other.restore(deepcopy(motion.state()))
+    return other

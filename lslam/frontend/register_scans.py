@@ -8,20 +8,23 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from contextvars import copy_context
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.registration import RegistrationConfig
 from lslam.errors import InputError
 from lslam.frontend.checkpoints import OdometryCheckpoints
 from lslam.frontend.keyframing import Keyframing
+from lslam.frontend.segments import Begin, SegmentTracker, Tracked
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
 from lslam.geometry.interpolate import poses_at
-from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel
+from lslam.inertial.constant_velocity import MotionModel
 from lslam.integrity.monitor import IntegrityMonitor
-from lslam.odometry.base import Deskewing, Odometry
+from lslam.odometry.base import Odometry
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
@@ -33,6 +36,8 @@ from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 
+# Of a pose in a frame of which nobody knows where it lies, m2 and rad2.
+UNBOUNDED = np.diag(np.full(6, np.inf))
 # Scans with points that say when sweeps begin and end.
 _LOOKED_AT = 3
 
@@ -42,7 +47,8 @@ def estimate(
     odometry: Odometry,
     *,
     threads: int = 2,
-    max_failures: int = 20,
+    begin: Begin | None = None,
+    initial_scans: int = RegistrationConfig().start_scans,
     stationary: StationaryDetector | None = None,
     motion: MotionModel | None = None,
     should_stop: Callable[[], bool] = lambda: False,
@@ -51,51 +57,52 @@ def estimate(
     checkpoints: OdometryCheckpoints | None = None,
     monitor: IntegrityMonitor | None = None,
 ) -> list[ScanResult]:
-    """Register every scan of the sequence; stops early on `should_stop` or after `max_failures` failures in a row.
+    """Register every scan of the sequence; stops early on `should_stop` only.
 
-    A scan that cannot be read, or is empty, is skipped: its pose is the motion prior. With `stationary`, scans of
-    a stationary sensor are not registered. `motion` predicts the scans, constant velocity when None.
+    A scan that cannot be read, or is empty, is skipped: its pose is the motion prior. `begin` and `initial_scans` make a new
+    segment where the map is lost, as in `SegmentTracker`. With `stationary`, scans of a stationary sensor are not registered.
+    `motion` predicts the scans, constant velocity when None.
     `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
     earlier run left off and keep what this one does. `monitor` checks the pose of every scan.
     """
-    tracker = Tracker(odometry, stationary, motion, monitor)
+    tracker = SegmentTracker(Tracker(odometry, stationary, motion), begin, initial_scans, monitor)
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
         results = checkpoints.begin(tracker, keyframing)
-    failures = _failures_at_end(results)
-    for loaded in read_ahead(sequence, odometry.prepare, threads, first=len(results)):
-        if failures >= max_failures:
-            break
-        middle = tracker.middle
-        result = tracker.track(loaded)
-        if results:
-            results[-1] = between_middles(results[-1], result, tracker, middle)
-        stages = {"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages}
-        if keyframing is not None:
-            began = time.perf_counter()
-            keyframing.see(len(results), loaded.scan, result, tracker.sweep)
-            stages["keyframe"] = time.perf_counter() - began
-        if monitor is not None:
-            began = time.perf_counter()
-            tracker.check(len(results), loaded, result)
-            stages["integrity"] = time.perf_counter() - began
-        result = replace(result, stages=stages, fault="" if loaded.scan is None else loaded.scan.fault)
-        results.append(result)
-        on_scan(result)
-        failures = 0 if result.status == "ok" else failures + 1
-        if failures >= max_failures or should_stop():
+    middle = tracker.middle
+    ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
+    # Scans that are still open at the end of the recording have their word there.
+    for decided in chain(map(tracker.track, ahead), map(SegmentTracker.finish, (tracker,))):
+        for tracked in decided:
+            if results and tracker.has_middles:
+                results[-1] = between_middles(results[-1], middle, tracked)
+            results.append(_observed(tracked, len(results), keyframing, monitor))
+            middle = tracked.middle
+            on_scan(results[-1])
+        if should_stop():
             break
         if checkpoints is not None and keyframing is not None:
             checkpoints.offer(results, tracker, keyframing)
     if checkpoints is not None and keyframing is not None:
-        is_over = len(results) == len(sequence) or failures >= max_failures
-        checkpoints.close(results, tracker, keyframing, is_over)
+        checkpoints.close(results, tracker, keyframing, len(results) == len(sequence))
     return results
 
 
-def _failures_at_end(results: list[ScanResult]) -> int:
-    """How many scans in a row were not registered before the last one and with it."""
-    return next((k for k, result in enumerate(reversed(results)) if result.status == "ok"), len(results))
+def _observed(
+    tracked: Tracked, position: int, keyframing: Keyframing | None, monitor: IntegrityMonitor | None
+) -> ScanResult:
+    """The result of the scan at this position of the run with its times, after keyframing and monitor saw it."""
+    loaded, result = tracked.loaded, tracked.result
+    stages = {"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages}
+    if keyframing is not None:
+        began = time.perf_counter()
+        keyframing.see(position, loaded.scan, result, tracked.sweep)
+        stages["keyframe"] = time.perf_counter() - began
+    if monitor is not None:
+        began = time.perf_counter()
+        monitor.see(position, loaded.scan, loaded.prepared, result, tracked.sweep)
+        stages["integrity"] = time.perf_counter() - began
+    return replace(result, stages=stages, fault="" if loaded.scan is None else loaded.scan.fault)
 
 
 def sweep_of(sequence: Sequence) -> Span | None:
@@ -118,40 +125,41 @@ def sweep_of(sequence: Sequence) -> Span | None:
     return max((span for span in spans if span is not None), key=lambda span: span.seconds, default=None)
 
 
-def is_diverged(results: list[ScanResult], max_failures: int) -> bool:
-    """Whether the run was given up: the last `max_failures` scans all failed, or hardly any scan was registered."""
-    tail = results[-max_failures:]
-    given_up = len(tail) == max_failures and all(r.status != "ok" for r in tail)
-    return given_up or sum(r.status == "ok" for r in results) < max(1, len(results) // 2)
+def is_diverged(results: list[ScanResult]) -> bool:
+    """Whether fewer than half of the scans were registered and stand in one frame, that of the trajectory."""
+    return sum(r.status == "ok" and r.frame == 0 for r in results) < max(1, len(results) // 2)
 
 
-def between_middles(
-    result: ScanResult, following: ScanResult, tracker: Tracker, middle: tuple[int, Floats]
-) -> ScanResult:
+def between_middles(result: ScanResult, middle: tuple[int, Floats], following: Tracked) -> ScanResult:
     """The result with its pose at the stamp between the middles of its sweep and the next one, where it lies there.
 
-    middle : instant, ns, and pose of the middle of its own sweep; that of the following is the tracker's
+    middle : instant, ns, and pose of the middle of its own sweep
 
     From its own middle a stamp at the end of a sweep is extrapolated, where one at the start lies between two: the error of the
     speed within a sweep that changes its direction is as large as a step.
     """
-    (begin_ns, begin), (end_ns, end) = middle, tracker.middle
-    is_alone = not isinstance(tracker.odometry, Deskewing) or not isinstance(tracker.motion, ConstantVelocity)
-    is_placed = all(r.status == "ok" and not r.is_stationary for r in (result, following))
+    (begin_ns, begin), (end_ns, end), after = middle, following.middle, following.result
+    is_placed = all(r.status == "ok" and not r.is_stationary and r.segment == after.segment for r in (result, after))
     # No farther from the next middle than a sweep is long: where scans are missing, its own is nearer.
-    if is_alone or not is_placed or not 0 < end_ns - result.stamp_ns <= 2 * (result.stamp_ns - begin_ns):
+    if not is_placed or not 0 < end_ns - result.stamp_ns <= 2 * (result.stamp_ns - begin_ns):
         return result
     pose = poses_at(np.array([begin_ns, end_ns]), np.stack([begin, end]), np.array([result.stamp_ns]))[0]
     return replace(result, stamp_offset=se3.relative(result.T_world_lidar, pose))
 
 
 def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
-    """The poses of all scans, with covariances when the method has them; a skipped scan adds `PRIOR_COVARIANCE` to the last."""
+    """The poses of all scans, with covariances when the method has them.
+
+    A skipped scan adds `PRIOR_COVARIANCE` to the last; that of a scan in another frame is `UNBOUNDED`.
+    """
     known = any(r.covariance is not None for r in results)
     covariances: list[NDArray[np.float64]] = []
     for result in results if known else ():
         before = covariances[-1] if covariances else np.zeros((6, 6))
         covariances.append(before + PRIOR_COVARIANCE if result.covariance is None else result.covariance)
+    elsewhere = [k for k, result in enumerate(results) if result.frame and known]
+    for k in elsewhere:
+        covariances[k] = UNBOUNDED
     return Trajectory(
         stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
         poses=np.stack([r.at_stamp.T_world_lidar for r in results]),

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from lslam.frontend import joint
 from lslam.geometry import se3, so3
 from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
-from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.sanity import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
@@ -48,7 +47,6 @@ class Tracker:
     """Poses of scans, one after the other.
 
     sweep : motion of the sensor within the last scan, as used by its registration
-    monitor : checks the poses that were found, by `check`
     middle : instant, ns, and pose of the middle of the last sweep, where registration is most accurate
     """
 
@@ -56,10 +54,9 @@ class Tracker:
     REFINE_M = 0.01
 
     def __init__(
-        self, odometry: Odometry, stationary: StationaryDetector | None = None, motion: MotionModel | None = None,
-        monitor: IntegrityMonitor | None = None,
-    ) -> None:  # fmt: skip
-        self.odometry, self.stationary, self.monitor = odometry, stationary, monitor
+        self, odometry: Odometry, stationary: StationaryDetector | None = None, motion: MotionModel | None = None
+    ) -> None:
+        self.odometry, self.stationary = odometry, stationary
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
@@ -112,11 +109,6 @@ class Tracker:
         self._keep(result)
         return self._recorded(result, expected, steady, trial, clock)
 
-    def check(self, position: int, loaded: Loaded, result: ScanResult) -> None:
-        """Have the monitor, if there is one, check what `track` found for the scan at this position of the run."""
-        if self.monitor is not None:
-            self.monitor.see(position, loaded.scan, loaded.prepared, result, self.sweep)
-
     @property
     def is_settled(self) -> bool:
         """Whether nothing waits for the next scan, so that `state` is complete."""
@@ -130,7 +122,6 @@ class Tracker:
             "stationary": None if self.stationary is None else self.stationary.state(),
             "middle": self.middle,
             "last": self._last,
-            "monitor": None if self.monitor is None else self.monitor.state(),
         }
 
     def restore(self, state: State) -> None:
@@ -141,8 +132,6 @@ class Tracker:
         if self.stationary is not None:
             self.stationary.restore(state["stationary"])
         self.middle, self._last = state["middle"], state["last"]
-        if self.monitor is not None:
-            self.monitor.restore(state["monitor"])
 
     def _standing(self, scan: Scan | None, clock: StageClock) -> ScanResult | None:
         """The result of a scan taken while the sensor stood; None where it has moved."""

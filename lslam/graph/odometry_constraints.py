@@ -19,8 +19,9 @@ from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 
-# m and rad; least sigmas of a step when a method states no covariance.
+# m and rad; least sigmas of a step when a method states no covariance, and those of one into another frame.
 LEAST_M, LEAST_RAD = 1e-3, 1e-4
+FREE_M, FREE_RAD = 1e3, np.pi
 
 
 def odometry_constraints(
@@ -82,6 +83,8 @@ def fitness_covariance(score: float, config: GraphConfig) -> Floats:
 
 def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Floats:
     """(6, 6) growth of odometry's covariance, world axes, from scan `a` to scan `b`, `way` m on."""
+    if a.frame != b.frame:
+        return np.diag(np.repeat([FREE_M**2, FREE_RAD**2], 3))
     of_a, of_b = _of_map(a), _of_map(b)
     if of_a is None or of_b is None:
         turn = np.deg2rad(config.drift_deg_per_100m) / 100 * way + LEAST_RAD

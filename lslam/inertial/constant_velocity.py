@@ -91,6 +91,8 @@ class ConstantVelocity(Stateful, MotionModel):
 
     A registration error of decimetres is a velocity error of metres per second: the change of velocity is bounded by the
     largest plausible acceleration.
+
+    pose : (4, 4) expected of the first scan, the identity when None
     """
 
     # Bound of extrapolation, in last steps: the speed after a longer pause is unknown.
@@ -99,9 +101,9 @@ class ConstantVelocity(Stateful, MotionModel):
     MAX_ACCELERATION = 20.0
     STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_seen")
 
-    def __init__(self) -> None:
+    def __init__(self, pose: Floats | None = None) -> None:
         self._instant_ns: int | None = None
-        self._pose = np.eye(4)
+        self._pose = np.eye(4) if pose is None else pose
         self._twist = np.zeros(6)
         self._step_s = 0.0
         # Velocity (6,) between the last two poses, m/s and rad/s.
@@ -110,7 +112,7 @@ class ConstantVelocity(Stateful, MotionModel):
         self._predicted: tuple[int, Floats] | None = None
 
     def predict(self, stamp_ns: int) -> Floats:
-        """(4, 4) T_world_lidar expected at `stamp_ns`; the identity before the first scan."""
+        """(4, 4) T_world_lidar expected at `stamp_ns`; that of the first scan before it."""
         if self._instant_ns is None or self._step_s <= 0:
             return self._pose.copy()
         if self._predicted is None or self._predicted[0] != stamp_ns:

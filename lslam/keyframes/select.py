@@ -15,10 +15,10 @@ from lslam.types.state import Stateful
 class KeyframeSelector(Stateful):
     """Takes a registered scan when the sensor has travelled `distance`, or turned by `angle_deg`, since the last taken.
 
-    The first registered scan is one. Scans that were bridged or skipped never are: their poses are unknown.
+    The first registered scan of each segment is one. Scans that were bridged or skipped never are: their poses are unknown.
     """
 
-    STATE = ("_count", "_travelled", "_here", "_last")
+    STATE = ("_count", "_travelled", "_here", "_last", "_segment")
 
     def __init__(self, config: KeyframesConfig) -> None:
         self._distance, self._angle = config.distance, float(np.deg2rad(config.angle_deg))
@@ -26,6 +26,7 @@ class KeyframeSelector(Stateful):
         self._travelled = 0.0
         self._here: NDArray[np.float64] | None = None
         self._last: NDArray[np.float64] | None = None
+        self._segment = 0
 
     def consider(self, scan: int, result: ScanResult) -> Keyframe | None:
         """The keyframe that scan number `scan` of the run becomes, or None; every scan of the run, in order."""
@@ -33,9 +34,9 @@ class KeyframeSelector(Stateful):
         if self._here is not None:
             self._travelled += float(np.linalg.norm(pose[:3, 3] - self._here[:3, 3]))
         self._here = pose
-        if result.status != "ok" or not self._is_due(pose):
+        if result.status != "ok" or not (result.segment != self._segment or self._is_due(pose)):
             return None
-        self._last = pose
+        self._last, self._segment = pose, result.segment
         self._count += 1
         return Keyframe(self._count - 1, scan, result.stamp_ns, pose, result.covariance, self._travelled)
 

@@ -6,6 +6,7 @@ import io
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,8 @@ class KeyframeStore:
     def __init__(self, folder: Path | None = None, cached: int = CACHED, deflate: int = 1) -> None:
         self.folder = folder
         self.keyframes: list[Keyframe] = []
+        # The number by which the cloud of each was added.
+        self._files: list[int] = []
         self._memory: dict[int, bytes] = {}
         self._cached, self._deflate = cached, deflate
         self._recent: OrderedDict[int, Points] = OrderedDict()
@@ -68,24 +71,31 @@ class KeyframeStore:
             _make(self.folder)
             write_npz(self._path(keyframe.number), {"planes": planes}, self._deflate)
         self.keyframes.append(keyframe)
+        self._files.append(keyframe.number)
         self._keep(keyframe.number, cloud)
 
     def points(self, number: int) -> Points:
         """Cloud (N, 3), m, of keyframe `number`, as it was added; not to be written to."""
+        file = self._files[number]
         with self._lock:
-            if number in self._recent:
-                self._recent.move_to_end(number)
-                return self._recent[number]
-        source = io.BytesIO(self._memory[number]) if self.folder is None else self._path(number)
+            if file in self._recent:
+                self._recent.move_to_end(file)
+                return self._recent[file]
+        source = io.BytesIO(self._memory[file]) if self.folder is None else self._path(file)
         planes = read_npz(source).get("planes", np.zeros(0, np.uint8))
         if planes.ndim != 3 or planes.shape[:2] != (4, 3) or planes.dtype != np.uint8:
             raise InputError(f"{source if isinstance(source, Path) else 'a keyframe'} holds no cloud of a keyframe")
         values = np.ascontiguousarray(planes.transpose(1, 2, 0)).view(np.float32)[..., 0]
-        return self._keep(number, np.ascontiguousarray(values.T))
+        return self._keep(file, np.ascontiguousarray(values.T))
+
+    def keep(self, keyframes: Sequence[Keyframe]) -> None:
+        """Hold these of the keyframes only, by their numbers, which begin at 0 again; their clouds stay where they are."""
+        self._files = [self._files[k.number] for k in keyframes]
+        self.keyframes = [replace(k, number=number) for number, k in enumerate(keyframes)]
 
     def clear(self) -> None:
         """Forget all keyframes, and remove those that the folder holds, of an earlier run too."""
-        self.keyframes, self._memory = [], {}
+        self.keyframes, self._files, self._memory = [], [], {}
         with self._lock:
             self._recent.clear()
         for file in [] if self.folder is None else self.folder.glob("*.npz"):
@@ -98,37 +108,56 @@ class KeyframeStore:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Everything but the clouds, as arrays."""
-        return keyframe_arrays(self.keyframes)
+        return {**keyframe_arrays(self.keyframes), "files": np.array(self._files, np.int64)}
 
     def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Hold the keyframes of `state`; raises InputError when a cloud of theirs is not there."""
         keyframes = keyframes_of(state)
-        for keyframe in keyframes:
-            if self.folder is None or not self._path(keyframe.number).is_file():
-                raise InputError(f"{self.folder}: the cloud of keyframe {keyframe.number} is missing")
+        files = [int(file) for file in state.get("files", np.arange(len(keyframes)))]
+        if len(files) != len(keyframes):
+            raise InputError("an index of keyframes is damaged: it does not list a file for each")
+        for number, file in enumerate(files):
+            if self.folder is None or not self._path(file).is_file():
+                raise InputError(f"{self.folder}: the cloud of keyframe {number} is missing")
         with self._lock:
             self._recent.clear()
-        self.keyframes = keyframes
+        self.keyframes, self._files = keyframes, files
 
     @property
     def size(self) -> int:
         """Bytes of all clouds, compressed."""
         if self.folder is None:
             return sum(len(data) for data in self._memory.values())
-        return sum(self._path(keyframe.number).stat().st_size for keyframe in self.keyframes)
+        return sum(self._path(file).stat().st_size for file in self._files)
 
-    def _path(self, number: int) -> Path:
+    def _path(self, file: int) -> Path:
         assert self.folder is not None
-        return self.folder / f"{number:06d}.npz"
+        return self.folder / f"{file:06d}.npz"
 
-    def _keep(self, number: int, cloud: Points) -> Points:
+    def _keep(self, file: int, cloud: Points) -> Points:
         cloud.flags.writeable = False
         with self._lock:
-            self._recent[number] = cloud
-            self._recent.move_to_end(number)
+            self._recent[file] = cloud
+            self._recent.move_to_end(file)
             while len(self._recent) > self._cached:
                 self._recent.popitem(last=False)
         return cloud
+
+
+class PartOfStore(KeyframeStore):
+    """Some of another store's keyframes, by their numbers there; their own begin at 0.
+
+    whole : they as the other store has them
+    """
+
+    def __init__(self, store: KeyframeStore, numbers: Sequence[int]) -> None:
+        super().__init__()
+        self._store, self.whole = store, [store.keyframes[n] for n in numbers]
+        self.keyframes = [replace(k, number=number) for number, k in enumerate(self.whole)]
+
+    def points(self, number: int) -> Points:
+        """Cloud of a keyframe."""
+        return self._store.points(self.whole[number].number)
 
 
 def keyframe_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[Any]]:

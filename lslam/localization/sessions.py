@@ -143,17 +143,29 @@ class Chain:
         return Constraint(last, last + 1, T, np.diag(np.repeat([move**2, turn**2], 3)), "odometry")
 
 
+@dataclass(frozen=True)
+class Vicinity:
+    """Where a session begins at the most: within `reach` m of a `position` (3,), common world."""
+
+    position: Floats
+    reach: float
+
+
 def tie(
-    session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool] = lambda: False
-) -> tuple[Session | None, str]:
+    session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool] = lambda: False,
+    vicinity: Vicinity | None = None,
+) -> tuple[Session | None, str]:  # fmt: skip
     """The session in the common world of the known ones, or None and why it is not found among them."""
     cloud = np.concatenate([_cloud_of(s) for s in known])
     prior_map = make_prior_map(cloud.astype(np.float64), config.registration, source="the sessions before")
     finder = PlaceFinder(PlaceSearch(prior_map, config.registration), _AtFinalPoses(session), config)
     expected = by_georeference(session, known)
-    prior = None if expected is None else _prior(se3.inverse(prior_map.T_map_level) @ expected, session, config)
+    T_level_map = se3.inverse(prior_map.T_map_level)
+    prior = None if expected is None else _prior(T_level_map @ expected, session, config)
+    if vicinity is not None:
+        prior = StartPrior(se3.apply(T_level_map, vicinity.position[None])[0, :2], None, vicinity.reach)
     start = finder.find(prior, should_stop)
-    if start is None and prior is not None:
+    if start is None and expected is not None:
         return None, "it is not where its georeference puts it among them"
     if start is None:
         said = [reason.split(",")[0] for reason in finder.reasons]

@@ -46,6 +46,7 @@ class Manifest:
     localization : how the drive was found in a map that exists and how many scans that holds, empty without one
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
+    segments : of a run that lost its map on the way, each with what ties it to the others
     integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
     problems : what went wrong in this run, beside what was wrong with the recording before; warnings : what its log warns of,
         which stands behind them in the file and does not decide how the run ended
@@ -65,6 +66,7 @@ class Manifest:
         self.counts: dict[str, int] = {}
         self.posed_by: dict[str, int] = {}
         self.integrity: dict[str, int] = {}
+        self.segments: list[dict[str, Any]] = []
         self.map_points: int | None = None
         self.imu: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
@@ -180,6 +182,7 @@ class Manifest:
             "counts": dict(self.counts),
             **({"posed_by": dict(self.posed_by)} if self.posed_by else {}),
             **({"integrity": dict(self.integrity)} if self.integrity else {}),
+            **({"segments": list(self.segments)} if self.segments else {}),
             **({"resumed_after_scans": list(self.resumed_after)} if self.resumed_after else {}),
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"graph": dict(self.graph)} if self.graph else {}),

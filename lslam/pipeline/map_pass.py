@@ -55,7 +55,7 @@ def build_map(
     sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool], spool: Path | None = None, checkpoints: MapCheckpoints | None = None,
 ) -> BuiltMap:  # fmt: skip
-    """Merge every scan that was registered; bridged scans would draw their error into the map and stay out.
+    """Merge every scan that was registered; bridged scans, and those of another frame, would draw their error into the map.
 
     A map too large for memory is kept in a temporary folder in `spool` meanwhile. Raises InterruptedRunError when
     `should_stop` says so; `checkpoints` know then where to go on.
@@ -94,7 +94,7 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
     results = [result.at_stamp for result in results]
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
-    registered = {result.index: result for result in results if result.status == "ok"}
+    registered = {result.index: result for result in results if result.status == "ok" and not result.frame}
 
     def pose_scan(scan: Scan) -> PosedScan | None:
         result = registered.get(scan.index)

@@ -7,15 +7,26 @@ from contextlib import suppress
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InputError
 from lslam.frontend import inertial_start
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.frontend.inertial_start import Inertial, begin_inertial, close_inertial, load_start, save_start
+from lslam.frontend.inertial_start import (
+    Inertial,
+    begin_inertial,
+    close_inertial,
+    load_start,
+    save_start,
+    with_imu_settings,
+)
 from lslam.frontend.keyframing import Keyframing
-from lslam.frontend.motion_models import smoother_noise
+from lslam.frontend.motion_models import copy_of, smoother_noise
 from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
+from lslam.frontend.segments import Begin
+from lslam.frontend.tracker import Tracker
+from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
@@ -23,7 +34,8 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.locks import one_at_a_time
 from lslam.loops import find_loops
 from lslam.maps import crispness, merge
-from lslam.odometry.base import Odometry, Resumable
+from lslam.odometry import create_odometry
+from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
@@ -33,6 +45,7 @@ from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import helped
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
+from lslam.pipeline.segments import checks_within, join_segments
 from lslam.types.constraint import Turn
 from lslam.types.inertial_state import InertialChain
 from lslam.types.run_record import RunRecord
@@ -56,7 +69,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     folder = None if job.folder is None else job.folder.path
     if osm is not None:
         osm.begin(None if folder is None else folder / REPLIES)
-    stationary = StationaryDetector(config.preprocess, config.registration) if config.preprocess.skip_standing else None
+    stationary = _stationary(config)
     monitor = IntegrityMonitor(config.preprocess) if config.odometry.integrity else None
     _warm_up(job, stationary, monitor)
 
@@ -72,29 +85,30 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
         watch.on_step()
 
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
-    limit = config.odometry.max_failures
     inertial = _begin_imu(job)
     motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
-            sequence, job.odometry, threads=config.input.workers, max_failures=limit, stationary=stationary,
-            motion=motion, should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing,
-            checkpoints=checkpoints, monitor=monitor,
+            sequence, job.odometry, threads=config.input.workers, begin=_begin_segment(job, inertial),
+            initial_scans=config.registration.start_scans, stationary=stationary, motion=motion,
+            should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing, checkpoints=checkpoints, monitor=monitor,
         )  # fmt: skip
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:
         manifest.resumed_after = checkpoints.resumed_after
         manifest.timings["odometry_s"] += checkpoints.seconds
-    manifest.keyframes = {"count": len(store), "bytes": store.size}
     if all(r.status == "skipped" for r in results):
         raise InputError(f"{sequence.path}: none of {len(results)} scans can be used, the first: {results[0].reason}")
     if config.imu.use:
         manifest.imu = close_inertial(inertial, results)
         manifest.problems += inertial.problems
     _report_faults(results, manifest)
-    manifest.judge(results, len(sequence), is_diverged(results, limit))
+    results = join_segments(results, store, config, manifest, watch.should_stop)
+    manifest.keyframes = {"count": len(store), "bytes": store.size}
+    manifest.judge(results, len(sequence), is_diverged(results))
+    checks = [] if monitor is None else checks_within(monitor.checks, results)
     if monitor is not None:
-        results = mark_lost(results, monitor.checks, manifest)
+        results = mark_lost(results, checks, manifest)
     return RunRecord(
         name=sequence.name,
         method=config.odometry.method,
@@ -102,13 +116,33 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
         results=results,
         trajectory=to_trajectory(results, config.odometry.method),
         ground_truth=job.truth,
-        checks=[] if monitor is None else monitor.checks,
+        checks=checks,
         real_time_limit=config.input.skip_frames / sequence.rate_hz,
         pose_time=manifest.pose_time,
         turns=_turns(inertial, store, config),
         inertial=_chain(inertial, store, config),
         imu=sequence.imu if config.imu.use else None,
     )
+
+
+def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:
+    """Trackers with an empty map; None for a method that predicts by itself, or whose poses are given."""
+    config = job.config
+    if not isinstance(job.odometry, Deskewing):
+        return None
+
+    def begin(pose: NDArray[np.float64]) -> Tracker:
+        motion: MotionModel = ConstantVelocity(pose)
+        if inertial.motion is not None and inertial.start is not None:
+            motion = copy_of(inertial.motion, inertial.start, config)
+        return Tracker(create_odometry(with_imu_settings(config)), _stationary(config), motion)
+
+    return begin
+
+
+def _stationary(config: Config) -> StationaryDetector | None:
+    is_wanted = config.preprocess.skip_standing
+    return StationaryDetector(config.preprocess, config.registration) if is_wanted else None
 
 
 def _chain(inertial: Inertial, store: KeyframeStore, config: Config) -> InertialChain | None:

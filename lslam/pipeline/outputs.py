@@ -48,10 +48,18 @@ def config_text(config: Config) -> str:
 def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibration) -> None:
     """trajectory.tum (LiDAR), trajectory_kitti.txt (camera 0 when Tr is known, else LiDAR), covariances.npz."""
     trajectory = record.trajectory
-    write_tum(
-        folder.path / "trajectory.tum", trajectory,
-        comment=f"lslam {__version__}, {record.method}: T_world_lidar\nworld: {record.world}\npose_time: {record.pose_time}",
-    )  # fmt: skip
+    frames = np.array([r.frame for r in record.results])
+    said = f"lslam {__version__}, {record.method}: T_world_lidar"
+    about = f"world: {record.world}\npose_time: {record.pose_time}"
+    elsewhere = "".join(
+        f"\nin frame {n}, of their own, as in trajectory_frame_{n}.tum: {np.count_nonzero(frames == n)} poses, the first of "
+        f"scan {record.results[int(np.argmax(frames == n))].index}"
+        for n in range(1, int(frames.max(initial=0)) + 1)
+    )
+    write_tum(folder.path / "trajectory.tum", trajectory, comment=f"{said}\n{about}{elsewhere}")
+    for n in range(1, int(frames.max(initial=0)) + 1):
+        comment = f"{said} in frame {n}, of its own\npose_time: {record.pose_time}"
+        write_tum(folder.path / f"trajectory_frame_{n}.tum", trajectory.select(frames == n), comment=comment)
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:
         stream = io.BytesIO()
@@ -79,14 +87,15 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     folder.write_text("timing.csv", timing_text(indices, stamps, names, seconds, record.back_end_seconds, saved))
     # Every number of scans.csv is the same in every run.
     columns = "index,stamp_ns,status,posed_by,standing,converged,iterations,source_points,inliers,overlap,rmse_m"
-    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost"]
+    rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost,segment,frame"]
     for r in record.results:
         values = (
             r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_stationary), int(r.converged), r.iterations,
             r.source_points, r.inliers, f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
             f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
             "" if r.imu.steady_norm is None else f"{r.imu.steady_norm:.5f}",
-            "" if r.imu.steady_iterations is None else r.imu.steady_iterations, int(r.is_lost),
+            "" if r.imu.steady_iterations is None else r.imu.steady_iterations, int(r.is_lost), r.segment,
+            r.frame,
         )  # fmt: skip
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")

@@ -321,7 +321,7 @@ def map_of(target: Path) -> Path:
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:
-    """What became of each scan; scans of a run that left no table count as registered."""
+    """What became of each scan; scans of a run that left no table count as registered, those of another frame as bridged."""
     known: dict[str, Status] = {"ok": "ok", "bridged": "bridged", "skipped": "skipped"}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:
@@ -333,6 +333,9 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
         raise InputError(f"{path} is no table of scans: {error}; run the sequence again") from None
     column = header.index("status") if "status" in header else len(header)
     words = ["".join(row[column : column + 1]) for row in rows]
+    if "frame" in header:
+        frame = header.index("frame")
+        words = [word if row[frame : frame + 1] == ["0"] else "bridged" for word, row in zip(words, rows, strict=True)]
     if len(words) != count or not set(words) <= set(known):
         raise InputError(f"{path} does not list the {count} scans of trajectory.tum; run the sequence again")
     return tuple(known[word] for word in words)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
+import numpy as np
+
 from lslam.backend.outcome import BackEnd, view_loop
 from lslam.config import Config
 from lslam.errors import LslamError
@@ -41,10 +43,16 @@ def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation |
     """The evaluation, or None with the reason among the record's problems."""
     if record.ground_truth is None:
         return None
+    # Poses in frames of their own have no error.
+    own = np.array([r.frame == 0 for r in record.results])
     try:
-        score = evaluate(record.trajectory, record.ground_truth, config.eval, calibration=sequence.calibration)
+        score = evaluate(
+            record.trajectory.select(own), record.ground_truth, config.eval, calibration=sequence.calibration
+        )
         if record.odometry is not None and record.odometry is not record.trajectory:
-            before = evaluate(record.odometry, record.ground_truth, config.eval, calibration=sequence.calibration)
+            before = evaluate(
+                record.odometry.select(own), record.ground_truth, config.eval, calibration=sequence.calibration
+            )
             score = replace(score, odometry=before)
     except LslamError as error:
         record.unscored = str(error)

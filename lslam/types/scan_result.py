@@ -31,6 +31,8 @@ class ScanResult:
     is_stationary : the sensor had not moved, so the scan was not registered and has the pose of the one before
     posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
         empty: the method itself
+    segment : number of the local map it was registered on; frame : of the coordinates that its pose is in, 0 for those of the
+        trajectory
     is_lost : the scans round it say that it may be elsewhere, which a problem of the run says in words
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
@@ -58,6 +60,8 @@ class ScanResult:
     overlap: float = 0.0
     is_stationary: bool = False
     posed_by: str = ""
+    segment: int = 0
+    frame: int = 0
     is_lost: bool = False
     degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)

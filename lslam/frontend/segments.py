@@ -1,0 +1,145 @@
+"""A run that never stops: where the local map holds no more, the scans begin another, a segment of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.registration import RegistrationConfig
+from lslam.frontend.tracker import Loaded, Tracker
+from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.integrity.monitor import IntegrityMonitor
+from lslam.odometry.base import Deskewing, Odometry
+from lslam.registration.robust import UsualAgreement
+from lslam.types.motion_prior import MotionPrior
+from lslam.types.scan_result import ScanResult
+from lslam.types.state import State
+
+Floats = NDArray[np.float64]
+# Begins an empty map: the tracker of a scan that is expected at a pose (4, 4).
+Begin = Callable[[Floats], Tracker]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A scan with its result; sweep, middle : of the tracker, as of this scan."""
+
+    loaded: Loaded
+    result: ScanResult
+    sweep: MotionPrior
+    middle: tuple[int, Floats]
+
+
+class SegmentTracker:
+    """Tracks the scans of a run, each segment of them in a local map of its own.
+
+    A scan that is not registered is a bad one, or the map ends before it. Both hypotheses are followed: a second tracker begins
+    an empty map with the scan. Where the first registers a scan again, and as many of its points agree with the old map as with
+    the new one, the map holds, and the scans since were bad ones. Where they do not, or where the second registers more scans in
+    a row than initialise a map, the scans since are a new segment. Scans that agree far less than those before do not count.
+
+    begin : None for a method that has one map only; initial_scans : that initialise a map
+    monitor : checks the poses that were found
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        begin: Begin | None = None,
+        initial_scans: int = 5,
+        monitor: IntegrityMonitor | None = None,
+    ) -> None:
+        self._tracker, self._begin, self._initial_scans, self.monitor = tracker, begin, initial_scans, monitor
+        self._segment = 0
+        # What scans agreed with their maps: by less than a share of that, scans of nothing agree as well.
+        self._usual = UsualAgreement(RegistrationConfig().min_agreement)
+        # The hypothesis of a new map, and the scans since, as each of the two has them.
+        self._other: Tracker | None = None
+        self._open: list[tuple[Tracked, Tracked]] = []
+
+    @property
+    def odometry(self) -> Odometry:
+        """The method with the map of the present segment."""
+        return self._tracker.odometry
+
+    @property
+    def middle(self) -> tuple[int, Floats]:
+        """Instant, ns, and pose of the middle of the newest sweep."""
+        return self._tracker.middle
+
+    @property
+    def has_middles(self) -> bool:
+        """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
+        return isinstance(self.odometry, Deskewing) and isinstance(self._tracker.motion, ConstantVelocity)
+
+    def track(self, loaded: Loaded) -> list[Tracked]:
+        """The scans that are decided with the next one, in order: none while two hypotheses are open."""
+        first = self._track(self._tracker, loaded, self._segment)
+        other = None if self._other is None else self._track(self._other, loaded, self._segment + 1)
+        is_held = first.result.status == "ok"
+        if is_held:
+            self._usual.observe(_share(first.result))
+        is_new = other is not None and other.result.status == "ok" and not self._usual.is_collapse(_share(other.result))
+        if other is not None and is_new:
+            self._open.append((first, other))
+            if is_held and not _is_less(first.result, other.result):
+                return self.finish()
+            return self._new_segment() if is_held or len(self._open) > self._initial_scans else []
+        decided = self.finish()
+        if is_held or self._begin is None or loaded.scan is None:
+            return [*decided, first]
+        self._other = self._begin(first.result.T_world_lidar)
+        other = self._track(self._other, loaded, self._segment + 1)
+        self._open = [(first, other)]
+        return decided if other.result.status == "ok" else [*decided, *self.finish()]
+
+    def finish(self) -> list[Tracked]:
+        """The scans that are open, as the first hypothesis has them."""
+        bridged = [first for first, _ in self._open]
+        self._other, self._open = None, []
+        return bridged
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing waits for the next scan, so that `state` is complete."""
+        return self._other is None and self._tracker.is_settled
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        monitor = None if self.monitor is None else self.monitor.state()
+        return {**self._tracker.state(), "segment": self._segment, "usual": self._usual.usual, "monitor": monitor}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        self._tracker.restore(state)
+        self._segment, self._usual.usual = int(state["segment"]), float(state["usual"])
+        if self.monitor is not None:
+            self.monitor.restore(state["monitor"])
+
+    def _new_segment(self) -> list[Tracked]:
+        assert self._other is not None
+        registered = [other for _, other in self._open]
+        # The motion model is known to others by its first object.
+        motion = self._tracker.motion
+        motion.restore(self._other.motion.state())
+        self._other.motion = motion
+        self._tracker, self._other, self._open = self._other, None, []
+        self._segment += 1
+        return registered
+
+    @staticmethod
+    def _track(tracker: Tracker, loaded: Loaded, segment: int) -> Tracked:
+        result = replace(tracker.track(loaded), segment=segment)
+        return Tracked(loaded, result, tracker.sweep, tracker.middle)
+
+
+def _is_less(result: ScanResult, other: ScanResult) -> bool:
+    """Whether so many fewer of a scan's points agree with a map than with the other that it may lie in the wrong place."""
+    return _share(result) < UsualAgreement.LESS * _share(other)
+
+
+def _share(result: ScanResult) -> float:
+    return result.inliers / max(result.source_points, 1)

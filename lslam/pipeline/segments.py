@@ -1,0 +1,201 @@
+"""The segments of a run as sessions: each is searched among those before it, and what is found stands in one frame."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config import Config
+from lslam.geometry import noise, se3
+from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.keyframes.store import KeyframeStore, PartOfStore
+from lslam.localization.sessions import Chain, Session, Vicinity, tie
+from lslam.localization.start import AGREEING
+from lslam.loops.detector import LEAST_REACH
+from lslam.pipeline.manifest import Manifest
+from lslam.types.motion_check import MotionCheck
+from lslam.types.scan_result import ScanResult
+from lslam.types.segment import Segment
+
+log = logging.getLogger("lslam")
+
+Floats = NDArray[np.float64]
+MOST_SAID = 6
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A segment, and its scans and keyframes as a session; None where its map left no initialisation."""
+
+    segment: Segment
+    results: list[ScanResult]
+    session: Session | None
+
+
+def join_segments(
+    results: list[ScanResult], store: KeyframeStore, config: Config, manifest: Manifest, should_stop: Callable[[], bool]
+) -> list[ScanResult]:
+    """The results in as few frames as the segments allow, that of most scans being 0; its keyframes stay in the store.
+
+    The manifest names the segments. A run of one segment is left alone; one that is asked to stop searches no further.
+    """
+    first = next((k for k, r in enumerate(results) if r.status == "ok"), 0)
+    if not first and not results[-1].segment:
+        return results
+    # What was recorded before the first registered scan has no place in its frame.
+    runs = groupby(range(len(results)), lambda k: results[k].segment if k >= first else -1)
+    parts = [_part([results[k] for k in run], n, store, config) for n, (_, run) in enumerate(runs)]
+    frames: list[list[_Part]] = []
+    with manifest.timed("segments_s"):
+        for part in parts:
+            _place(part, frames, config, should_stop)
+    frames.sort(key=lambda frame: -sum(part.segment.registered for part in frame))
+    for number, frame in enumerate(frames):
+        frame[:] = [replace(part, segment=replace(part.segment, frame=number)) for part in frame]
+    # What does not fit the frame of most scans may have come first, when nothing was there to be searched.
+    unfit = next((part.segment.reason for part in frames[0] if part.segment.reason), "")
+    frames[1:] = [
+        [replace(p, segment=replace(p.segment, reason=p.segment.reason or p.segment.tied_by or unfit)) for p in frame]
+        for frame in frames[1:]
+    ]
+    placed = sorted((part for frame in frames for part in frame), key=lambda part: part.segment.number)
+    moved = {part.segment.number: part.results for part in placed} | _chained(frames[0], store, config)
+    manifest.segments = [asdict(part.segment) for part in placed]
+    _say([part.segment for part in placed], manifest)
+    # Where a frame of its own lies, nobody knows.
+    return [
+        replace(r, frame=part.segment.frame, is_lost=part.segment.frame > 0)
+        for part in placed
+        for r in moved[part.segment.number]
+    ]
+
+
+def checks_within(checks: list[MotionCheck], results: list[ScanResult]) -> list[MotionCheck]:
+    """The checks of motions within one segment: across a border nothing was claimed."""
+    return [check for check in checks if results[check.first].segment == results[check.last].segment]
+
+
+def _part(scans: list[ScanResult], number: int, store: KeyframeStore, config: Config) -> _Part:
+    scans = [replace(r, segment=number) for r in scans]
+    registered = sum(r.status == "ok" for r in scans)
+    segment = Segment(number, scans[0].index, scans[-1].index, len(scans), registered)
+    stamps = {r.stamp_ns for r in scans}
+    own = PartOfStore(store, [k.number for k in store.keyframes if k.stamp_ns in stamps])
+    if registered <= config.registration.start_scans or not own.keyframes:
+        return _Part(replace(segment, reason=f"given up, {registered} of {len(scans)} registered"), scans, None)
+    return _Part(segment, scans, Session(f"segment {number}", own, own.keyframes, scans))
+
+
+def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: Callable[[], bool]) -> None:
+    """Add the part to the first frame, the largest first, that it is found in; else it begins another."""
+    reasons = []
+    for frame in sorted(frames, key=lambda frame: -sum(other.segment.registered for other in frame)):
+        known = [other.session for other in frame if other.session is not None]
+        if part.session is None or not known:
+            continue
+        found, reason = tie(part.session, known, config, should_stop, _vicinity(known[-1], part.session))
+        if found is not None and found.start is not None and found.start.votes < AGREEING:
+            found, reason = None, "it is too short for two of its keyframes to agree on a place"
+        if found is not None and found.start is not None:
+            said = f"place search: {found.start.votes} of {found.start.tried} keyframes tried agree"
+            frame.append(replace(part, session=found, segment=replace(part.segment, tied_by=said)))
+            return
+        reasons.append(reason)
+    frames.append([replace(part, segment=replace(part.segment, reason=part.segment.reason or "; ".join(reasons)))])
+
+
+def _vicinity(before: Session, session: Session) -> Vicinity:
+    """Where the sensor may have come to since the last registered scan: as fast as there, but for what it may change."""
+    (a, b), first = [r for r in before.results if r.status == "ok"][-2:], session.keyframes[0]
+    seconds = max(1e-9 * (first.stamp_ns - b.stamp_ns), 0.0)
+    start, end = (before.T_town_session @ r.T_world_lidar for r in (a, b))
+    steps = 1e9 * seconds / max(b.stamp_ns - a.stamp_ns, 1)
+    reach = 0.5 * ConstantVelocity.MAX_ACCELERATION * seconds**2
+    return Vicinity(end[:3, 3] + steps * (end[:3, 3] - start[:3, 3]), max(reach, LEAST_REACH))
+
+
+def _chained(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> dict[int, list[ScanResult]]:
+    """The scans of each segment of the frame as of one drive, whose keyframes alone stay in the store."""
+    sessions = [part.session for part in frame if part.session is not None]
+    if not sessions:
+        return {}
+    drive, kept, out = Chain(sessions, config), [], {}
+    keyframes = drive.keyframes()
+    for n, session in enumerate(sessions):
+        chained = keyframes[drive.part(n)]
+        first, T = chained[0], session.T_town_session
+        # What the first scan of the segment knows of its own map is small beside the tie.
+        base = np.zeros((6, 6)) if n == 0 or first.covariance is None else first.covariance
+        out[session.results[0].segment] = [_moved(r, T, first.T_world_lidar[:3, 3], base) for r in session.results]
+        assert isinstance(session.store, PartOfStore)
+        if n:
+            last = sessions[n - 1]
+            out[last.results[0].segment] = _bridged(out[last.results[0].segment], last.T_town_session, session)
+        of_scan = {r.stamp_ns: r for r in out[session.results[0].segment]}
+        for own, now in zip(session.store.whole, chained, strict=True):
+            moved = of_scan[own.stamp_ns]
+            kept.append(
+                replace(own, T_world_lidar=moved.T_world_lidar, covariance=moved.covariance, distance=now.distance)
+            )
+    store.keep(kept)
+    store.save()
+    return out
+
+
+def _bridged(results: list[ScanResult], T: Floats, following: Session) -> list[ScanResult]:
+    """The results, those after the last registered one between what `T` (4, 4) makes of their priors and the next segment does.
+
+    The next segment begins at the prior of its first scan, so that the two differ by what the priors erred over the gap.
+    """
+    last = max(k for k, r in enumerate(results) if r.status == "ok")
+    begin_ns, end_ns = results[last].stamp_ns, following.results[0].stamp_ns
+    wrong = se3.inverse(T) @ following.T_town_session
+    out = results[: last + 1]
+    for result in results[last + 1 :]:
+        prior = se3.inverse(T) @ result.T_world_lidar
+        share = (result.stamp_ns - begin_ns) / (end_ns - begin_ns)
+        step = share * se3.log(se3.relative(prior, wrong @ prior))
+        out.append(replace(result, T_world_lidar=se3.normalise(result.T_world_lidar @ se3.exp(step))))
+    return out
+
+
+def _moved(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanResult:
+    """The result in the world that T (4, 4) leads to, its covariance beside that of the segment's `origin` (3,), m."""
+    pose = se3.normalise(T @ result.T_world_lidar)
+
+    def turned(covariance: Floats | None) -> Floats | None:
+        return None if covariance is None else noise.rotated(covariance, T[:3, :3])
+
+    def chained(covariance: Floats | None) -> Floats | None:
+        own = turned(covariance)
+        return None if own is None else np.asarray(own + noise.transported(base, pose[:3, 3] - origin))
+
+    return replace(
+        result, T_world_lidar=pose, covariance=chained(result.covariance), points_covariance=chained(result.points_covariance),
+        registration_covariance=turned(result.registration_covariance),
+        degenerate=result.degenerate @ np.kron(np.eye(2), T[:3, :3]).T,
+    )  # fmt: skip
+
+
+def _say(segments: Sequence[Segment], manifest: Manifest) -> None:
+    said = [_sentence(segment) for segment in segments]
+    said = [sentence for sentence in said if sentence]
+    if len(said) > MOST_SAID:
+        said = [*said[:MOST_SAID], f"and {len(said) - MOST_SAID} more segments: see segments in manifest.json"]
+    for sentence in said:
+        log.warning("%s", sentence)
+    manifest.problems += said
+
+
+def _sentence(segment: Segment) -> str:
+    what = f"{segment.span}, segment {segment.number}"
+    if segment.frame:
+        return f"{what}: not tied to the trajectory, in frame {segment.frame}, of its own: {segment.reason}"
+    if segment.tied_by:
+        return f"tracking was lost before scan {segment.first}; {what}: tied to those before by {segment.tied_by}"
+    return ""
