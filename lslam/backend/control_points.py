@@ -19,6 +19,7 @@ from lslam.graph.chi_square import quantile
 from lslam.graph.consistency import Drift
 from lslam.graph.problem import PositionFix
 from lslam.maps.georeference import Projection, to_wgs84
+from lslam.preprocessing.ground import world_up_of
 from lslam.printable import counted
 from lslam.types.gnss import Georeference
 from lslam.types.keyframe import Keyframe
@@ -40,7 +41,7 @@ def with_control(
 ) -> Placement:  # fmt: skip
     """The placement with the control points as held fixes; where there is none, they give it.
 
-    results : at the poses of odometry; up : (3,) up in their world as an IMU has it, None for its z axis
+    results : at the poses of odometry; up : (3,) up in their world as an IMU has it, None for how the sensor is mounted
 
     Raises UsageError for coordinates that PROJ does not know or that are none of a place.
     """
@@ -50,7 +51,8 @@ def with_control(
     sigmas = np.stack([point.sigma for point in points])
     known = placement.georeference
     if known is None:
-        level = so3.least_rotation(np.array([0.0, 0.0, 1.0]) if up is None else up, np.array([0.0, 0.0, 1.0]))
+        direction = world_up_of(config.preprocess, results[0].T_world_lidar) if up is None else up
+        level = so3.least_rotation(direction, np.array([0.0, 0.0, 1.0]))
         enu = geodesy.to_local(on_earth, on_earth[0])
         T = _aligned(seen @ level.T, enu, sigmas)
         if T is None:

@@ -30,6 +30,7 @@ from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_mark
 from lslam.graph.gnss_alignment import GnssAlignment
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
+from lslam.preprocessing.ground import world_up_of
 from lslam.types.gnss import Georeference, GnssStream
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
@@ -108,7 +109,8 @@ def place(
     assert stream is not None
     T_lidar_gnss = sequence.calibration.T_lidar_gnss
     arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
-    direction, sigma = (np.array([0.0, 0, 1.0]), UNLEVELLED) if up is None else (up, LEVELLED)
+    mounted = world_up_of(config.preprocess, results[0].T_world_lidar)
+    direction, sigma = (mounted, UNLEVELLED) if up is None else (up, LEVELLED)
     level = so3.least_rotation(direction, np.array([0.0, 0.0, 1.0]))
     fixes, faults = _on_one_clock(stream, results, arm, level, config)
     if isinstance(fixes, str):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.config.graph import GraphConfig
 from lslam.graph.problem import FloorPlane, UpDirection
 from lslam.keyframes.store import KeyframeStore
-from lslam.preprocessing.ground import levelling
+from lslam.preprocessing.ground import Z, levelling
 from lslam.stopping import checking
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
@@ -57,13 +57,16 @@ def world_up(ups: Sequence[UpDirection], keyframes: Sequence[Keyframe]) -> Float
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def floor_planes(store: KeyframeStore, config: GraphConfig) -> list[FloorPlane]:
-    """The floor plane under each keyframe that is level and as far below as usual."""
+def floor_planes(store: KeyframeStore, config: GraphConfig, up: Floats = Z, world_up: Floats = Z) -> list[FloorPlane]:
+    """The floor plane under each keyframe that is level and as far below as usual.
+
+    up : (3,) unit vector up in the LiDAR frame; world_up : (3,) that in the world of the keyframes
+    """
     planes = []
     for keyframe in checking(store.keyframes):
-        R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS)
+        R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS, up)
         normal = R[2]
-        if not np.isfinite(height) or (keyframe.T_world_lidar[:3, :3] @ normal)[2] < np.cos(STEEPEST):
+        if not np.isfinite(height) or world_up @ keyframe.T_world_lidar[:3, :3] @ normal < np.cos(STEEPEST):
             continue
         planes.append(FloorPlane(keyframe.number, normal, -height, float(np.deg2rad(config.floor_deg)), config.floor_m))
     usual = float(np.median([p.offset for p in planes])) if planes else 0.0

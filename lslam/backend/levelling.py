@@ -17,7 +17,8 @@ from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.kernels import jit
 from lslam.locks import one_at_a_time
-from lslam.preprocessing.ground import levelling
+from lslam.preprocessing.ground import levelling, up_of
+from lslam.preprocessing.up import NEAR_Z
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
@@ -66,7 +67,7 @@ def find_level(sequence: Sequence, results: list[ScanResult], config: Config) ->
     if up is None:
         problem = "" if config.input.level == "auto" else f"input.level = {wanted}: {why}; the world is not levelled"
         return Level(np.eye(3), f"{ORIGIN}, not levelled", problem)
-    R = so3.least_rotation(up, UP)
+    R = so3.least_rotation(up, UP) if up[2] > NEAR_Z else so3.level_frame(up)
     tilt, known = np.rad2deg(float(so3.angle(R))), np.rad2deg(sigma)
     if tilt < SIGNIFICANT * known:
         return Level(
@@ -120,6 +121,7 @@ def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config)
         if result.status != "ok" or result.frame:
             continue
         with suppress(InputError), jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
-            R, height = levelling(sequence.scan(number).points, config.preprocess.ground_tolerance, CELLS)
+            tolerance, up = config.preprocess.ground_tolerance, up_of(config.preprocess)
+            R, height = levelling(sequence.scan(number).points, tolerance, CELLS, up)
             return np.asarray(result.T_world_lidar[:3, :3] @ R[2]) if np.isfinite(height) else None
     return None

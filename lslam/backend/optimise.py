@@ -36,6 +36,7 @@ from lslam.graph.odometry_constraints import bent, fitness_covariance, fitness_s
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
+from lslam.preprocessing.ground import up_of, world_up_of
 from lslam.stopping import checking
 from lslam.types.constraint import LoopCandidate, Turn
 from lslam.types.gnss import Georeference
@@ -225,7 +226,8 @@ def _graph(given: Given, inertial: InertialChain | None) -> PoseGraph:
     up = world_up(ups, store.keyframes)
     poses = np.stack([k.T_world_lidar for k in store.keyframes])
     distances = np.array([k.distance for k in store.keyframes])
-    seen = floor_planes(store, config.graph) if config.graph.floor else []
+    horizon = world_up_of(config.preprocess, store.keyframes[0].T_world_lidar)
+    seen = floor_planes(store, config.graph, up_of(config.preprocess), horizon) if config.graph.floor else []
     floors = on_one_plane(seen, poses, distances, config.graph) if config.graph.floor_is_flat else seen
     if seen and not floors:
         given.problems.append(
@@ -242,5 +244,5 @@ def _graph(given: Given, inertial: InertialChain | None) -> PoseGraph:
         distances=distances,
         ups=ups,
         inertial=inertial,
-        world_up=np.array([0.0, 0.0, 1.0]) if up is None else up,
+        world_up=horizon if up is None else up,
     )

@@ -19,6 +19,11 @@ class PreprocessConfig(Section):
         None,
         description="m; x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame: points inside are dropped",
     )
+    up: tuple[float, float, float] | None = Field(
+        None,
+        description="up in the LiDAR frame, of any length; absent: z, unless the IMU, or the ground under the first scans, is "
+        "more than 45 deg off",
+    )
     remove_ground: bool = Field(False, description="take out the points that lie on the ground")
     ground_slope: float = Field(0.2, gt=0, lt=1, description="m/m; steepest ground against the plane under the sensor")
     ground_tolerance: float = Field(0.25, gt=0, description="m; what is lower above the ground counts as ground")
@@ -61,4 +66,6 @@ class PreprocessConfig(Section):
         box = self.ego_box
         if box is not None and not (box[0] < box[1] and box[2] < box[3] and box[4] < box[5]):
             raise ValueError(f"ego_box = {list(box)} must be x_min, x_max, y_min, y_max, z_min, z_max")
+        if self.up is not None and not 0.0 < sum(v * v for v in self.up) < float("inf"):
+            raise ValueError(f"up = {list(self.up)} must be a direction: three finite numbers, not all 0")
         return self

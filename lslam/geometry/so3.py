@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from lslam.geometry import portable
 
 Floats = NDArray[np.float64]
+# Length of x as seen from above, below which it is vertical: 15 deg.
+_STEEP = 0.25
 
 
 def hat(v: NDArray[Any]) -> Floats:
@@ -65,6 +67,20 @@ def least_rotation(a: Floats, b: Floats) -> Floats:
         axis = np.eye(3)[least] - a[least] * a
         return exp(np.pi * axis / portable.norm(axis))
     return exp(axis / sine * portable.arctan2(sine, cosine))
+
+
+def level_frame(up: Floats) -> Floats:
+    """(3, 3) rotation that makes the unit vector `up` (3,) the z axis and keeps x ahead as seen from above.
+
+    Where x is nearly vertical, the least rotation. The identity for up = z.
+    """
+    if np.array_equal(up, (0.0, 0.0, 1.0)):
+        return np.eye(3)
+    ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    length = float(portable.norm(ahead))
+    if length < _STEEP:
+        return least_rotation(up, np.array([0.0, 0.0, 1.0]))
+    return np.stack([ahead / length, np.cross(up, ahead / length), up])
 
 
 def to_quaternion(R: NDArray[Any]) -> Floats:

@@ -16,6 +16,7 @@ from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.odometry.feature_solver import NONE, FeatureNoise, map_problem, remap_solution, solve_on_map
 from lslam.odometry.feature_steps import ScanStep
 from lslam.preprocessing.features import Features
+from lslam.preprocessing.ground import Z
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
@@ -54,6 +55,7 @@ class FeatureTarget(Target):
     """The last scan's features and the feature map.
 
     reach : m, how far from the sensor the map is kept
+    up : (3,) unit vector, up in the LiDAR frame
     with_start_search : whether the second scan is sought within `start_reach`
     with_all_points : whether `icp` on all points is kept beside it
     """
@@ -64,19 +66,19 @@ class FeatureTarget(Target):
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, variant: LoamVariant, reach: float = 120.0, *,
-        with_start_search: bool = True, with_all_points: bool = False,
+        up: Floats = Z, with_start_search: bool = True, with_all_points: bool = False,
     ) -> None:  # fmt: skip
         self.config, self.loam, self.variant, self._reach = config, loam, variant, reach
         self.map = self._new_map(1 << 16) if variant.with_map else None
         self.scan: FeatureScan | None = None
         self.all_points = AllPoints(config, self._plane_size(config.voxel_size)) if with_all_points else None
         self._keyframes = None if variant.keyframes is None else FeatureKeyframes(*variant.keyframes)
-        self._failures, self._with_start_search = 0, with_start_search
+        self._failures, self._with_start_search, self._up = 0, with_start_search, up
 
     def fresh(self) -> FeatureTarget:
         """An empty one of the same settings."""
         return FeatureTarget(
-            self.config, self.loam, self.variant, self._reach, with_start_search=self._with_start_search,
+            self.config, self.loam, self.variant, self._reach, up=self._up, with_start_search=self._with_start_search,
             with_all_points=self.all_points is not None,
         )  # fmt: skip
 
@@ -203,7 +205,7 @@ class FeatureTarget(Target):
         if history.inserted > 1 or not self._with_start_search:
             return result
         # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
-        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP)]
+        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP, self._up)]
         tried = [on_coarse(T_prior @ T, 2 * START_STEP) for T in offsets]
         agree = [edges_at(one) for one in tried]
         most, usual = max(agree, default=0), max(edges_at(result), 0)

@@ -15,6 +15,7 @@ from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features, extract_features
+from lslam.preprocessing.ground import up_of
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
@@ -47,7 +48,7 @@ class Loam(Stateful):
         self.config, self.variant = config, variant
         c, reach = config.registration, 1.2 * config.preprocess.range_max
         target = FeatureTarget(
-            c, config.loam, variant, reach, with_start_search=config.recovery.start_search,
+            c, config.loam, variant, reach, up=up_of(config.preprocess), with_start_search=config.recovery.start_search,
             with_all_points=config.recovery.fallback == "all-points",
         )  # fmt: skip
         policies = feature_policies(config.recovery)

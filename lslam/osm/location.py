@@ -30,6 +30,7 @@ from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading
 from lslam.osm.walls import OsmMap, find_walls
+from lslam.preprocessing.ground import up_of, world_up_of
 from lslam.stopping import checking
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import Verdict
@@ -138,9 +139,11 @@ def finish(
 
 
 def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Floats:
-    """Up (3,) in the world of odometry: median normal of the ground below all keyframes, z axis without any ground."""
-    normals = [odometry[f.keyframe, :3, :3] @ f.normal for f in floor_planes(store, config.graph)]
-    up = np.median(normals, axis=0) if normals else UP
+    """Up (3,) in the world of odometry: median normal of the ground below all keyframes, or as the sensor is mounted."""
+    mounted = world_up_of(config.preprocess, odometry[0])
+    floors = floor_planes(store, config.graph, up_of(config.preprocess), mounted)
+    normals = [odometry[f.keyframe, :3, :3] @ f.normal for f in floors]
+    up = np.median(normals, axis=0) if normals else mounted
     return np.asarray(up / np.linalg.norm(up))
 
 

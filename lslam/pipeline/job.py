@@ -19,6 +19,7 @@ from lslam.errors import InputError, InterruptedRunError
 from lslam.evaluation.frames import main_axis
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.frontend.inertial_start import with_imu_settings
+from lslam.frontend.mounting import with_up
 from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import sweep_of
 from lslam.frontend.scene_scale import with_scene_scale
@@ -82,7 +83,7 @@ def prepare(
     sequence = with_streams(sequence, config.imu.use, config.gnss.mode != "off")
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if truth is None else truth
-    config = with_scene_scale(config, sequence)
+    config = with_up(sequence, with_scene_scale(config, sequence))
     odometry = create_odometry(with_imu_settings(config))
     given: Trajectory | None = None
     if isinstance(odometry, GivenPoses):

@@ -1,7 +1,8 @@
 """Points that lie on the ground, found by height alone: no rings, no mounting height, on slopes and under a tilted sensor.
 
 First the dominant plane: of all planes through three of the lowest points of a grid, the one with most lowest points
-near it and fewest below (RANSAC, Fischler and Bolles 1981). It levels the scan, so the tilt of a drone is no slope. Then the
+near it and fewest below (RANSAC, Fischler and Bolles 1981). It levels the scan, so the tilt of a drone is no slope. The grid
+is level where `up` is vertical, which a sensor that hangs or lies has elsewhere than along its z. Then the
 slope filter of Vosselman (2000): a point is no ground when another one lies so much lower that the ground between them
 would be steeper than `slope`. Mirrors and puddles put points under the ground: what no such slope joins to the plane
 under the sensor is not asked for its opinion.
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import so3
 from lslam.kernels import ground
 
@@ -23,8 +25,24 @@ Floats = NDArray[np.float64]
 CELL = 0.5
 REACH = 150.0
 TRIPLES = 200
-# Planes steeper than 40 deg against the sensor are walls or roofs.
+# Planes steeper than 40 deg against the expected horizontal are walls or roofs.
 UPRIGHT = float(np.cos(np.deg2rad(40.0)))
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def up_of(config: PreprocessConfig) -> Floats:
+    """(3,) unit vector up in the LiDAR frame as configured; z where nothing is."""
+    return Z if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
+
+
+def ahead_of(config: PreprocessConfig, up: Floats) -> Floats:
+    """(3,) unit vector ahead in the LiDAR frame in which `up` (3,) is up: x, or of a turned sensor x of the level frame."""
+    return np.array([1.0, 0.0, 0.0]) if config.up is None else np.asarray(so3.level_frame(up)[0])
+
+
+def world_up_of(config: PreprocessConfig, T_world_lidar: Floats) -> Floats:
+    """(3,) unit vector up in the world by the first pose (4, 4); z where nothing is configured."""
+    return Z if config.up is None else np.asarray(T_world_lidar[:3, :3] @ up_of(config))
 
 
 @dataclass(frozen=True)
@@ -40,22 +58,25 @@ class Ground:
         return ground.above(points, self.R, CELL, self.half, self.top, height)
 
 
-def above_ground(points: NDArray[np.float32], slope: float, tolerance: float) -> NDArray[np.int64]:
+def above_ground(
+    points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z
+) -> NDArray[np.int64]:  # fmt: skip
     """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground (`ground_of`), increasing."""
-    return ground_of(points, slope, tolerance).above(points, tolerance)
+    return ground_of(points, slope, tolerance, up).above(points, tolerance)
 
 
-def ground_of(points: NDArray[np.float32], slope: float, tolerance: float) -> Ground:
+def ground_of(points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z) -> Ground:
     """The ground under the points (N, 3), m, LiDAR frame, of a scan.
 
-    slope : steepest ground, m per m, against the dominant plane; tolerance : height that still counts as ground, m.
-    Without a plane to be found nothing is levelled and the slope is that against the sensor's own horizontal.
+    slope : steepest ground, m per m, against the dominant plane; tolerance : height that still counts as ground, m
+    up : (3,) unit vector, about which the dominant plane's normal is looked for
+    Without a plane to be found the slope is that against the horizontal of `up`.
     """
     if len(points) < 3:
         return Ground(np.eye(3), 1, np.full((2, 2), ground.EMPTY))
     farthest = float(np.sqrt(np.einsum("ij,ij->i", points, points).max()))
     half = int(np.ceil(min(farthest, REACH) / CELL)) + 1
-    R, floor = levelling(points, tolerance, half)
+    R, floor = levelling(points, tolerance, half, up)
     index = ground.lowest(points, R, CELL, half)
     low = points[index[index >= 0]].astype(np.float64) @ R.T
     is_under = low[:, 2] < floor - tolerance - slope * np.hypot(low[:, 0], low[:, 1])
@@ -64,11 +85,20 @@ def ground_of(points: NDArray[np.float32], slope: float, tolerance: float) -> Gr
     return Ground(R, half, ground.envelope(height.reshape(2 * half, 2 * half), slope * CELL, tolerance))
 
 
-def levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:
+def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floats = Z) -> tuple[Floats, float]:
     """(3, 3) rotation that makes the dominant plane of the lowest points horizontal, and its height then, m.
 
-    Without such a plane the identity and minus infinity.
+    Without such a plane the frame levelled by `up` (3,), and minus infinity.
     """
+    if np.array_equal(up, Z):
+        return _levelling(points, tolerance, half)
+    turn = so3.level_frame(up)
+    R, height = _levelling(np.ascontiguousarray(points @ turn.T.astype(np.float32)), tolerance, half)
+    return R @ turn, height
+
+
+def _levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:
+    """`levelling` of points whose z is about up."""
     index = ground.lowest(points, np.eye(3), CELL, half)
     low = points[index[index >= 0]].astype(np.float64)
     if len(low) < 3:

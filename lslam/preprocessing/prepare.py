@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import voxel
-from lslam.preprocessing.ground import above_ground
+from lslam.preprocessing.ground import above_ground, up_of
 from lslam.preprocessing.weather_filter import on_surfaces
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
@@ -115,7 +115,7 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArra
     """
     kept = voxel.gate(points, *_gate_of(config))
     if config.remove_ground:
-        kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance)]
+        kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance, up_of(config))]
     if config.denoise:
         from lslam.preprocessing.weather_filter import dense_points
 

@@ -22,7 +22,7 @@ from lslam.preprocessing.features import (
     features_along,
     walk_rings,
 )
-from lslam.preprocessing.ground import CELL, REACH, levelling
+from lslam.preprocessing.ground import CELL, REACH, levelling, up_of
 from lslam.types.scan import Scan
 
 # m; a ring's next neighbour on the ground is at least so far off, so that noise does not tilt the line between them.
@@ -63,15 +63,16 @@ def lego_features(
     Raises InputError as `extract_features` does.
     """
     config = config or LoamConfig()
-    walk = walk_rings(scan, gate or PreprocessConfig())
-    segments = _segment(scan, walk, config)
+    gate = gate or PreprocessConfig()
+    walk = walk_rings(scan, gate)
+    segments = _segment(scan, walk, config, up_of(gate))
     allowed = np.uint8(MAY_BE_EDGE | MAY_BE_FLAT) * (segments.labels > 0)
     allowed += np.uint8(MAY_BE_PLANE | MAY_BE_FLAT) * segments.ground
     return features_along(scan, walk, config, allowed), segments
 
 
-def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
-    slopes = range_image.row_slopes(walk.points, walk.starts)
+def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: NDArray[np.float64]) -> Segments:
+    slopes = range_image.row_slopes(walk.points, walk.starts) * (1.0 if vertical[2] >= 0 else -1.0)
     known = np.flatnonzero(np.isfinite(slopes))
     row = np.zeros(len(slopes), np.int64)
     upwards = known[np.argsort(slopes[known], kind="stable")]
@@ -81,7 +82,7 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
     elevation = np.arctan(np.sort(slopes[known]))
     columns = max(round(2 * np.pi / walk.step), 1)
     pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(known), columns)
-    up, floor = _floor(walk, upwards[: max(1, len(upwards) // _LOWEST)])
+    up, floor = _floor(walk, upwards[: max(1, len(upwards) // _LOWEST)], vertical)
     ground = range_image.find_ground(
         walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE
     )
@@ -92,7 +93,9 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig) -> Segments:
     return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
 
 
-def _floor(walk: RingWalk, lowest: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
+def _floor(
+    walk: RingWalk, lowest: NDArray[np.int64], vertical: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:  # fmt: skip
     """The upward direction (3,) and the height of the dominant plane along it, m.
 
     It is looked for where the vehicle stands or the drone hovers: within a few times the range at which the `lowest` rings
@@ -101,7 +104,7 @@ def _floor(walk: RingWalk, lowest: NDArray[np.int64]) -> tuple[NDArray[np.float6
     first = np.concatenate([np.arange(walk.starts[k], walk.starts[k + 1]) for k in lowest])
     reach = min(_FLOOR_REACH * float(np.median(walk.ranges[first])), REACH)
     near = np.flatnonzero(walk.ranges < reach)[::_FLOOR_SHARE]
-    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(reach / CELL) + 1)
+    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(reach / CELL) + 1, vertical)
     if floor == -np.inf:
-        floor = float(np.median(walk.points[first, 2]))
+        floor = float(np.median(walk.points[first] @ vertical))
     return np.ascontiguousarray(R[2]), floor

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
+from lslam.preprocessing.ground import Z
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
@@ -114,9 +115,10 @@ class MapAlignment:
         return solve((coarse_map,), points, start, annealing, self.config)
 
 
-def upright_directions(T_prior: Floats) -> Floats:
-    """(6, 6) projector on the sensor's z, roll and pitch at a pose (4, 4), world axes."""
-    along_z = np.outer(T_prior[:3, 2], T_prior[:3, 2])
+def upright_directions(T_prior: Floats, up: Floats = Z) -> Floats:
+    """(6, 6) projector on height, roll and pitch at a pose (4, 4) of a sensor in whose frame `up` (3,) is up, world axes."""
+    vertical = T_prior[:3, :3] @ up
+    along = np.outer(vertical, vertical)
     projector = np.zeros((6, 6))
-    projector[:3, :3], projector[3:, 3:] = along_z, np.eye(3) - along_z
+    projector[:3, :3], projector[3:, 3:] = along, np.eye(3) - along
     return projector

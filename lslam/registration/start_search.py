@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3, so3
-from lslam.preprocessing.ground import Ground, above_ground, ground_of
+from lslam.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
 from lslam.preprocessing.prepare import PreparedPoints, subset, thin
 from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
@@ -56,8 +56,9 @@ class NonGroundPoints:
 
     def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:
         self._cells = GaussianMap(NEAR, min_points=1, planarity=NO_PLANES, reach=np.inf, capacity=1 << 12)
+        self._up = up_of(preprocess)
         for points, T_world_lidar in scans:
-            index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance)
+            index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance, self._up)
             self._cells.insert(points[index], T_world_lidar)
 
     def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Flags:
@@ -76,14 +77,14 @@ class NonGroundPoints:
 
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
-        level = np.eye(6) - upright_directions(T_start)
+        level = np.eye(6) - upright_directions(T_start, self._up)
         annealing = Annealing(REACH, NEAR / 2, 0.7, 20)
         return solve((self._cells,), seen, T_start, annealing, ALL_ALIKE, residual=MEANS, allowed=level)
 
 
 def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground:
     """The ground under a scan."""
-    return ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance)
+    return ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance, up_of(preprocess))
 
 
 def sought(points: PreparedPoints, ground: Ground) -> PreparedPoints:
@@ -139,7 +140,7 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
         return aligned.moved(upright(aligned.T_world_lidar), aligned.covariance)
 
     def upright(pose: Floats) -> Floats:
-        directions = upright_directions(pose)
+        directions = upright_directions(pose, up_of(target.preprocess))
         aligned: RegistrationResult = target.refine(flat, pose, width, c.start_iterations, coarser, directions)
         return aligned.T_world_lidar
 
@@ -148,7 +149,7 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
 
     starts = [T_prior]
     if is_lost or not result.ok:
-        starts.append(_likeliest(non_ground, seen, T_prior, c.start_reach))
+        starts.append(_likeliest(non_ground, seen, T_prior, c.start_reach, up_of(target.preprocess)))
     aligned = max(map(placed, starts), key=lambda at: np.count_nonzero(agreeing(at)))
     place, most = aligned.T_world_lidar, agreeing(aligned)
     last = attempt.history.recent[-1][1]
@@ -175,7 +176,7 @@ def _best_start(
     slow = target.slowly(2 * START_STEP)
     tried = [
         target.on_planes(coarse_map, few, attempt.T_prior @ se3.make(np.eye(3), offset), slow)
-        for offset in start_offsets(attempt.config.start_reach, START_STEP)
+        for offset in start_offsets(attempt.config.start_reach, START_STEP, up_of(target.preprocess))
     ]
     # Without non-ground points, as in hills, the ground decides.
     tried.sort(key=lambda at: (-non_ground.share(seen, at.T_world_lidar), -at.inliers))
@@ -192,11 +193,13 @@ def _best_start(
     return best
 
 
-def _likeliest(non_ground: NonGroundPoints, seen: PreparedPoints, T_prior: Floats, reach: float) -> Floats:
-    """(4, 4) pose up to `reach`, m, from the prior, or turned about its z, at which most points have one near by."""
-    moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR)]
+def _likeliest(
+    non_ground: NonGroundPoints, seen: PreparedPoints, T_prior: Floats, reach: float, up: Floats
+) -> Floats:  # fmt: skip
+    """(4, 4) pose up to `reach`, m, from the prior, or turned about `up`, at which most points have one near by."""
+    moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR, up)]
     turns = np.deg2rad(START_TURNS_DEG)
-    turned = [T_prior @ se3.make(so3.exp(np.array([0, 0, turn])), np.zeros(3)) for turn in turns]
+    turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in turns]
     return max([*moved, *turned], key=lambda start: non_ground.share(seen, start))
 
 
@@ -226,10 +229,10 @@ def distinct(results: list[RegistrationResult], known: Floats) -> list[Registrat
     return chosen[:LOOKED_AT]
 
 
-def start_offsets(reach: float, step: float) -> Floats:
-    """(N, 3) m in the LiDAR frame, nearest first: ahead and back up to `reach`, sideways one step at most."""
+def start_offsets(reach: float, step: float, up: Floats = Z) -> Floats:
+    """(N, 3) m in the LiDAR frame, nearest first: level, ahead and back up to `reach`, sideways one step at most."""
     count = int(np.ceil(reach / step - 1e-9))
     ahead = [sign * min(k * step, reach) for k in range(1, count + 1) for sign in (1, -1)]
     sideways = [sign * min(step, reach) for sign in (1, -1)] if count else []
     offsets = np.array([(x, 0.0, 0.0) for x in ahead] + [(0.0, y, 0.0) for y in sideways]).reshape(-1, 3)
-    return offsets[np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")]
+    return offsets[np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")] @ so3.level_frame(up)

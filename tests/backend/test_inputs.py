@@ -36,6 +36,16 @@ def test_floors_are_planes_in_the_axes_of_their_keyframes() -> None:
         assert (plane.sigma_m, plane.sigma_rad) == (0.2, np.deg2rad(2.0))
 
 
+def test_floors_of_a_sensor_upside_down_lie_above_it_in_its_world() -> None:
+    store = KeyframeStore()
+    R = np.diag([1.0, -1.0, -1.0])
+    store.add(Keyframe(0, 0, 0, np.eye(4)), (ground(1.7) @ R).astype(np.float32))
+    (plane,) = floor_planes(store, GraphConfig(), R[2], R[2])
+    np.testing.assert_allclose(plane.normal, R[2], atol=5e-3)
+    assert abs(plane.offset - 1.7) < 0.03
+    assert floor_planes(store, GraphConfig())[0].offset < 0, "without up the sensor lies under it"
+
+
 def test_nothing_below_is_no_floor() -> None:
     store = KeyframeStore()
     store.add(Keyframe(0, 0, 0, np.eye(4)), np.zeros((1, 3), np.float32))

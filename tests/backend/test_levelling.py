@@ -138,6 +138,17 @@ def test_the_ground_makes_the_world_level() -> None:
     assert "levelled by the ground" in level.world
 
 
+@pytest.mark.parametrize("roll_deg", [172.0, 180.0, 188.0])
+def test_the_ground_under_a_sensor_upside_down_makes_the_world_level_and_ahead_stays(roll_deg: float) -> None:
+    R = so3.from_euler_rpy(np.deg2rad([roll_deg, 5.0, 0.0]))
+    scan = ground_scan(True)
+    hanging = Scan((scan.points @ TILT.T @ R).astype(np.float32), 0, 0)
+    settings = config("input.level=ground", f"preprocess.up={R[2].tolist()}")
+    level = find_level(Stub([hanging]), [ScanResult(0, 0, np.eye(4))], settings)
+    np.testing.assert_allclose(level.R @ R[2], [0, 0, 1], atol=4e-3)
+    assert level.R[0, 0] > np.cos(np.deg2rad(6.0))
+
+
 @pytest.mark.parametrize("wanted", ["ground", "gravity"])
 def test_an_unavailable_levelling_is_reported(wanted: str) -> None:
     results = [ScanResult(0, 0, np.eye(4))]

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from recovery_drives import driven, seen_by
 
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.registration.registration import Registration
 from lslam.registration.start_search import MUCH, is_much_more, start_offsets
 from lslam.simulation.scenarios import simulate
@@ -183,6 +183,12 @@ def test_starts_cover_the_configured_reach_nearest_first() -> None:
     assert (np.diff(lengths) >= 0).all()
     assert len(start_offsets(0.0, 3.0)) == 0
     assert np.abs(start_offsets(4.0, 3.0)).max() == 4.0
+
+
+@pytest.mark.parametrize("rpy_deg", [(180, 0, 0), (0, 60, 0), (0, 90, 0), (100, 0, 0)])
+def test_starts_of_a_turned_sensor_are_level_and_ahead_of_its_x(rpy_deg: tuple[int, int, int]) -> None:
+    R = so3.from_euler_rpy(np.deg2rad(rpy_deg))
+    np.testing.assert_allclose(start_offsets(9.0, 3.0, R[2]) @ R.T, start_offsets(9.0, 3.0), atol=1e-9)
 
 
 def test_a_larger_share_is_significant_and_above_the_margin() -> None:
