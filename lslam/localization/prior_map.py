@@ -14,6 +14,7 @@ from lslam.errors import InputError
 from lslam.geometry import se3
 from lslam.kernels.transform import transform
 from lslam.loops.level import find_up, level_rotation
+from lslam.preprocessing.ground import Z
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
@@ -70,11 +71,11 @@ class PriorMap:
 
 def make_prior_map(
     points: Floats, config: RegistrationConfig, georeference: Georeference | None = None, source: str = "",
-    origin: Floats | None = None,
+    origin: Floats | None = None, up: Floats = Z,
 ) -> PriorMap:  # fmt: skip
     """Level a cloud (N, 3), m, of the map's coordinates, which may be as large as those of a projection.
 
-    origin : (3,) m, what is taken from the coordinates of the file
+    origin : (3,) m, what is taken from the coordinates of the file; up : (3,) unit vector in them, about which it is looked for
     Raises InputError for a cloud without finite points.
     """
     origin = np.zeros(3) if origin is None else origin
@@ -88,7 +89,7 @@ def make_prior_map(
         reach=np.inf,
     )  # fmt: skip
     insert_all(planes, local[:: max(len(local) // LOOKED_AT, 1)])
-    T = se3.make(level_rotation(find_up([planes])).T, middle)
+    T = se3.make(level_rotation(find_up([planes], up)).T, middle)
     level = np.empty_like(local)
     transform(local, se3.make(T[:3, :3].T, np.zeros(3)), level)
     return PriorMap(level, T, georeference, source, origin)

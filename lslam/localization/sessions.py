@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
+from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import geodesy, noise, se3
 from lslam.graph.odometry_constraints import positive
 from lslam.kernels import voxel
@@ -18,6 +19,7 @@ from lslam.keyframes.submaps import submap
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import make_prior_map
 from lslam.localization.start import PlaceFinder, Start, StartPrior
+from lslam.preprocessing.ground import ahead_of, world_up_of
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.types.constraint import Constraint
 from lslam.types.gnss import Georeference
@@ -39,6 +41,7 @@ class Session:
     results : all its scans, likewise; T_town_session : (4, 4) from its world into the common one
     start : how it was found among the sessions before it, None of the first
     georeference : of its own world, None where that lies nowhere
+    preprocess : its run's, which says how the sensor was mounted
     """
 
     name: str
@@ -48,11 +51,17 @@ class Session:
     T_town_session: Floats = field(default_factory=lambda: np.eye(4))
     start: Start | None = None
     georeference: Georeference | None = None
+    preprocess: PreprocessConfig = field(default_factory=PreprocessConfig)
 
     @property
     def poses(self) -> Floats:
         """(K, 4, 4) of the keyframes in the common world."""
         return self.T_town_session @ np.stack([k.T_world_lidar for k in self.keyframes])
+
+    @property
+    def up(self) -> Floats:
+        """(3,) up in the common world by the mounting of its sensor."""
+        return world_up_of(self.preprocess, self.poses[0])
 
 
 class Chain:
@@ -157,8 +166,11 @@ def tie(
 ) -> tuple[Session | None, str]:  # fmt: skip
     """The session in the common world of the known ones, or None and why it is not found among them."""
     cloud = np.concatenate([_cloud_of(s) for s in known])
-    prior_map = make_prior_map(cloud.astype(np.float64), config.registration, source="the sessions before")
-    finder = PlaceFinder(PlaceSearch(prior_map, config.registration), _AtFinalPoses(session), config)
+    prior_map = make_prior_map(
+        cloud.astype(np.float64), config.registration, source="the sessions before", up=known[0].up
+    )
+    own = config.model_copy(update={"preprocess": session.preprocess})
+    finder = PlaceFinder(PlaceSearch(prior_map, config.registration), _AtFinalPoses(session), own)
     expected = by_georeference(session, known)
     T_level_map = se3.inverse(prior_map.T_map_level)
     prior = None if expected is None else _prior(T_level_map @ expected, session, config)
@@ -186,8 +198,8 @@ def by_georeference(session: Session, known: Sequence[Session]) -> Floats | None
 def _prior(T: Floats, session: Session, config: Config) -> StartPrior:
     """Where the first keyframe is expected by T (4, 4), from the session's world into level axes of the map."""
     first = T @ session.keyframes[0].T_world_lidar
-    c = config.localize
-    heading = float(np.arctan2(first[1, 0], first[0, 0]))
+    c, ahead = config.localize, first[:3, :3] @ ahead_of(session.preprocess, first[2, :3])
+    heading = float(np.arctan2(ahead[1], ahead[0]))
     return StartPrior(first[:2, 3], heading, c.start_radius, float(np.deg2rad(c.start_turn_deg)))
 
 

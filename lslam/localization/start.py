@@ -16,6 +16,7 @@ from lslam.keyframes.submaps import submap
 from lslam.localization.place_search import APART, PlaceSearch, Region
 from lslam.loops.level import find_up, level_rotation
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
+from lslam.preprocessing.ground import ahead_of, world_up_of
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.acceptance import MAP_MIN_INLIERS, Acceptance
 from lslam.registration.gaussian_map import GaussianMap
@@ -77,7 +78,7 @@ class Start:
 class PlaceFinder:
     """Finds the start of a drive in the map.
 
-    store : the drive's keyframes at odometry's poses
+    store : the drive's keyframes at odometry's poses; config : also of how its sensor is mounted
     reasons : why keyframes found no place
     """
 
@@ -137,7 +138,8 @@ class PlaceFinder:
     def _level(self) -> Floats:
         """(3, 3) the rotation that makes odometry's world level, by its first submap."""
         cloud = submap(self.store, self._poses, 0, self.config.keyframes.submap_size, T_world_frame=np.eye(4))
-        return level_rotation(find_up([make_level_submap(cloud, self.config.registration).fine]))
+        mounted = world_up_of(self.config.preprocess, self._poses[0])
+        return level_rotation(find_up([make_level_submap(cloud, self.config.registration).fine], mounted))
 
     def _cloud(self, b: int) -> NDArray[np.float32]:
         """The submap about a keyframe in level axes, origin at the keyframe."""
@@ -161,7 +163,8 @@ class PlaceFinder:
         step = self._R_level @ (self._poses[b, :3, 3] - self._poses[0, :3, 3])
         if prior.heading is None:
             return Region(prior.position, prior.radius + float(np.linalg.norm(step[:2])))
-        forward = self._R_level @ self._poses[0, :3, 0]
+        first = self._poses[0, :3, :3]
+        forward = self._R_level @ (first @ ahead_of(self.config.preprocess, self._R_level[2] @ first))
         yaw = prior.heading - float(np.arctan2(forward[1], forward[0]))
         turned = so3.exp(np.array([0.0, 0.0, yaw])) @ step
         away = prior.radius + prior.turn * float(np.linalg.norm(step[:2]))

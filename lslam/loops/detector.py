@@ -28,6 +28,7 @@ from lslam.loops.shared_results import SharedResults
 from lslam.loops.throttling import LoopThrottle
 from lslam.loops.verify import Verification, Verifier
 from lslam.loops.working_memory import WorkingMemory
+from lslam.preprocessing.ground import Z
 from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.types.keyframe import Keyframe
 from lslam.types.manual import KnownPair
@@ -55,6 +56,7 @@ class Detector:
     keyframes : all of the run, in order
     cloud : gives the submap about a keyframe, (M, 3) m, in its LiDAR frame
     forbidden : pairs of keyframes, the older first, that are no candidates, nor are those around them
+    up : (3,) unit vector, up in the world of the keyframes by the mounting of the sensor
     """
 
     def __init__(
@@ -64,9 +66,10 @@ class Detector:
         config: LoopsConfig,
         registration: RegistrationConfig,
         forbidden: Sequence[tuple[int, int]] = (),
+        up: Floats = Z,
     ) -> None:
         self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
-        self.forbidden = forbidden
+        self.forbidden, self._mounted = forbidden, up
         self._is_level = False
         self.uncertainty = OdometryUncertainty(keyframes, config.drift_percent, config.drift_deg)
         self.index = create_descriptor(config)
@@ -174,7 +177,8 @@ class Detector:
             return
         self._is_level = True
         shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
-        up = find_up([make_level_submap(self._make_level(int(number)), self.registration).fine for number in shown])
+        maps = [make_level_submap(self._make_level(int(number)), self.registration).fine for number in shown]
+        up = find_up(maps, self._mounted)
         self.keyframes = levelled(self.keyframes, up)
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 

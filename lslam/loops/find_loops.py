@@ -19,6 +19,7 @@ from lslam.loops.detector import LEAST_REACH, Detector
 from lslam.loops.gating import OdometryUncertainty
 from lslam.loops.level_submap import make_level_submap
 from lslam.loops.verify import Verifier
+from lslam.preprocessing.ground import Z
 from lslam.types.constraint import LoopCandidate, LoopStage
 from lslam.types.keyframe import Keyframe
 from lslam.types.manual import KnownPair
@@ -27,6 +28,7 @@ from lslam.types.stage_clock import KeyframeClocks
 log = logging.getLogger("lslam")
 
 Points = NDArray[np.float32]
+Floats = NDArray[np.float64]
 
 
 def find_loops(
@@ -39,6 +41,7 @@ def find_loops(
     threads: int = 1,
     keyframes: Sequence[Keyframe] | None = None,
     forbidden: Sequence[tuple[int, int]] = (),
+    up: Floats = Z,
 ) -> list[LoopCandidate]:
     """Loop candidates of a run in the order of the newer keyframe, with verdicts.
 
@@ -48,12 +51,13 @@ def find_loops(
     threads : so many keyframes are verified at once; the candidates do not depend on it
     keyframes : those of the store at other poses than odometry's; forbidden : pairs of them that are no candidates, nor are
         those around them
+    up : (3,) unit vector, up in their world by the mounting of the sensor
 
     An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
     said so between two keyframes.
     """
     at = store.keyframes if keyframes is None else keyframes
-    detector = _detector(store, at, config, registration, submap_size, forbidden)
+    detector = _detector(store, at, config, registration, submap_size, forbidden, up)
     candidates = detector.find(clocks, should_stop, threads)
     accepted = sum(c.is_accepted for c in candidates)
     tried = sum(c.stage != LoopStage.THINNED for c in candidates)
@@ -63,13 +67,13 @@ def find_loops(
 
 def verify_known(
     store: KeyframeStore, pairs: Sequence[KnownPair], config: LoopsConfig, registration: RegistrationConfig,
-    submap_size: int = 5, should_stop: Callable[[], bool] = lambda: False,
+    submap_size: int = 5, should_stop: Callable[[], bool] = lambda: False, up: Floats = Z,
 ) -> list[LoopCandidate]:  # fmt: skip
     """The known pairs as candidates, verified wherever their scans may lie; an accepted one is held by the graph.
 
     Raises InterruptedRunError when `should_stop` said so between two.
     """
-    detector = _detector(store, store.keyframes, config, registration, submap_size)
+    detector = _detector(store, store.keyframes, config, registration, submap_size, up=up)
     found = []
     for pair in pairs:
         if should_stop():
@@ -80,11 +84,11 @@ def verify_known(
 
 def _detector(
     store: KeyframeStore, keyframes: Sequence[Keyframe], config: LoopsConfig, registration: RegistrationConfig,
-    submap_size: int, forbidden: Sequence[tuple[int, int]] = (),
+    submap_size: int, forbidden: Sequence[tuple[int, int]] = (), up: Floats = Z,
 ) -> Detector:  # fmt: skip
     poses = np.array([keyframe.T_world_lidar for keyframe in keyframes]).reshape(-1, 4, 4)
     return Detector(
-        keyframes, lambda number: submap(store, poses, number, submap_size), config, registration, forbidden
+        keyframes, lambda number: submap(store, poses, number, submap_size), config, registration, forbidden, up
     )
 
 

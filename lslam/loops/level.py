@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
+from lslam.preprocessing.ground import Z
+from lslam.preprocessing.up import NEAR_Z
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.types.keyframe import Keyframe
 
@@ -18,11 +20,14 @@ Floats = NDArray[np.float64]
 ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 15.0, 15.0))
 
 
-def find_up(maps: Iterable[GaussianMap]) -> Floats:
-    """(3,) unit vector: the mean normal of nearly horizontal planes, with a tighter limit each round; z without any."""
+def find_up(maps: Iterable[GaussianMap], mounted: Floats = Z) -> Floats:
+    """(3,) unit vector: the mean normal of nearly horizontal planes, with a tighter limit each round.
+
+    mounted : (3,) unit vector, up by the mounting of the sensor, which the first round begins with and no plane leaves as it is
+    """
     planes = [m.planes[m.planes[:, 7] >= 0, 3:6] for m in maps]
     normals = np.concatenate([*planes, np.zeros((0, 3))])
-    up = np.array([0.0, 0.0, 1.0])
+    up = mounted
     for limit in ROUNDS:
         along = normals @ up
         near = normals[np.abs(along) > limit] * np.sign(along[np.abs(along) > limit, None])
@@ -34,14 +39,16 @@ def find_up(maps: Iterable[GaussianMap]) -> Floats:
 
 
 def level_rotation(up: Floats) -> Floats:
-    """(3, 3) the least rotation that makes the unit vector `up` (3,) the z axis."""
+    """(3, 3) a rotation that makes the unit vector `up` (3,) the z axis: the least, or x stays ahead where up is far from z."""
+    if up[2] <= NEAR_Z:
+        return so3.level_frame(up)
     axis = np.cross(up, [0.0, 0.0, 1.0])
     sine = float(np.linalg.norm(axis))
     return np.eye(3) if sine < 1e-12 else so3.exp(axis / sine * np.arctan2(sine, up[2]))
 
 
 def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
-    """The keyframes in a world turned by the least rotation that makes the unit vector `up` (3,) its z axis."""
+    """The keyframes in a world turned so that the unit vector `up` (3,) is its z axis."""
     R = level_rotation(up)
     T, turn = se3.make(R, np.zeros(3)), np.kron(np.eye(2), R)
     return [

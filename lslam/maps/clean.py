@@ -8,8 +8,9 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
+from lslam.geometry import se3, so3
 from lslam.maps.things import Floor, floor_of, standing, things_of, whole
+from lslam.preprocessing.ground import Z
 from lslam.stopping import checking
 from lslam.types.state import State
 
@@ -69,12 +70,15 @@ class Cleaner:
     scan, so that neither the map nor its length has to fit into memory. The ground never moves: beams that graze it say
     little, and only what stands on it (`things`) is asked about.
 
+    up : (3,) unit vector, up in the world of the scans
+
     Attributes
     ----------
     removed, seen : points taken out, of so many
     """
 
-    def __init__(self) -> None:
+    def __init__(self, up: NDArray[np.float64] = Z) -> None:
+        self._R_level = so3.level_frame(up)
         self._scans: deque[PosedScan] = deque()
         self._looks: deque[_Look] = deque()
         self._grid: _Grid | None = None
@@ -90,12 +94,12 @@ class Cleaner:
         scan = replace(scan, points=points)
         if self._grid is None:
             self._grid = _grid_of(points)
-        T, upright = scan.T_world_lidar, _upright(scan)
-        floor = floor_of(upright, T[:3, 3])
+        T, (upright, sensor) = scan.T_world_lidar, self._upright(scan)
+        floor = floor_of(upright, sensor)
         image = np.full((1, 1, 3), np.inf, np.float32)
         if self._grid is not None:
             g = self._grid
-            stands = standing(upright, T[:3, 3], [floor])
+            stands = standing(upright, sensor, [floor])
             image = nearest_ranges(points, stands, g.rows, g.columns, g.low, 1 / g.size)
         self._scans.append(scan)
         self._looks.append(_Look(T, image, floor))
@@ -141,8 +145,8 @@ class Cleaner:
         around = (number + sign * offset for offset in OFFSETS for sign in (-1, 1))
         others = [self._looks[k - self._begin] for k in around if self._begin <= k < self._count]
         floors = [look.floor for look in (self._looks[number - self._begin], *others)]
-        upright = _upright(scan)
-        stands = standing(upright, scan.T_world_lidar[:3, 3], floors)
+        upright, sensor = self._upright(scan)
+        stands = standing(upright, sensor, floors)
         points, upright = scan.points[stands], upright[stands]
         free, hit = self._votes(points, scan.T_world_lidar, others)
         moving = spread((free >= 1) & (free >= hit), points)
@@ -152,6 +156,12 @@ class Cleaner:
         moves = np.zeros(len(stands), np.bool_)
         moves[stands] = moving
         return moves
+
+    def _upright(self, scan: PosedScan) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Its points (N, 3) as seen from the sensor, and where that is, m, along the world's axes once z is up."""
+        T = self._R_level @ scan.T_world_lidar[:3]
+        with np.errstate(invalid="ignore"):  # organised clouds mark what they did not see by infinity
+            return scan.points @ T[:, :3].T.astype(np.float32), T[:, 3]
 
     def _votes(
         self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64], others: list[_Look]
@@ -169,12 +179,6 @@ class Cleaner:
             for k, (look, T) in enumerate(zip(others, se3.relative(poses, T_world_lidar), strict=True)):
                 vote(points, T, look.image, low, inverse, MARGIN, SLOPE, STEP, len(others) - k, free, hit)
         return free, hit
-
-
-def _upright(scan: PosedScan) -> NDArray[np.float32]:
-    """Its points (N, 3) as seen from the sensor, m, along the world's axes."""
-    with np.errstate(invalid="ignore"):  # organised clouds mark what they did not see by infinity
-        return scan.points @ scan.T_world_lidar[:3, :3].T.astype(np.float32)
 
 
 def spread(moves: NDArray[np.bool_], points: NDArray[np.float32]) -> NDArray[np.bool_]:

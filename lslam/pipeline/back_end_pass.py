@@ -31,6 +31,7 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run_tables import write_loops, write_osm_matches
+from lslam.preprocessing.ground import world_up_of
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference
@@ -109,14 +110,14 @@ def _loops(
     if known is not None and np.array_equal(known["poses"], poses):
         candidates: list[LoopCandidate] = known["candidates"]
         return candidates, doubts(store.keyframes, candidates[: len(pairs.known)], pairs.known, results, config)
-    submap_size = config.keyframes.submap_size
-    candidates = verify_known(store, pairs.known, config.loops, config.registration, submap_size, should_stop)
+    submap_size, up = config.keyframes.submap_size, world_up_of(config.preprocess, results[0].T_world_lidar)
+    candidates = verify_known(store, pairs.known, config.loops, config.registration, submap_size, should_stop, up)
     said = doubts(store.keyframes, candidates, pairs.known, results, config)
     if config.loops.use:
         taken = {(c.a, c.b) for c in candidates}
         found = find_loops(
             store, config.loops, config.registration, submap_size, clocks, should_stop, config.input.workers,
-            where_held(store.keyframes, candidates, job.manual.points, results, config), pairs.forbidden,
+            where_held(store.keyframes, candidates, job.manual.points, results, config), pairs.forbidden, up,
         )  # fmt: skip
         candidates += [c for c in found if (c.a, c.b) not in taken]
     if checkpoints is not None:

@@ -24,6 +24,7 @@ from lslam.pipeline.map_files import read_json
 from lslam.pipeline.map_pass import scan_poser
 from lslam.pipeline.rebuild import EarlierRun, results_of
 from lslam.pipeline.run_folder import MANIFEST
+from lslam.preprocessing.ground import world_up_of
 from lslam.stopping import asking
 from lslam.types.gnss import Georeference
 from lslam.types.sequence import Sequence
@@ -90,7 +91,8 @@ def compare_runs(
 
     def cast(run: EarlierRun, sequence: Sequence, T: Floats) -> Evidence:
         voxel, near, far = section.occupancy_voxel, run.config.map.range_min, section.occupancy_range
-        mapper, cleaner = OccupancyMapper(voxel, near, far, spool=spool, origin=origin), Cleaner()
+        up = world_up_of(run.config.preprocess, run.trajectory.poses[0])
+        mapper, cleaner = OccupancyMapper(voxel, near, far, spool=spool, origin=origin), Cleaner(up)
 
         def enter(scans: list[PosedScan]) -> None:
             for scan in scans:

@@ -25,6 +25,7 @@ from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.preprocessing.deskew import deskew_points, knots_over
+from lslam.preprocessing.ground import Z, world_up_of
 from lslam.stopping import asking
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory, thinned
 from lslam.types.motion_prior import MotionPrior
@@ -62,9 +63,10 @@ def build_map(
     """
     section = config.map
     poses = np.stack([r.T_world_lidar for r in results])
+    up = world_up_of(config.preprocess, poses[0])
 
     def make() -> MapMaker:
-        return MapMaker(section, spool, None if checkpoints is None else checkpoints.folder)
+        return MapMaker(section, spool, None if checkpoints is None else checkpoints.folder, up)
 
     maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
     for _ in range(done):
@@ -111,15 +113,18 @@ class MapMaker:
     """What the scans of a run go through on their way into its map: cleaning, merging, the occupancy.
 
     section : what is asked for; spool : folder for maps too large for memory; keep : for one that is gone on with
+    up : (3,) unit vector, up in the world of the scans
     """
 
-    def __init__(self, section: MapConfig, spool: Path | None = None, keep: Path | None = None) -> None:
+    def __init__(
+        self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: NDArray[np.float64] = Z
+    ) -> None:  # fmt: skip
         self._section = section
         self._merger = MapMerger(
             section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,
             keep=None if keep is None else keep / "map",
         )  # fmt: skip
-        self._cleaner = Cleaner() if section.clean else None
+        self._cleaner = Cleaner(up) if section.clean else None
         self._occupancy = None
         if section.occupancy:
             self._occupancy = OccupancyMapper(

@@ -107,7 +107,9 @@ def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:
     if store.keyframes[-1].scan >= len(results):
         raise InputError(f"{folder / KEYFRAMES} does not belong to the {len(results)} poses of trajectory.tum")
     keyframes = [replace(k, T_world_lidar=results[k.scan].T_world_lidar) for k in store.keyframes]
-    return run, Session(name, store, keyframes, results, georeference=run.georeference)
+    return run, Session(
+        name, store, keyframes, results, georeference=run.georeference, preprocess=run.config.preprocess
+    )
 
 
 def _with_covariances(run: EarlierRun) -> list[ScanResult]:
@@ -194,7 +196,8 @@ def _loops(chain: Chain, config: Config, should_stop: Stop, checkpoints: Checkpo
     if known is not None and np.array_equal(known["poses"], chain.poses):
         found: list[LoopCandidate] = known["candidates"]
         return found
-    detector = Detector(chain.keyframes(), chain.cloud, config.loops, config.registration)
+    up = chain.sessions[0].up
+    detector = Detector(chain.keyframes(), chain.cloud, config.loops, config.registration, up=up)
     candidates = detector.find(None, should_stop, config.input.workers)
     if checkpoints is not None:
         checkpoints.write(len(chain), lambda: {"poses": chain.poses, "candidates": Records(candidates)})

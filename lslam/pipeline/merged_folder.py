@@ -108,7 +108,7 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
     about: dict[str, Any] = {}
     built = None
     if config.map.write:
-        built = _map(recordings, merged.results, config, watch, folder.path)
+        built = _map(recordings, merged.results, config, watch, folder.path, merged.sessions[0].up)
         note = MapNote(", ".join(s.name for s in merged.sessions), config.map.voxel, built.done, world)
         write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
         about["map_points"] = len(built.merged)
@@ -205,12 +205,13 @@ def _map(
     config: Config,
     watch: Watch,
     spool: Path,
+    up: NDArray[np.float64],
 ) -> BuiltMap:
-    """The scans of all sessions in one map."""
+    """The scans of all sessions in one map; up : (3,) unit vector in their common world."""
     watch.on_start(
         "map", sum(len(r) for r, recording in zip(results, recordings, strict=True) if recording is not None)
     )
-    maker, number = MapMaker(config.map, spool), 0
+    maker, number = MapMaker(config.map, spool, up=up), 0
     for recording, poses in zip(recordings, results, strict=True):
         if recording is None:
             continue

@@ -6,19 +6,22 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
-from lslam.errors import InputError, UsageError
+from lslam.errors import ConfigError, InputError, UsageError
 from lslam.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
 from lslam.localization.prior_map import PriorMap, make_prior_map
 from lslam.maps.georeference import Projection
 from lslam.pipeline.map_files import georeference_of, in_own_world, note_of, read_json
 from lslam.pipeline.map_tiles import INDEX, is_tiles, read_tiles
-from lslam.pipeline.rebuild import map_of
+from lslam.pipeline.rebuild import map_of, read_run
 from lslam.pipeline.run_folder import require_run
+from lslam.preprocessing.ground import Z, world_up_of
 from lslam.types.cloud import ArrayCloud
 
 log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
 # m; coordinates beyond are those of a projection, which a trajectory in float32 plots and maps would lose centimetres of.
 LARGE, KILOMETRE = 1e5, 1000.0
 
@@ -67,4 +70,13 @@ def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
     if len(points) and float(np.abs(points).max()) > LARGE:
         origin = np.round(np.nanmedian(points, axis=0) / KILOMETRE) * KILOMETRE
         log.info("coordinates of %s are large: the world of this run begins at %s of them", path, origin.tolist())
-    return make_prior_map(points, config, georeference, str(path), origin)
+    return make_prior_map(points, config, georeference, str(path), origin, _up_of(path.parent))
+
+
+def _up_of(folder: Path) -> Floats:
+    """(3,) up in the world of the run in a folder, by the mounting of its sensor; z where there is none."""
+    try:
+        run = read_run(folder)
+    except (InputError, ConfigError):
+        return Z
+    return world_up_of(run.config.preprocess, run.trajectory.poses[0])

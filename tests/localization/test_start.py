@@ -7,10 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from revisited import CONFIG, Revisited, error_of, revisit, town_map
+from turned_sensor import TURNS, turn, turned_pose, turned_store
 
+from lslam.config.preprocess import PreprocessConfig
 from lslam.geometry import se3, so3
+from lslam.keyframes.store import KeyframeStore
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import make_prior_map
+from lslam.localization.sessions import Session, tie
 from lslam.localization.start import PlaceFinder, Start, StartPrior
 from lslam.simulation.routes import Visit
 
@@ -90,3 +94,51 @@ def test_votes_that_odometry_cannot_compare_do_not_agree(search: PlaceFinder, wo
         assert not search._same(vote, near)
     finally:
         search._distances = distances
+
+
+@pytest.mark.parametrize("name", TURNS)
+def test_a_drive_with_a_turned_sensor_is_found_with_a_start_and_without(
+    name: str, world: Revisited, search: PlaceFinder
+) -> None:
+    R, T_map_level = turn(name), map_pose(world)
+    up = CONFIG.preprocess.model_copy(update={"up": tuple(R[2])})
+    config = CONFIG.model_copy(update={"preprocess": up})
+    finder = PlaceFinder(search.search, turned_store(world.store, R), config)
+    T = se3.inverse(T_map_level) @ T_MAP_TOWN @ world.true_poses[0]
+    heading = float(np.arctan2(T[1, 0], T[0, 0]))
+    for prior in (None, StartPrior(T[:2, 3] + [4.0, -3.0], heading + 0.2)):
+        start = finder.find(prior)
+        assert start is not None, finder.reasons
+        scan = world.store.keyframes[start.vote.keyframe].scan
+        found = T_map_level @ start.vote.T_level_odometry @ turned_pose(world.results[scan].T_world_lidar, R)
+        move, angle = error_of(found, T_MAP_TOWN @ world.true_poses[scan] @ se3.make(R, np.zeros(3)))
+        assert move < 0.1
+        assert angle < 0.5
+
+
+def test_a_map_upside_down_is_levelled_where_its_up_is_known(world: Revisited) -> None:
+    R = turn("upside down")
+    hanging = make_prior_map(world.points @ R, REGISTRATION, up=R[2])
+    assert np.rad2deg(np.arccos(hanging.T_map_level[:3, 2] @ R[2])) < 1.0
+
+
+def part(world: Revisited, first: int, R: np.ndarray) -> Session:
+    """Half of the drive as a session of its own, by a turned sensor."""
+    whole, store = turned_store(world.store, R), KeyframeStore()
+    for n, k in enumerate(whole.keyframes[first : first + 2 * len(whole) // 3]):
+        store.add(replace(k, number=n), whole.points(k.number))
+    preprocess = PreprocessConfig(up=None if R[2, 2] == 1.0 else tuple(R[2]))
+    return Session("part", store, store.keyframes, [], preprocess=preprocess)
+
+
+@pytest.mark.parametrize("name", TURNS)
+@pytest.mark.parametrize("is_first", [False, True])
+def test_a_session_with_a_turned_sensor_is_tied_to_others(name: str, is_first: bool, world: Revisited) -> None:
+    R = turn(name)
+    ways = (R, np.eye(3)) if is_first else (np.eye(3), R)
+    known, other = part(world, 0, ways[0]), part(world, len(world.store) // 3, ways[1])
+    tied, why = tie(other, [known], CONFIG)
+    assert tied is not None, why
+    move, angle = error_of(tied.T_town_session, se3.make(R.T if is_first else R, np.zeros(3)))
+    assert move < 0.1
+    assert angle < 0.5

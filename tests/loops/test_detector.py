@@ -20,6 +20,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.loops.descriptor import PlaceMatch
 from lslam.loops.detector import Detector
 from lslam.loops.find_loops import find_loops, warm_up
+from lslam.preprocessing.ground import Z
 from lslam.types.constraint import LoopCandidate
 
 Floats = NDArray[np.float64]
@@ -37,12 +38,14 @@ def drifted(true: Floats, scale: float = 0.01, turn_deg: float = 0.5) -> Floats:
     return np.array(poses)
 
 
-def detect(world: Floats, true: Floats, odometry: Floats, **settings: float) -> list[LoopCandidate]:
+def detect(
+    world: Floats, true: Floats, odometry: Floats, up: Floats = Z, **settings: float
+) -> list[LoopCandidate]:  # fmt: skip
     def cloud(number: int) -> Points:
         return seen(world, true[number], np.random.default_rng(number))
 
     config = LoopsConfig.model_validate(settings)
-    return Detector(keyframes_of(odometry), cloud, config, RegistrationConfig()).find()
+    return Detector(keyframes_of(odometry), cloud, config, RegistrationConfig(), up=up).find()
 
 
 def accepted(candidates: list[LoopCandidate]) -> list[LoopCandidate]:
@@ -59,14 +62,15 @@ def errors(candidates: list[LoopCandidate], true: Floats) -> Floats:
     return np.array(found).reshape(-1, 2)
 
 
-@pytest.mark.parametrize("tilt_deg", [0.0, 28.0])
+@pytest.mark.parametrize("tilt_deg", [0.0, 28.0, 90.0, 180.0])
 def test_finds_where_a_drive_comes_round_again(tilt_deg: float) -> None:
     mounting = pose(0, 0, pitch_deg=tilt_deg)
     mounting[:3, 3] = 0
     true = np.array([round_the_square(d) for d in np.arange(0, 430, 5.0)]) @ mounting
     # The world is the LiDAR's at the first scan, as tilted as that.
+    up = Z if tilt_deg < 45 else true[0, 2, :3]
     world, true = se3.apply(se3.inverse(true[0]), town()), se3.relative(true[0], true)
-    candidates = detect(world, true, drifted(true))
+    candidates = detect(world, true, drifted(true), up)
     closures = accepted(candidates)
     assert len(closures) >= 6
     assert all(c.reason == "" and c.a < c.b for c in closures)
