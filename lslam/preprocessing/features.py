@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from lslam.config.loam import LoamConfig
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import InputError
+from lslam.geometry import so3
 from lslam.kernels import curvature
+from lslam.preprocessing.ground import Z
 from lslam.preprocessing.prepare import gate_points
+from lslam.preprocessing.up import NEAR_Z
 from lslam.types.scan import Scan
 
 # What a point is allowed to become: an edge, a less planar point, a planar one (which is less planar as well).
@@ -143,7 +146,7 @@ def curvature_noise(ranges: NDArray[np.float64], side: int = curvature.SIDE) -> 
 def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
     """The gated points of a scan along each of its rings. Raises InputError as `extract_features`.
 
-    The order of the file is kept where it follows the beam; else rings are walked by azimuth.
+    The order of the file is kept where it follows the beam; else rings are walked by azimuth, about the axis of their cones.
     """
     if scan.rings is None:
         raise InputError(
@@ -152,7 +155,10 @@ def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
     order, starts = curvature.into_rings(scan.rings, gate_points(scan.points, gate))
     points, ranges, steps, step, turns, progress = curvature.walk(scan.points, order, starts)
     if step > WIDEST_STEP or turns > _MANY_TURNS or progress < _SPINS:
-        azimuth = np.arctan2(scan.points[order, 1], scan.points[order, 0])
+        about = scan.points @ so3.level_frame(_spin_axis(points / ranges[:, None], starts)).T.astype(np.float32)
+        progress = curvature.walk(about, order, starts)[-1]
+    if step > WIDEST_STEP or turns > _MANY_TURNS or progress < _SPINS:
+        azimuth = np.arctan2(about[order, 1], about[order, 0])
         order = order[np.lexsort((azimuth, scan.rings[order]))]
         points, ranges, steps, step, _, _ = curvature.walk(scan.points, order, starts)
     if step > WIDEST_STEP and len(order) > len(starts):
@@ -162,6 +168,19 @@ def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
             "which needs no rings, or another --rings"
         )
     return RingWalk(order, starts, points, ranges, steps, min(step, WIDEST_STEP))
+
+
+def _spin_axis(directions: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(3,) unit vector about which rings of directions (K, 3) are circles; z where there is none, or within 45 deg of it.
+
+    A circle about an axis has no extent along it, and errors of elevation are far smaller than the widest step.
+    """
+    sizes = np.diff(starts)
+    means = np.add.reduceat(directions, starts[:-1][sizes > 0], axis=0) / sizes[sizes > 0, None]
+    away = directions - np.repeat(means, sizes[sizes > 0], axis=0)
+    variances, axes = np.linalg.eigh(away.T @ away / max(len(away), 1))
+    are_circles = variances[0] < (WIDEST_STEP / 4) ** 2
+    return axes[:, 0] if are_circles and abs(axes[2, 0]) <= NEAR_Z else Z
 
 
 def gather_features(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_step: float) -> Features:

@@ -15,6 +15,7 @@ from lslam.config import load_config
 from lslam.config.loam import LoamConfig
 from lslam.config.preprocess import PreprocessConfig
 from lslam.errors import ConfigError, InputError
+from lslam.geometry import so3
 from lslam.preprocessing.features import extract_features, walk_rings
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
@@ -199,6 +200,21 @@ def test_the_order_of_points_in_the_file_does_not_matter() -> None:
     # Only where a ring begins differs: regions are cut there.
     assert np.mean(there.labels == here.labels[mixed]) > 0.9
     assert len(there.edges) == pytest.approx(len(here.edges), rel=0.1)
+
+
+@pytest.mark.parametrize("rpy_deg", [(0, 90, 0), (90, 0, 0), (180, 0, 0), (0, 60, 0)])
+@pytest.mark.parametrize("is_shuffled", [False, True])
+def test_rings_about_any_axis_give_the_features_of_those_about_z(
+    rpy_deg: tuple[int, int, int], is_shuffled: bool
+) -> None:
+    scan = bumpy(4)
+    assert scan.rings is not None
+    order = np.random.default_rng(0).permutation(len(scan)) if is_shuffled else np.arange(len(scan))
+    turned = scan.points @ so3.from_euler_rpy(np.deg2rad(rpy_deg))
+    expected = extract_features(scan).labels[order]
+    labels = extract_features(scan_of(turned[order], scan.rings[order])).labels
+    assert (expected != 0).mean() > 0.3
+    assert (labels == expected).mean() > 0.95, "the seam of the walk lies elsewhere"
 
 
 def test_scans_of_nothing_give_no_features() -> None:
