@@ -14,13 +14,14 @@ from lslam.geometry import geodesy, noise, se3
 from lslam.graph.odometry_constraints import positive
 from lslam.kernels import voxel
 from lslam.kernels.transform import transform
+from lslam.keyframes.mounting import mounted_up
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import make_prior_map
 from lslam.localization.start import PlaceFinder, Start, StartPrior
-from lslam.preprocessing.ground import ahead_of, world_up_of
 from lslam.preprocessing.prepare import NO_TIMES
+from lslam.preprocessing.up import ahead_of
 from lslam.types.constraint import Constraint
 from lslam.types.gnss import Georeference
 from lslam.types.keyframe import Keyframe
@@ -61,7 +62,7 @@ class Session:
     @property
     def up(self) -> Floats:
         """(3,) up in the common world by the mounting of its sensor."""
-        return world_up_of(self.preprocess, self.poses[0])
+        return mounted_up(self.store, self.poses, self.preprocess)
 
 
 class Chain:
@@ -198,7 +199,7 @@ def by_georeference(session: Session, known: Sequence[Session]) -> Floats | None
 def _prior(T: Floats, session: Session, config: Config) -> StartPrior:
     """Where the first keyframe is expected by T (4, 4), from the session's world into level axes of the map."""
     first = T @ session.keyframes[0].T_world_lidar
-    c, ahead = config.localize, first[:3, :3] @ ahead_of(session.preprocess, first[2, :3])
+    c, ahead = config.localize, first[:3, :3] @ ahead_of(first[2, :3])
     heading = float(np.arctan2(ahead[1], ahead[0]))
     return StartPrior(first[:2, 3], heading, c.start_radius, float(np.deg2rad(c.start_turn_deg)))
 

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.geometry import se3, so3
 from lslam.kernels.transform import transform
+from lslam.keyframes.mounting import mounted_up
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.localization.place_search import APART, PlaceSearch, Region
 from lslam.loops.level import find_up, level_rotation
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
-from lslam.preprocessing.ground import ahead_of, world_up_of
 from lslam.preprocessing.prepare import PreparedPoints, thin
+from lslam.preprocessing.up import ahead_of
 from lslam.registration.acceptance import MAP_MIN_INLIERS, Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.robust import Annealing
@@ -138,7 +139,7 @@ class PlaceFinder:
     def _level(self) -> Floats:
         """(3, 3) the rotation that makes odometry's world level, by its first submap."""
         cloud = submap(self.store, self._poses, 0, self.config.keyframes.submap_size, T_world_frame=np.eye(4))
-        mounted = world_up_of(self.config.preprocess, self._poses[0])
+        mounted = mounted_up(self.store, self._poses, self.config.preprocess)
         return level_rotation(find_up([make_level_submap(cloud, self.config.registration).fine], mounted))
 
     def _cloud(self, b: int) -> NDArray[np.float32]:
@@ -164,7 +165,7 @@ class PlaceFinder:
         if prior.heading is None:
             return Region(prior.position, prior.radius + float(np.linalg.norm(step[:2])))
         first = self._poses[0, :3, :3]
-        forward = self._R_level @ (first @ ahead_of(self.config.preprocess, self._R_level[2] @ first))
+        forward = self._R_level @ (first @ ahead_of(self._R_level[2] @ first))
         yaw = prior.heading - float(np.arctan2(forward[1], forward[0]))
         turned = so3.exp(np.array([0.0, 0.0, yaw])) @ step
         away = prior.radius + prior.turn * float(np.linalg.norm(step[:2]))

@@ -24,6 +24,7 @@ from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
+from lslam.keyframes.mounting import mounted_up
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.find_loops import find_loops, verify_known
 from lslam.osm.hold import hold_by_buildings
@@ -31,7 +32,6 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run_tables import write_loops, write_osm_matches
-from lslam.preprocessing.ground import world_up_of
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference
@@ -110,7 +110,7 @@ def _loops(
     if known is not None and np.array_equal(known["poses"], poses):
         candidates: list[LoopCandidate] = known["candidates"]
         return candidates, doubts(store.keyframes, candidates[: len(pairs.known)], pairs.known, results, config)
-    submap_size, up = config.keyframes.submap_size, world_up_of(config.preprocess, results[0].T_world_lidar)
+    submap_size, up = config.keyframes.submap_size, mounted_up(store, poses, config.preprocess)
     candidates = verify_known(store, pairs.known, config.loops, config.registration, submap_size, should_stop, up)
     said = doubts(store.keyframes, candidates, pairs.known, results, config)
     if config.loops.use:

@@ -15,9 +15,10 @@ from lslam.localization.prior_map import PriorMap, make_prior_map
 from lslam.maps.georeference import Projection
 from lslam.pipeline.map_files import georeference_of, in_own_world, note_of, read_json
 from lslam.pipeline.map_tiles import INDEX, is_tiles, read_tiles
-from lslam.pipeline.rebuild import map_of, read_run
+from lslam.pipeline.merge_runs import read_session
+from lslam.pipeline.rebuild import map_of
 from lslam.pipeline.run_folder import require_run
-from lslam.preprocessing.ground import Z, world_up_of
+from lslam.preprocessing.ground import Z
 from lslam.types.cloud import ArrayCloud
 
 log = logging.getLogger("lslam")
@@ -76,7 +77,6 @@ def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
 def _up_of(folder: Path) -> Floats:
     """(3,) up in the world of the run in a folder, by the mounting of its sensor; z where there is none."""
     try:
-        run = read_run(folder)
+        return read_session(folder, folder.name)[1].up
     except (InputError, ConfigError):
         return Z
-    return world_up_of(run.config.preprocess, run.trajectory.poses[0])

@@ -35,11 +35,6 @@ def up_of(config: PreprocessConfig) -> Floats:
     return Z if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
 
 
-def ahead_of(config: PreprocessConfig, up: Floats) -> Floats:
-    """(3,) unit vector ahead in the LiDAR frame in which `up` (3,) is up: x, or of a turned sensor x of the level frame."""
-    return np.array([1.0, 0.0, 0.0]) if config.up is None else np.asarray(so3.level_frame(up)[0])
-
-
 def world_up_of(config: PreprocessConfig, T_world_lidar: Floats) -> Floats:
     """(3,) unit vector up in the world by the first pose (4, 4); z where nothing is configured."""
     return Z if config.up is None else np.asarray(T_world_lidar[:3, :3] @ up_of(config))

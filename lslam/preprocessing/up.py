@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.geometry import so3
 from lslam.kernels import ground
 from lslam.preprocessing.ground import CELL, Z, levelling
 
@@ -69,6 +70,11 @@ def find_up(points: NDArray[np.float32], gravity_up: Floats | None = None) -> Up
     # Of a floor and its ceiling the one nearer to z.
     normal = max(grounds, key=lambda ground: ground[:2])[2] if grounds else Z
     return AXIS if normal[2] > NEAR_Z else Up(normal, "ground")
+
+
+def ahead_of(up: Floats) -> Floats:
+    """(3,) unit vector ahead in the LiDAR frame in which `up` (3,) is up: x, or of a turned sensor x of the level frame."""
+    return np.array([1.0, 0.0, 0.0]) if up[2] > NEAR_Z else np.asarray(so3.level_frame(up)[0])
 
 
 def ground_share(points: NDArray[np.float32], up: Floats) -> tuple[float, Floats]:
