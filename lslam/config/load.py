@@ -23,7 +23,12 @@ SUMMARY, BASE = "summary", "base"
 Tree = dict[str, Any]
 
 # Keys of earlier versions, and what became of them.
-REMOVED = {"odometry.max_failures": "a lost run begins a new segment and goes on to its last scan; leave the key out"}
+REMOVED = {
+    "odometry.max_failures": "a lost run begins a new segment and goes on to its last scan; leave the key out",
+    "registration.min_inliers": "a scan is compared with what agreed in this recording before (registration.min_agreement); "
+    "leave the key out",
+    "registration.start_overlap": "registration.min_overlap holds from the first scan on",
+}
 
 
 def known_presets() -> dict[str, str]:

@@ -77,6 +77,19 @@ def test_wrong_values_name_the_key_and_the_way_out(setting: str, words: str) -> 
     assert caught.value.exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("odometry.max_failures=8", "new segment"),
+        ("registration.min_inliers=0.1", r"registration\.min_agreement"),
+        ("registration.start_overlap=0.1", r"registration\.min_overlap"),
+    ],
+)
+def test_a_key_of_an_earlier_version_is_answered_with_what_became_of_it(setting: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=rf"no {setting.partition('=')[0]} any more.*{words}"):
+        load_config(settings=[setting])
+
+
 def test_the_source_of_an_unknown_key_is_named(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
     file.write_text("[map]\nvoxels = 1\n")

@@ -14,7 +14,7 @@ from stub_sequences import Stub, sample
 
 import lslam
 from lslam.config import Config, load_config
-from lslam.errors import ConfigError, InterruptedRunError
+from lslam.errors import InterruptedRunError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline.watch import RunOutcome, Watch
@@ -197,8 +197,3 @@ def test_without_a_frame_of_most_scans_the_run_is_lost(tmp_path: Path) -> None:
         lslam.run(stub, config(), out=tmp_path / "out")
     assert len(columns(tmp_path / "out")["status"]) == 24
     assert manifest(tmp_path / "out")["status"] == "diverged"
-
-
-def test_the_key_that_ended_runs_is_answered_with_what_became_of_it() -> None:
-    with pytest.raises(ConfigError, match=r"no odometry.max_failures any more.*new segment"):
-        config("odometry.max_failures=8")
