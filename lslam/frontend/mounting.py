@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from itertools import islice
 
 import numpy as np
@@ -10,14 +9,11 @@ from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.inertial.imu_cleaning import gravity_unit
-from lslam.kernels import jit
-from lslam.locks import one_at_a_time
 from lslam.preprocessing.prepare import clean_points
 from lslam.preprocessing.up import Up, find_up
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence, readable
 
-log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]
 
 # Scans of which the largest serves: the first message may be a sliver.
@@ -41,15 +37,21 @@ def with_up(sequence: Sequence, config: Config) -> Config:
 
 
 def _up_of(sequence: Sequence, config: Config) -> Up | None:
-    """Up by the first scans, and by the IMU if the run uses it; None without a scan."""
+    """Up by the first scan, and by the IMU if the run uses it; None without a scan.
+
+    What the first scan does not confirm, that z is up, is asked of the largest of a few.
+    """
     plain = config.preprocess.model_copy(update={"remove_ground": False, "denoise": False})
-    first = range(config.input.start, len(sequence))
-    scans = [scan for _, scan in islice(readable(first, sequence.scan), SCANS)]
-    if not scans:
+    scans = (scan for _, scan in readable(range(len(sequence)), sequence.scan))
+    first = next(scans, None)
+    if first is None:
         return None
-    points = clean_points(max(scans, key=len).points, plain)
-    with jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
-        return find_up(points, _gravity_up(sequence, int(sequence.stamps_ns[first[0]])) if config.imu.use else None)
+    gravity = _gravity_up(sequence, int(sequence.stamps_ns[0])) if config.imu.use else None
+    up = find_up(clean_points(first.points, plain), gravity)
+    if up.tilt_deg == 0.0 and up.source != "axis":
+        return up
+    largest = max((first, *islice(scans, SCANS - 1)), key=len)
+    return find_up(clean_points(largest.points, plain), gravity)
 
 
 def _gravity_up(sequence: Sequence, begin_ns: int) -> Floats | None:

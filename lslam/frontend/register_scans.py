@@ -79,7 +79,7 @@ def estimate(
             results.append(_observed(tracked, len(results), keyframing, monitor))
             middle = tracked.middle
             on_scan(results[-1])
-        if should_stop():
+        if decided and should_stop():
             break
         if checkpoints is not None and keyframing is not None:
             checkpoints.offer(results, tracker, keyframing)

@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lslam.backend.outcome import BackEnd
-from lslam.config import Config
+from lslam.config import Config, load_config
 from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
 from lslam.evaluation.evaluate import Evaluation
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm.corrections import write_buildings
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import write_back_end
-from lslam.pipeline.job import PreparedRun
+from lslam.pipeline.job import PreparedRun, fit_to_scene
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
@@ -43,7 +43,7 @@ def in_folder(
     earlier : the run whose odometry serves
     """
     if out is None:
-        yield job
+        yield fit_to_scene(job)
         return
     manifest = job.manifest
     place = out if isinstance(out, RemotePath) else None
@@ -81,6 +81,7 @@ def _begun(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierR
     Raises InputError when the odometry of the earlier run cannot be read.
     """
     folder.require_space(outputs.least_bytes(len(job.sequence)), "the result without its map")
+    job = fit_to_scene(job, load_config(folder.path / "config.toml", environ={}) if goes_on else None)
     folder.write_text("config.toml", outputs.config_text(job.config))
     if earlier is not None:
         folder.begin_from(earlier.folder)

@@ -22,7 +22,7 @@ from lslam.frontend.inertial_start import with_imu_settings
 from lslam.frontend.mounting import with_up
 from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import sweep_of
-from lslam.frontend.scene_scale import with_scene_scale
+from lslam.frontend.scene_scale import LENGTHS, with_scene_scale
 from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
@@ -45,6 +45,9 @@ from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
+
+# What the first scans decide on, unless it is set.
+OPEN_KEYS = (*(f"{section}.{key}" for section, keys in LENGTHS.items() for key in keys), "preprocess.up")
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,6 @@ def prepare(
     sequence = with_streams(sequence, config.imu.use, config.gnss.mode != "off")
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if truth is None else truth
-    config = with_up(sequence, with_scene_scale(config, sequence))
     odometry = create_odometry(with_imu_settings(config))
     given: Trajectory | None = None
     if isinstance(odometry, GivenPoses):
@@ -96,6 +98,33 @@ def prepare(
     manual = read_manual(config, chosen)
     manifest, store = Manifest(command, chosen, config), KeyframeStore(deflate=config.keyframes.deflate)
     return PreparedRun(chosen, odometry, config, truth, given, manifest, watch, osm, manual, store)
+
+
+def is_open(config: Config, key: str) -> bool:
+    """Whether the scene decides on `section.key`: nobody has set it."""
+    section, _, name = key.partition(".")
+    return key in OPEN_KEYS and name not in getattr(config, section).model_fields_set
+
+
+def fit_to_scene(job: PreparedRun, begun: Config | None = None) -> PreparedRun:
+    """The run with the lengths and the up direction that its first scans show, where its configuration leaves them open.
+
+    begun : the configuration of the part of the run that is there, which has them
+    """
+    config = job.config
+    if begun is None:
+        config = with_up(job.sequence, with_scene_scale(config, job.sequence))
+    for key in OPEN_KEYS if begun is not None else ():
+        section, _, name = key.partition(".")
+        value = getattr(getattr(begun, section), name)
+        if is_open(job.config, key) and value != getattr(getattr(config, section), name):
+            config = config.model_copy(update={section: getattr(config, section).model_copy(update={name: value})})
+    if config == job.config:
+        return job
+    job.manifest.config = config
+    is_given = isinstance(job.odometry, GivenPoses)
+    odometry = job.odometry if is_given else create_odometry(with_imu_settings(config))
+    return replace(job, config=config, odometry=odometry)
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:

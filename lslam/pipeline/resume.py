@@ -14,6 +14,7 @@ import numpy as np
 from lslam.config import Config
 from lslam.errors import GateError, InputError, OutputExistsError, RunFailedError, RunFinishedError, cause
 from lslam.osm.source import extract_digest
+from lslam.pipeline.job import is_open
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.printable import printable_tree, shown
 from lslam.remote import RemotePath
@@ -177,7 +178,9 @@ def _difference(
     if version != __version__:
         return f"it was begun by lslam {version}, this is {__version__}"
     before, now = (_flat(tree) for tree in (begun, printable_tree(config.model_dump(mode="json"))))
-    changed = [key for key in sorted(before | now) if before.get(key) != now.get(key) and key not in FREE]
+    # What the scene decided of an open key is taken from the run that was begun.
+    differing = [key for key in sorted(before | now) if before.get(key) != now.get(key)]
+    changed = [key for key in differing if key not in FREE and not is_open(config, key)]
     unknown = set(_flat(printable_tree(Config().model_dump(mode="json")))) - set(before)
     if changed and set(changed) <= unknown:
         return f"it was begun by an earlier lslam, which had no {shown(changed)}"
