@@ -148,6 +148,27 @@ def test_interrupted_twice_it_ends_with_the_same_bytes(
 POSES = ("input.threads=1", "map.write=false")
 
 
+def room() -> Stub:
+    scans = simulate("room", seed=1, count=6, lidar="os1-16", motion_compensated=True)
+    return Stub([scans.scan(i) for i in range(len(scans))])
+
+
+@pytest.mark.usefixtures("at_every_scan")
+def test_what_the_scene_decided_is_kept_and_another_wish_is_refused(whole: Whole, tmp_path: Path) -> None:
+    config, out = config_of(*POSES), tmp_path / "out"
+    with pytest.raises(KeyboardInterrupt):
+        lslam.run(replace(room(), on_read=die_at(2)), config, out=out)
+    begun = load_config(out / "config.toml", environ={})
+    assert begun.registration.voxel_size < 0.8
+    with pytest.raises(OutputExistsError, match=r"registration\.voxel_size was .* and is 0\.8"):
+        lslam.run(room(), config_of(*POSES, "registration.voxel_size=0.8"), out=out, resume=True)
+    again = replace(room(), reads=[])
+    lslam.run(again, config, out=out, resume=True)
+    assert result_of(out) == whole(room, *POSES)
+    assert load_config(out / "config.toml", environ={}) == begun
+    assert 1 not in again.reads, "what was registered is not read again"
+
+
 @pytest.mark.usefixtures("at_every_scan")
 @pytest.mark.parametrize("scan", [1, 2, 9, 15])
 def test_it_goes_on_where_it_was_killed(scan: int, whole: Whole, tmp_path: Path) -> None:
