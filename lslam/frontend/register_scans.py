@@ -72,7 +72,8 @@ def estimate(
     middle = tracker.middle
     ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
     # Scans that are still open at the end of the recording have their word there.
-    for decided in chain(map(tracker.track, ahead), map(SegmentTracker.finish, (tracker,))):
+    for loaded in chain(ahead, (None,)):
+        decided = tracker.finish() if loaded is None else tracker.decide(loaded, tracker.present.track(loaded))
         for tracked in decided:
             if results and tracker.has_middles:
                 results[-1] = between_middles(results[-1], middle, tracked)

@@ -75,10 +75,18 @@ class SegmentTracker:
         """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
         return isinstance(self.odometry, Deskewing) and isinstance(self._tracker.motion, ConstantVelocity)
 
-    def track(self, loaded: Loaded) -> list[Tracked]:
-        """The scans that are decided with the next one, in order: none while two hypotheses are open."""
-        first = self._track(self._tracker, loaded, self._segment)
-        other = None if self._other is None else self._track(self._other, loaded, self._segment + 1)
+    @property
+    def present(self) -> Tracker:
+        """The tracker of the present segment."""
+        return self._tracker
+
+    def decide(self, loaded: Loaded, result: ScanResult) -> list[Tracked]:
+        """The scans that are decided with the next one, in order: none while two hypotheses are open.
+
+        result : of the present tracker
+        """
+        first = self._tracked(self._tracker, loaded, result, self._segment)
+        other = None if self._other is None else self._tried(self._other, loaded)
         is_held = first.result.status == "ok"
         if is_held:
             self._usual.observe(_share(first.result))
@@ -92,7 +100,7 @@ class SegmentTracker:
         if is_held or self._begin is None or loaded.scan is None:
             return [*decided, first]
         self._other = self._begin(first.result.T_world_lidar)
-        other = self._track(self._other, loaded, self._segment + 1)
+        other = self._tried(self._other, loaded)
         self._open = [(first, other)]
         return decided if other.result.status == "ok" else [*decided, *self.finish()]
 
@@ -130,10 +138,12 @@ class SegmentTracker:
         self._segment += 1
         return registered
 
+    def _tried(self, other: Tracker, loaded: Loaded) -> Tracked:
+        return self._tracked(other, loaded, other.track(loaded), self._segment + 1)
+
     @staticmethod
-    def _track(tracker: Tracker, loaded: Loaded, segment: int) -> Tracked:
-        result = replace(tracker.track(loaded), segment=segment)
-        return Tracked(loaded, result, tracker.sweep, tracker.middle)
+    def _tracked(tracker: Tracker, loaded: Loaded, result: ScanResult, segment: int) -> Tracked:
+        return Tracked(loaded, replace(result, segment=segment), tracker.sweep, tracker.middle)
 
 
 def _is_less(result: ScanResult, other: ScanResult) -> bool:

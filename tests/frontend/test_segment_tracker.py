@@ -34,7 +34,8 @@ def tracked(old: dict[int, int], *new: dict[int, int], count: int, unread: tuple
     begun = iter(new)
     tracker = SegmentTracker(Scripted(old), lambda pose: Scripted(next(begun), pose[0, 3] + 1), INITIAL)
     scan = Scan(np.ones((3, 3), np.float32), 0, 0)
-    out = [tracker.track(Loaded(i, i, None if i in unread else scan)) for i in range(count)]
+    every = [Loaded(i, i, None if i in unread else scan) for i in range(count)]
+    out = [tracker.decide(loaded, tracker.present.track(loaded)) for loaded in every]
     return [*out, tracker.finish()]
 
 
