@@ -17,7 +17,7 @@ from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.inertial_calibration import calibration_found, mounting_problem
 from lslam.frontend.motion_models import motion_of
 from lslam.frontend.register_scans import read_ahead
-from lslam.frontend.scene_scale import with_scene_scale
+from lslam.frontend.scene_scale import in_scale
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.frontend.tracker import Tracker
 from lslam.inertial import fusion
@@ -157,7 +157,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     end_ns = begin_ns + round(1e9 * config.imu.start_s)
     few = select(whole, first, max(int(np.searchsorted(whole.stamps_ns[first:], end_ns)), 1))
     gate = config.preprocess.model_dump(include={"range_min", "range_max", "up", "deskew"})
-    odometry = create_odometry(with_scene_scale(Config.model_validate({"preprocess": gate}), few))
+    odometry = create_odometry(in_scale(Config.model_validate({"preprocess": gate}), few))
     tracker = Tracker(odometry, motion=motion)
     stamps: list[int] = []
     poses: list[NDArray[np.float64]] = []

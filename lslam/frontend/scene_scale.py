@@ -23,10 +23,16 @@ LENGTHS = {
 
 
 def with_scene_scale(config: Config, sequence: Sequence) -> Config:
-    """The configuration with its default lengths in proportion to the median range of the scans, where that is short.
+    """The configuration with its default lengths in proportion to the scene, where that is small; a note of it."""
+    scaled = in_scale(config, sequence)
+    if scaled != config:
+        voxel_m = scaled.registration.voxel_size
+        sequence.notes.append(f"a small scene: the voxels of the local map are {voxel_m:g} m wide")
+    return scaled
 
-    Lengths that were set are kept. What was decided is a note of the sequence.
-    """
+
+def in_scale(config: Config, sequence: Sequence) -> Config:
+    """The configuration with the lengths that nobody has set times the scale of the scene."""
     free = {
         name: [key for key in keys if key not in getattr(config, name).model_fields_set]
         for name, keys in LENGTHS.items()
@@ -39,10 +45,7 @@ def with_scene_scale(config: Config, sequence: Sequence) -> Config:
         for name in LENGTHS
         if free[name] and (section := getattr(config, name))
     }
-    changed = config.model_copy(update=sections)
-    voxel_m = changed.registration.voxel_size
-    sequence.notes.append(f"a small scene: the voxels of the local map are {voxel_m:g} m wide")
-    return changed
+    return config.model_copy(update=sections)
 
 
 def scene_scale(sequence: Sequence) -> float:

@@ -17,7 +17,6 @@ from lslam.odometry.feature_solver import NONE, FeatureNoise, map_problem, remap
 from lslam.odometry.feature_steps import ScanStep
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.ground import Z
-from lslam.registration.acceptance import Acceptance
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
 from lslam.registration.optimiser import optimise
@@ -98,10 +97,6 @@ class FeatureTarget(Target):
     def ready(self, points: Features, history: History) -> Features:
         """As they are."""
         return points
-
-    def limits(self, history: History) -> Acceptance:
-        """Those of odometry."""
-        return Acceptance.of(self.config, history, self.source)
 
     def noise(self, history: History) -> FeatureNoise:
         """With the recent variance of the motion prior as threshold of degeneracy.

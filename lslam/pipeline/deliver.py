@@ -37,7 +37,7 @@ log = logging.getLogger("lslam")
 def in_folder(
     job: PreparedRun, out: Path | None, overwrite: bool, resume: bool, earlier: EarlierRun | None
 ) -> Iterator[PreparedRun]:
-    """The run with its folder, which is held for the block and, in storage, uploaded after it; unchanged without one.
+    """The run fitted to its scene, with its folder, which is held for the block and, in storage, uploaded after it.
 
     The status is written last, however the block ends. One in storage is filled on this machine; what is to go on stays there.
     earlier : the run whose odometry serves

@@ -106,25 +106,31 @@ def is_open(config: Config, key: str) -> bool:
     return key in OPEN_KEYS and name not in getattr(config, section).model_fields_set
 
 
-def fit_to_scene(job: PreparedRun, begun: Config | None = None) -> PreparedRun:
+def fit_to_scene(job: PreparedRun, earlier: Config | None = None) -> PreparedRun:
     """The run with the lengths and the up direction that its first scans show, where its configuration leaves them open.
 
-    begun : the configuration of the part of the run that is there, which has them
+    earlier : the configuration of the part of the run that is there, which has them already
     """
-    config = job.config
-    if begun is None:
-        config = with_up(job.sequence, with_scene_scale(config, job.sequence))
-    for key in OPEN_KEYS if begun is not None else ():
-        section, _, name = key.partition(".")
-        value = getattr(getattr(begun, section), name)
-        if is_open(job.config, key) and value != getattr(getattr(config, section), name):
-            config = config.model_copy(update={section: getattr(config, section).model_copy(update={name: value})})
+    if earlier is None:
+        config = with_up(job.sequence, with_scene_scale(job.config, job.sequence))
+    else:
+        config = _with_scene_of(earlier, job.config)
     if config == job.config:
         return job
     job.manifest.config = config
     is_given = isinstance(job.odometry, GivenPoses)
     odometry = job.odometry if is_given else create_odometry(with_imu_settings(config))
     return replace(job, config=config, odometry=odometry)
+
+
+def _with_scene_of(earlier: Config, config: Config) -> Config:
+    """The configuration with the open keys of an earlier one."""
+    for key in OPEN_KEYS:
+        name, _, field = key.partition(".")
+        if is_open(config, key):
+            section = getattr(config, name).model_copy(update={field: getattr(getattr(earlier, name), field)})
+            config = config.model_copy(update={name: section})
+    return config
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:

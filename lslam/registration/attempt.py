@@ -26,6 +26,7 @@ NEAR_KERNEL = 2.0
 class Target(Stateful, ABC):
     """The maps that scans are registered on, and the residuals of their points or features there."""
 
+    config: RegistrationConfig
     # Words for what is registered.
     source: str
     # Steps as a multiple of those configured.
@@ -51,9 +52,9 @@ class Target(Stateful, ABC):
     def ready(self, points: Any, history: History) -> Any:
         """The points with all that the residual takes of them."""
 
-    @abstractmethod
     def limits(self, history: History) -> Acceptance:
         """What a registration must pass."""
+        return Acceptance.of(self.config, history, self.source)
 
     @abstractmethod
     def align(

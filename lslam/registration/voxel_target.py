@@ -12,7 +12,6 @@ from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
 from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.registration.acceptance import Acceptance
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
@@ -85,10 +84,6 @@ class VoxelTarget(MapAlignment, Target):
         c = self.config
         covariance = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
         return replace(points, covariance=covariance)
-
-    def limits(self, history: History) -> Acceptance:
-        """Those of odometry."""
-        return Acceptance.of(self.config, history, self.source)
 
     def align(
         self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None
