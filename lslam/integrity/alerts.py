@@ -39,9 +39,9 @@ class Alert:
 
 def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
-    told = [rule(checks) for rule in (_unconfirmed, _inconsistent, _ambiguous, _open, _foreign)]
-    found = [alert for alerts_of_rule in (*told, _jumps(positions, stamps_ns)) for alert in alerts_of_rule]
-    return sorted(found, key=lambda alert: (alert.first, alert.last))
+    rules = (_unconfirmed, _inconsistent, _ambiguous, _open, _foreign)
+    of_checks = [alert for rule in rules for alert in rule(checks)]
+    return sorted([*of_checks, *_jumps(positions, stamps_ns)], key=lambda alert: (alert.first, alert.last))
 
 
 def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
@@ -128,15 +128,15 @@ def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:
 def _open(checks: list[MotionCheck]) -> list[Alert]:
     """Where the poses begin to move along a direction that the scans leave open; checks one after the other make one alert."""
     spans: list[tuple[int, int, float, str]] = []
-    told: MotionCheck | None = None
+    reference: MotionCheck | None = None
     for check in checks:
         if not check.is_open:
-            told = check
+            reference = check
             continue
-        if told is None or min(told.seconds, check.seconds) <= 0:
+        if reference is None or min(reference.seconds, check.seconds) <= 0:
             continue
-        longer = check.seconds / told.seconds
-        more = (check.claimed - se3.exp(longer * se3.log(told.claimed)))[:3, 3]
+        longer = check.seconds / reference.seconds
+        more = (check.claimed - se3.exp(longer * se3.log(reference.claimed)))[:3, 3]
         axis = int(np.argmax(np.abs(more)))
         # What a shorter pair does not tell grows with the time.
         if abs(more[axis]) <= LARGE[axis] * max(longer, 1.0):

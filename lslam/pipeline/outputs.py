@@ -49,16 +49,16 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
     """trajectory.tum (LiDAR), trajectory_kitti.txt (camera 0 when Tr is known, else LiDAR), covariances.npz."""
     trajectory = record.trajectory
     frames = np.array([r.frame for r in record.results])
-    said = f"lslam {__version__}, {record.method}: T_world_lidar"
+    title = f"lslam {__version__}, {record.method}: T_world_lidar"
     about = f"world: {record.world}\npose_time: {record.pose_time}"
     elsewhere = "".join(
         f"\nin frame {n}, of their own, as in trajectory_frame_{n}.tum: {np.count_nonzero(frames == n)} poses, the first of "
         f"scan {record.results[int(np.argmax(frames == n))].index}"
         for n in range(1, int(frames.max(initial=0)) + 1)
     )
-    write_tum(folder.path / "trajectory.tum", trajectory, comment=f"{said}\n{about}{elsewhere}")
+    write_tum(folder.path / "trajectory.tum", trajectory, comment=f"{title}\n{about}{elsewhere}")
     for n in range(1, int(frames.max(initial=0)) + 1):
-        comment = f"{said} in frame {n}, of its own\npose_time: {record.pose_time}"
+        comment = f"{title} in frame {n}, of its own\npose_time: {record.pose_time}"
         write_tum(folder.path / f"trajectory_frame_{n}.tum", trajectory.select(frames == n), comment=comment)
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:

@@ -25,7 +25,7 @@ from lslam.types.segment import Segment
 log = logging.getLogger("lslam")
 
 Floats = NDArray[np.float64]
-MOST_SAID = 6
+MAX_SENTENCES = 6
 
 
 @dataclass(frozen=True)
@@ -95,15 +95,16 @@ def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: 
     """Add the part to the first frame, the largest first, that it is found in; else it begins another."""
     reasons = []
     for frame in sorted(frames, key=lambda frame: -sum(other.segment.registered for other in frame)):
-        known = [other.session for other in frame if other.session is not None]
-        if part.session is None or not known:
+        targets = [other.session for other in frame if other.session is not None]
+        if part.session is None or not targets:
             continue
-        found, reason = tie(part.session, known, config, should_stop, _vicinity(known[-1], part.session))
-        if found is not None and found.start is not None and found.start.votes < AGREEING:
-            found, reason = None, "it is too short for two of its keyframes to agree on a place"
-        if found is not None and found.start is not None:
-            said = f"place search: {found.start.votes} of {found.start.tried} keyframes tried agree"
-            frame.append(replace(part, session=found, segment=replace(part.segment, tied_by=said)))
+        session, reason = tie(part.session, targets, config, should_stop, _vicinity(targets[-1], part.session))
+        start = None if session is None else session.start
+        if start is not None and start.votes < AGREEING:
+            start, reason = None, "it is too short for two of its keyframes to agree on a place"
+        if start is not None:
+            evidence = f"place search: {start.votes} of {start.tried} keyframes tried agree"
+            frame.append(replace(part, session=session, segment=replace(part.segment, tied_by=evidence)))
             return
         reasons.append(reason)
     frames.append([replace(part, segment=replace(part.segment, reason=part.segment.reason or "; ".join(reasons)))])
@@ -183,13 +184,12 @@ def _moved(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanR
 
 
 def _say(segments: Sequence[Segment], manifest: Manifest) -> None:
-    said = [_sentence(segment) for segment in segments]
-    said = [sentence for sentence in said if sentence]
-    if len(said) > MOST_SAID:
-        said = [*said[:MOST_SAID], f"and {len(said) - MOST_SAID} more segments: see segments in manifest.json"]
-    for sentence in said:
+    sentences = [sentence for segment in segments if (sentence := _sentence(segment))]
+    if (more := len(sentences) - MAX_SENTENCES) > 0:
+        sentences = [*sentences[:MAX_SENTENCES], f"and {more} more segments: see segments in manifest.json"]
+    for sentence in sentences:
         log.warning("%s", sentence)
-    manifest.problems += said
+    manifest.problems += sentences
 
 
 def _sentence(segment: Segment) -> str:

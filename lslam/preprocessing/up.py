@@ -65,8 +65,8 @@ def find_up(points: NDArray[np.float32], gravity_up: Floats | None = None) -> Up
         return Up(Z if direction[2] > NEAR_Z else direction, "gravity")
     if about_z > LEAST_SHARE:
         return Up(Z, "ground")
-    found = [ground_share(points, d) for d in DIRECTIONS]
-    grounds = [(n[2] > 0.0, share, n) for share, n in found if share > LEAST_SHARE]
+    shares = [ground_share(points, d) for d in DIRECTIONS]
+    grounds = [(n[2] > 0.0, share, n) for share, n in shares if share > LEAST_SHARE]
     # Of a floor and its ceiling the one nearer to z.
     normal = max(grounds, key=lambda ground: ground[:2])[2] if grounds else Z
     return AXIS if normal[2] > NEAR_Z else Up(normal, "ground")
