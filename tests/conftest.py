@@ -24,7 +24,7 @@ from lslam.errors import InputError
 from lslam.foreign import importing_open3d
 from lslam.locks import one_at_a_time
 
-pytest_plugins = ["perturbed_scans"]
+pytest_plugins = ["perturbed_scans", "tiers"]
 compile_once()
 
 # How long an example takes is the machine's affair.

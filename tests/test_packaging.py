@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 DEPENDENCIES = [Requirement(text) for text in PROJECT["dependencies"]]
-TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["test"]]
+TEST_EXTRA = [Requirement(text) for text in PROJECT["optional-dependencies"]["test"] if text != "lslam[docs]"]
 # What a user may install beside: `pip install 'lslam[small-gicp]'`.
 CHOICES = [
     Requirement(t)
@@ -62,7 +62,7 @@ def files() -> list[Path]:
         if listing.returncode == 0 and listing.stdout:
             found = [ROOT / name for name in listing.stdout.split("\0") if name]
             return [path for path in found if path.is_file()]
-    litter = {"build", "dist", "runs", "venv", "__pycache__", "lslam.egg-info"}
+    litter = {"build", "dist", "runs", "site", "venv", "__pycache__", "lslam.egg-info"}
     return [
         path for path in ROOT.rglob("*")
         if path.is_file() and not any(p in litter or (p.startswith(".") and p != ".ci") for p in path.relative_to(ROOT).parts)

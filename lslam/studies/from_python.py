@@ -49,8 +49,13 @@ def compare(
     out : folder of all runs (default: runs/compare-TIME); jobs : runs at once, times are comparable with one only
     imu : `both` makes two of each, `on` and `off` one; settings : "map.voxel=0.1", of all runs
 
-    Raises UsageError, InputError and OutputError as the command does. Runs are processes of their own: in a script call it below
-    ``if __name__ == "__main__":``.
+    Raises
+    ------
+    UsageError, InputError and OutputError as the command does.
+
+    Notes
+    -----
+    Runs are processes of their own: in a script call it below ``if __name__ == "__main__":``.
     """
     folder = Path(out) if out is not None else Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
     require_free(folder, COMPARISON, "comparison", overwrite, resume)

@@ -47,6 +47,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in SAME}
 
 
+@pytest.mark.quick
 def test_writes_exactly_the_promised_files(first: tuple[Done, Path]) -> None:
     done, out = first
     assert done.returncode == 0, done.stderr

@@ -79,6 +79,7 @@ def drive() -> Sequence:
     return with_rings(with_points(replace(moving, scans=scans), 9, astray.points), "elevation:16")
 
 
+@pytest.mark.quick
 @pytest.mark.parametrize(("method", "settings"), VARIANTS)
 def test_every_method_resumes_to_the_last_bit(method: str, settings: tuple[str, ...], tmp_path: Path) -> None:
     config, sequence = config_of(method, *settings), drive()

@@ -134,6 +134,7 @@ def test_forbidden_states_after_a_signal_are_detected(
     assert not said or any(said in fault for fault in found)
 
 
+@pytest.mark.quick
 def test_a_kill_hits_in_the_stage_requested(tmp_path: Path) -> None:
     done = run("plain", tmp_path, Kill(signal.SIGKILL, 0.0, ODOMETRY))
     assert (done.is_hit, done.stage, done.code) == (True, ODOMETRY, -signal.SIGKILL)

@@ -49,6 +49,7 @@ def test_a_tilted_map_is_levelled(world: Revisited) -> None:
     assert np.rad2deg(np.arccos(up @ T_MAP_TOWN[:3, 2])) < 1.0
 
 
+@pytest.mark.quick
 def test_a_drive_on_the_other_lane_is_found_anywhere_in_the_map(world: Revisited, search: PlaceFinder) -> None:
     start = search.find()
     assert start is not None, search.reasons

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+import pytest
 
 from lslam.config import load_config
 from lslam.config.odometry import TIGHTLY_COUPLED
@@ -19,6 +20,7 @@ ALIKE = {("ct-icp", "icp")}
 OWN = {"", "less planar points", "coarse-to-fine", "start search"}
 
 
+@pytest.mark.quick
 def test_no_two_methods_give_the_same_trajectory() -> None:
     drive = simulate("block", seed=1, lidar="vlp16", count=12, motion_compensated=True)
     trajectories = {}

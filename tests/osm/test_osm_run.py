@@ -153,6 +153,7 @@ def test_the_number_of_threads_changes_nothing(by_file: Path, tmp_path: Path) ->
     assert bytes_of(tmp_path / "out") == bytes_of(by_file)
 
 
+@pytest.mark.quick
 def test_external_poses_are_matched_with_the_map(by_file: Path, tmp_path: Path) -> None:
     outcome = lslam.run(
         SAMPLE, config(MAP, "odometry.method=poses", f'odometry.poses="{by_file / "trajectory_odometry.tum"}"')

@@ -169,6 +169,7 @@ def test_what_the_scene_decided_is_kept_and_another_wish_is_refused(whole: Whole
     assert 1 not in again.reads, "what was registered is not read again"
 
 
+@pytest.mark.quick
 @pytest.mark.usefixtures("at_every_scan")
 @pytest.mark.parametrize("scan", [1, 2, 9, 15])
 def test_it_goes_on_where_it_was_killed(scan: int, whole: Whole, tmp_path: Path) -> None:
