@@ -19,6 +19,10 @@ class RecoveryConfig(Section):
     start_search: bool = Field(
         True, description="seek the first steps within `registration.start_reach`, told by the points above the ground"
     )
+    at_rest: bool = Field(
+        True,
+        description="hold a sensor that stood, where fewer things must have moved for that than for its own motion",
+    )
     less_planar: bool = Field(
         True, description="LOAM methods: less planar points in place of features that are few or leave a direction open"
     )

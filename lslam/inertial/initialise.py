@@ -147,7 +147,12 @@ def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPo
 
 
 def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, told: FirstPoses, gyro_bias: Floats | None) -> None:
-    """Refuse forces that lead along the scans' path when they point the other way: at rest +g is up (REP 145)."""
+    """Refuse forces that lead along the scans' path when they point the other way: at rest +g is up (REP 145).
+
+    Where the sensor stood, the path is what registration errs by, and tells nothing of the IMU.
+    """
+    if _farthest(told.poses) < STILL_MOVE:
+        return
     bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
     guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
     as_given, reversed_ = (
@@ -215,9 +220,14 @@ def _is_stationary(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) 
     within = stamps_ns < end_ns
     if j - i < 5 or within.sum() < 3:
         return False, np.zeros(3)
-    moved = float(np.linalg.norm(poses[within, :3, 3] - poses[0, :3, 3], axis=1).max())
+    moved = _farthest(poses[within])
     varies = float(np.std(imu.gyro[i:j], axis=0).max()), float(np.std(imu.accel[i:j], axis=0).max())
     return moved < STILL_MOVE and varies[0] < STILL_RATE and varies[1] < STILL_FORCE, imu.gyro[i:j].mean(axis=0)
+
+
+def _farthest(poses: Floats) -> float:
+    """m that any of the poses (N, 4, 4) is from the first."""
+    return float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
 
 
 def _learnt(

@@ -8,6 +8,7 @@ from lslam.config.recovery import RecoveryConfig
 from lslam.odometry.feature_solver import remap_solution
 from lslam.odometry.feature_target import MIN_FEATURES
 from lslam.registration.attempt import Attempt, Policy
+from lslam.registration.policies import AtRest
 from lslam.registration.solver import RegistrationResult
 
 
@@ -90,4 +91,5 @@ def feature_policies(config: RecoveryConfig) -> tuple[Policy, ...]:
         *([LessPlanar()] if config.less_planar else []),
         SolutionRemapping(),
         *([AllPointsInstead()] if config.fallback == "all-points" else []),
+        *([AtRest()] if config.at_rest else []),
     )

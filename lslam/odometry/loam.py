@@ -51,7 +51,9 @@ class Loam(Stateful):
             c, config.loam, variant, reach, up=up_of(config.preprocess), with_start_search=config.recovery.start_search,
             with_all_points=config.recovery.fallback == "all-points",
         )  # fmt: skip
-        policies = feature_policies(config.recovery)
+        # From scan to scan no spot is remembered, on which the sensor could have come to rest.
+        kept = {} if variant.with_map else {"at_rest": False}
+        policies = feature_policies(config.recovery.model_copy(update=kept))
         self.registration = Registration(c, config.preprocess, target=target, policies=policies)
         self._uncertainty = self._fresh_uncertainty()
 

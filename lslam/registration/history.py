@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.preprocess import PreprocessConfig
 from lslam.config.registration import RegistrationConfig
+from lslam.registration.rest import Rest
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.types.state import Stateful
@@ -21,26 +23,29 @@ class History(Stateful):
     threshold : kernel width by the recent errors of the motion prior
     agreement, matches : recent inlier shares, of all source points and of those with a match
     starting : initialisation scans that remain; inserted : scans in the map
+    rest : the spot that the sensor has not left
     recent : points (N, 3), LiDAR frame, and pose (4, 4) of the last scans in the map
     """
 
-    STATE = ("threshold", "agreement", "matches", "starting", "inserted", "recent")
+    STATE = ("threshold", "agreement", "matches", "starting", "inserted", "recent", "rest")
 
-    def __init__(self, config: RegistrationConfig) -> None:
+    def __init__(self, config: RegistrationConfig, preprocess: PreprocessConfig | None = None) -> None:
         self.start_scans = config.start_scans
         self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
         self.agreement, self.matches = (UsualAgreement(config.min_agreement) for _ in range(2))
         self.starting, self.inserted = config.start_scans, 0
         self.recent: tuple[tuple[NDArray[Any], Floats], ...] = ()
+        self.rest = Rest(preprocess or PreprocessConfig(), config.sigma)
 
     @property
     def is_young(self) -> bool:
         """Whether the map is made of the first scans alone."""
         return self.inserted <= self.start_scans
 
-    def enter(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
-        """One more scan is in the map."""
+    def enter(self, points: NDArray[Any], T_world_lidar: Floats, lever_arm: float = 1.0) -> None:
+        """One more scan is in the map; `lever_arm` of its rotation, m."""
         self.inserted += 1
+        self.rest.enter(points, T_world_lidar, lever_arm)
         self.recent = (*self.recent, (points, T_world_lidar))[-self.start_scans :]
 
     def observe(self, result: RegistrationResult) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lslam.config.recovery import RecoveryConfig
+from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt, Policy
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import StartSearch
@@ -37,6 +38,27 @@ class CoarseToFine:
         return replace(result, iterations=iterations)
 
 
+class AtRest:
+    """Holds a sensor where it stood, as long as fewer things must have moved for that than for its own motion.
+
+    At the lights the surfaces of vehicles hold a sensor best. Where they drive off together, their points outnumber those of
+    the street, all of which must have come along if the sensor moved.
+    """
+
+    name = "at rest"
+
+    def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
+        """Acts on results that leave the spot on which the sensor stood."""
+        rest, T_found = attempt.history.rest, result.T_world_lidar
+        is_standing = rest.scans >= attempt.config.start_scans
+        if not (result.ok and is_standing) or rest.is_here(T_found, result.lever_arm):
+            return result
+        if not rest.votes(attempt.target.cloud(attempt.points), T_found).is_standing:
+            return result
+        held = result.moved(rest.T_world_lidar.copy(), result.covariance)
+        return replace(held, prior_error=correction(attempt.T_prior, held.T_world_lidar), pose_source=self.name)
+
+
 def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:
     """Nearest first: a policy sees what those before it found."""
     policies: list[Policy] = []
@@ -44,4 +66,6 @@ def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:
         policies.append(CoarseToFine())
     if config.start_search:
         policies.append(StartSearch())
+    if config.at_rest:
+        policies.append(AtRest())
     return tuple(policies)

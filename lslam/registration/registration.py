@@ -52,7 +52,7 @@ class Registration(Stateful):
         self.config, self.preprocess = config or RegistrationConfig(), preprocess or PreprocessConfig()
         self.target: Any = VoxelTarget(self.config, self.preprocess) if target is None else target
         self.policies = policies_of(recovery or RecoveryConfig()) if policies is None else tuple(policies)
-        self.history = History(self.config)
+        self.history = History(self.config, self.preprocess)
         # Of `register`: the last two poses, and how many scans there were.
         self._last, self._index = (np.eye(4), np.eye(4)), 0
 
@@ -133,4 +133,4 @@ class Registration(Stateful):
             self.target.miss(result)
             return
         self.target.enter(result)
-        self.history.enter(self.target.cloud(result.points), result.T_world_lidar)
+        self.history.enter(self.target.cloud(result.points), result.T_world_lidar, result.lever_arm)

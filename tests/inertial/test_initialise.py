@@ -232,3 +232,25 @@ def test_gaps_are_longer_than_the_limit_and_than_a_slow_rate() -> None:
     assert len(gaps(slow, 0.1)) == 2
     assert gaps(slow, 0.1)[0, 1] < 0
     assert gaps(slow, 0.1)[-1, 0] > 808_000_000
+
+
+def test_a_sensor_that_stood_has_no_path_that_tells_of_the_sign() -> None:
+    """Forces that lead against a path of a centimetre: so far registration errs, as among traffic that starts."""
+    t, swing = np.arange(0.0, 3.0, 0.01), np.pi
+    accel = np.column_stack([0.01 * swing**2 * np.sin(swing * t), 0 * t, 9.81 + 0 * t])
+    rng = np.random.default_rng(0)
+    imu = ImuStream(
+        (1e9 * t).astype(np.int64), accel + rng.normal(0, 1e-3, accel.shape), rng.normal(0, 1e-3, accel.shape)
+    )
+
+    def started(metres: float) -> InertialStart:
+        poses = np.tile(np.eye(4), (29, 1, 1))
+        poses[:, 0, 3] = metres * np.sin(swing * t[::10][:29])
+        stamps = imu.stamps_ns[::10][:29]
+        first = FirstPoses(stamps, poses, stamps, poses, np.tile(1e-6 * np.eye(6), (29, 1, 1)))
+        return start(imu, np.eye(4), first, int(stamps[-1]), ImuConfig())
+
+    assert np.linalg.norm(started(0.01).estimate.gravity) == pytest.approx(9.81, abs=0.05)
+    imu = spoilt(imu, accel=np.column_stack([20 * accel[:, 0], accel[:, 1:]]))
+    with pytest.raises(ImuRefusedError, match="point the other way"):
+        started(0.2)

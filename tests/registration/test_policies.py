@@ -12,7 +12,7 @@ from lslam.config.config import Config
 from lslam.config.recovery import RecoveryConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
-from lslam.registration.policies import CoarseToFine, policies_of
+from lslam.registration.policies import AtRest, CoarseToFine, policies_of
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import StartSearch
@@ -24,10 +24,10 @@ def test_each_policy_has_its_switch_and_coarse_to_fine_comes_first() -> None:
     def kinds(config: RecoveryConfig) -> list[type]:
         return [type(policy) for policy in policies_of(config)]
 
-    assert kinds(RecoveryConfig()) == kinds(Config().recovery) == [CoarseToFine, StartSearch]
-    assert kinds(RecoveryConfig(coarse_to_fine=False)) == [StartSearch]
-    assert kinds(RecoveryConfig(start_search=False)) == [CoarseToFine]
-    assert kinds(RecoveryConfig(coarse_to_fine=False, start_search=False)) == []
+    assert kinds(RecoveryConfig()) == kinds(Config().recovery) == [CoarseToFine, StartSearch, AtRest]
+    assert kinds(RecoveryConfig(coarse_to_fine=False)) == [StartSearch, AtRest]
+    assert kinds(RecoveryConfig(start_search=False)) == [CoarseToFine, AtRest]
+    assert kinds(RecoveryConfig(coarse_to_fine=False, start_search=False, at_rest=False)) == []
 
 
 def surprised(config: RecoveryConfig) -> tuple[RegistrationResult, Floats]:

@@ -1,0 +1,171 @@
+"""The spot on which a sensor rests, and whether a scan shows it there or moved: which of both needs fewer things to move?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.config.preprocess import PreprocessConfig
+from lslam.geometry import se3, so3
+from lslam.preprocessing.ground import ground_of, up_of
+from lslam.registration.alignment import upright_directions
+from lslam.registration.gaussian_map import FLOOR
+from lslam.registration.local_map import BREADTH
+from lslam.types.state import State, Stateful
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Flags = NDArray[np.bool_]
+
+# m; points of one wall in plan, as wide as a voxel reaches.
+NEIGHBOURHOOD_M = 0.8
+# m; surfaces farther apart are of different things.
+THINGS_APART_M = 2.0
+# Squared sigmas beyond which a point is no inlier, so that two points at least make a vote.
+MOST_CHI2 = 9.0
+# Squared sigmas by which a point tells two poses apart.
+TELLING_CHI2 = 0.5
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Things that fit where they were, and things that fit the motion: all others tell nothing."""
+
+    stay: int
+    move: int
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether fewer things must have moved if the sensor stands."""
+        return self.stay > 0 and self.stay >= self.move
+
+
+class PlanWalls:
+    """Vertical surfaces of a scan, in plan: a façade of few rings far away has no plane in a voxel, and a line here.
+
+    A thing is a wall where its points are thin in plan, and lie across beams (`BREADTH`): a ring on a slope is thin, too.
+
+    cloud : (N, 3) m, LiDAR frame
+    """
+
+    def __init__(self, cloud: NDArray[np.float32], preprocess: PreprocessConfig, sigma: float) -> None:
+        from scipy.spatial import cKDTree
+
+        self._preprocess, self._sigma2 = preprocess, sigma**2
+        ground = ground_of(cloud, preprocess.ground_slope, preprocess.ground_tolerance, up_of(preprocess))
+        self._R = ground.R
+        high = cloud[ground.above(cloud, preprocess.ground_tolerance)].astype(np.float64) @ self._R.T
+        self._tree = cKDTree(high[:, :2])
+        pairs = self._tree.query_pairs(NEIGHBOURHOOD_M, output_type="ndarray")
+        own = np.arange(len(high))
+        at, of = np.concatenate([own, pairs[:, 0], pairs[:, 1]]), np.concatenate([own, pairs[:, 1], pairs[:, 0]])
+        count = np.bincount(at, minlength=len(high))
+
+        def mean(values: Floats) -> Floats:
+            return np.asarray(np.bincount(at, values, len(high)) / count)
+
+        self._mean = np.stack([mean(high[of, k]) for k in range(3)], axis=1)
+        x, y, z = (high[of] - self._mean[at]).T
+        xx, xy, yy, zz = mean(x * x), mean(x * y), mean(y * y), mean(z * z)
+        spread, angle = np.hypot((xx - yy) / 2, xy), 0.5 * np.arctan2(2 * xy, xx - yy)
+        self._normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+        thick = np.maximum((xx + yy) / 2 - spread, 0.0) + FLOOR
+        self._variance = thick + self._sigma2
+        self._is_wall = (thick < self._sigma2) & (np.minimum((xx + yy) / 2 + spread, zz) > BREADTH * thick)
+
+    def votes(self, cloud: NDArray[np.float32], motion: Floats) -> Votes:
+        """How many things of a later scan (N, 3) fit better if the sensor stands, and how many if it came by `motion` (4, 4)."""
+        p = self._preprocess
+        ground = ground_of(cloud, p.ground_slope, p.ground_tolerance, up_of(p))
+        points = cloud[ground.above(cloud, p.ground_tolerance)].astype(np.float64)
+        if not len(self._mean) or not len(points):
+            return Votes(0, 0)
+        here, there = points @ self._R.T, se3.apply(motion, points) @ self._R.T
+        (standing, is_here), (moved, is_there) = self._cost(here), self._cost(there)
+        # Where one of them tells nothing there is nothing to compare.
+        gain = np.where(np.isfinite(standing) & np.isfinite(moved) & (is_here | is_there), moved - standing, 0.0)
+        telling = np.flatnonzero(np.abs(gain) > TELLING_CHI2)
+        if not len(telling):
+            return Votes(0, 0)
+        things = _connected(here[telling, :2])
+        sums = np.bincount(things, gain[telling])
+        return Votes(*(int(np.count_nonzero(sign * sums > MOST_CHI2)) for sign in (1, -1)))
+
+    def _cost(self, points: Floats) -> tuple[Floats, Flags]:
+        """(N,) squared sigmas of levelled points from their wall, NaN where none is known, and whether anything is near."""
+        away, near = self._tree.query(points[:, :2], distance_upper_bound=NEIGHBOURHOOD_M)
+        is_near = np.isfinite(away)
+        near = np.where(is_near, near, 0)
+        off = ((points - self._mean[near])[:, :2] * self._normal[near]).sum(1)
+        cost = np.minimum(off**2 / self._variance[near], MOST_CHI2)
+        return np.where(is_near, np.where(self._is_wall[near], cost, np.nan), MOST_CHI2), is_near
+
+
+def _connected(points: Floats) -> Longs:
+    """(N,) numbers of the things that points (N, 2) in plan belong to."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(points).query_pairs(THINGS_APART_M, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
+
+
+class Rest(Stateful):
+    """The spot that the sensor has not left: the scan that it came with, its pose, and how many scans lie there since.
+
+    Walls tell of level motion alone, and so does this: a car that is about to start pitches.
+
+    sigma : m, noise of a point, by which two poses of one spot may differ
+    """
+
+    STATE = ("scans", "T_world_lidar", "_cloud", "_squares")
+
+    def __init__(self, preprocess: PreprocessConfig, sigma: float) -> None:
+        self.preprocess, self.sigma, self.scans = preprocess, sigma, 0
+        # Sum of the squared distances of these scans, m2.
+        self._squares = 0.0
+        self.T_world_lidar = np.eye(4)
+        self._cloud: NDArray[np.float32] | None = None
+        self._walls: PlanWalls | None = None
+
+    def is_here(self, T_world_lidar: Floats, lever_arm: float) -> bool:
+        """Whether a pose (4, 4) is the spot, within what registrations of one spot differ by: a sigma at least, three at most."""
+        usual = float(np.sqrt(MOST_CHI2 * self._squares / self.scans))
+        return self._away(T_world_lidar, lever_arm) < min(max(usual, self.sigma), self._reach)
+
+    @property
+    def _reach(self) -> float:
+        """m; beyond three sigma a single point would tell, and nearer a wall of the street may have no vote yet."""
+        return float(np.sqrt(MOST_CHI2)) * self.sigma
+
+    def _away(self, T_world_lidar: Floats, lever_arm: float) -> float:
+        """m from the spot to a pose (4, 4), but for height and tilt, for a point at the `lever_arm`, m."""
+        old, new = self.T_world_lidar, T_world_lidar
+        change = np.concatenate([new[:3, 3] - old[:3, 3], so3.log(new[:3, :3] @ old[:3, :3].T)])
+        level = change - upright_directions(old, up_of(self.preprocess)) @ change
+        return float(np.linalg.norm(level[:3]) + np.linalg.norm(level[3:]) * lever_arm)
+
+    def enter(self, cloud: NDArray[np.float32], T_world_lidar: Floats, lever_arm: float) -> None:
+        """One more scan: points (N, 3), m, LiDAR frame, at its pose (4, 4), which may have left the spot."""
+        away = self._away(T_world_lidar, lever_arm)
+        if self._cloud is not None and away < self._reach:
+            self.scans, self._squares = self.scans + 1, self._squares + away**2
+        else:
+            self._cloud, self.T_world_lidar, self._walls = cloud, T_world_lidar.copy(), None
+            self.scans, self._squares = 1, 0.0
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        super().restore(state)
+        self._walls = None
+
+    def votes(self, cloud: NDArray[np.float32], T_world_lidar: Floats) -> Votes:
+        """Of a scan (N, 3) for the spot, and for the pose (4, 4)."""
+        assert self._cloud is not None
+        if self._walls is None:
+            self._walls = PlanWalls(self._cloud, self.preprocess, self.sigma)
+        return self._walls.votes(cloud, se3.relative(self.T_world_lidar, T_world_lidar))
