@@ -44,10 +44,10 @@ class Dlo(Icp):
             result = self.registration.locate(points, step.T_world_lidar if step.ok else prior.pose, is_near)
         return replace(result, map_age=self.map_age, stages=clock.seconds)
 
-    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> None:
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
         """Enter the scan as the last one, and as a keyframe when one is due."""
-        super().insert(stamp_ns, prior, result)
         self.pairwise.update(result)
+        return super().insert(stamp_ns, prior, result)
 
     def restart(self) -> None:
         """No last scan and no keyframes."""

@@ -98,13 +98,13 @@ class Icp(Stateful):
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
         """Enter the scan into the local map where its result puts it."""
         began = time.perf_counter()
-        self.insert(scan.stamp_ns, prior, result)
+        result = self.insert(scan.stamp_ns, prior, result)
         record = recorded(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))
         return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
 
-    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> None:
-        """Enter a scan that was registered from `prior` into the map."""
-        self.registration.update(result)
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
+        """Enter a scan that was registered from `prior` into the map; the result says whether the sensor is at rest."""
+        return self.registration.update(result)
 
     def restart(self) -> None:
         """An empty map."""

@@ -39,8 +39,8 @@ class LioMapping(FastLio2):
     def __init__(self, registration: Registration, lag: int) -> None:
         super().__init__(registration)
         self.lag = lag
-        # Scans that are not in the map yet, the earliest first: stamp, points and pose.
-        self.pending: tuple[tuple[int, PreparedPoints, Floats], ...] = ()
+        # Scans that are not in the map yet, the earliest first: stamp, points, pose, and whether the sensor was at rest.
+        self.pending: tuple[tuple[int, PreparedPoints, Floats, bool], ...] = ()
         # The scan that is being registered.
         self._offered: dict[int, PreparedPoints] = {}
 
@@ -59,27 +59,28 @@ class LioMapping(FastLio2):
 
     def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
         """Of scans at other poses (4, 4), by their stamps; none of those that are in the map already."""
-        known = self._offered | {stamp_ns: points for stamp_ns, points, _ in self.pending}
+        known = self._offered | {stamp_ns: points for stamp_ns, points, *_ in self.pending}
         return tuple(self._at(stamp_ns, known[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in known)
 
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
         return ScanEquations(stamp_ns, T, *self.registration.target.equations(points, T))
 
-    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> None:
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
         """Keep the scan for the map; while that is young, or the window silent, it enters at once."""
         if not result.ok or prior.covariance is None or self.registration.history.is_young:
-            self.registration.update(result)
-            return
+            return self.registration.update(result)
+        result = self.registration.rest_detector.judged(result)
         self.registration.history.observe(result)
-        self.pending = (*self.pending, (stamp_ns, result.points, result.T_world_lidar))
+        self.pending = (*self.pending, (stamp_ns, result.points, result.T_world_lidar, result.is_stationary))
+        return result
 
     def settle(self, poses: Mapping[int, Floats]) -> None:
         """Move the scans that wait to the poses (4, 4) of the window; those old enough, or no longer in it, enter the map."""
-        waiting = [(stamp_ns, points, poses.get(stamp_ns, T)) for stamp_ns, points, T in self.pending]
-        due = [k < len(waiting) - self.lag or stamp_ns not in poses for k, (stamp_ns, _, _) in enumerate(waiting)]
-        for (_, points, T), is_due in zip(waiting, due, strict=True):
+        waiting = [(stamp_ns, points, poses.get(stamp_ns, T), rests) for stamp_ns, points, T, rests in self.pending]
+        due = [k < len(waiting) - self.lag or one[0] not in poses for k, one in enumerate(waiting)]
+        for (_, points, T, rests), is_due in zip(waiting, due, strict=True):
             if is_due:
-                self.registration.enter(RegistrationResult(T, points=points))
+                self.registration.enter(RegistrationResult(T, points=points, is_stationary=rests))
         self.pending = tuple(one for one, is_due in zip(waiting, due, strict=True) if not is_due)
 
     def warm_up(self) -> None:

@@ -91,7 +91,7 @@ class Loam(Stateful):
         """Enter the scan where its result puts it: into the feature map, and as what the next one is registered on."""
         clock = StageClock()
         with clock.stage("update"):
-            self.registration.update(result)
+            result = self.registration.update(result)
             record = recorded(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))
         return replace(record, stages={**result.stages, **clock.seconds})
 

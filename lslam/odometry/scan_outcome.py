@@ -28,7 +28,8 @@ def recorded(scan: Scan, found: RegistrationResult, covariance: Floats | None, o
         status="ok" if found.is_accepted else "bridged", reason=found.reason, covariance=covariance,
         registration_covariance=own, map_age=found.map_age, converged=found.converged, iterations=found.iterations,
         source_points=found.source_points, inliers=found.inliers, rmse=found.rmse, overlap=found.overlap,
-        posed_by=found.pose_source, degenerate=found.degenerate, prior_error=found.prior_error, stages=found.stages,
+        is_stationary=found.is_stationary, posed_by=found.pose_source,
+        degenerate=found.degenerate, prior_error=found.prior_error, stages=found.stages,
     )  # fmt: skip
 
 

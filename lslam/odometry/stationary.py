@@ -58,7 +58,7 @@ class StationaryDetector(Stateful):
             return None
         return ScanResult(
             scan.index, scan.stamp_ns, self._last.T_world_lidar.copy(),
-            reason=f"standing since scan {self._last.index}", is_stationary=True,
+            reason=f"standing since scan {self._last.index}", is_stationary=True, is_repeated=True,
             covariance=self._last.covariance, registration_covariance=self._last.registration_covariance,
             points_covariance=self._last.points_covariance,
         )  # fmt: skip

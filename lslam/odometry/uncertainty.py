@@ -28,7 +28,7 @@ class PoseUncertainty(Stateful):
     the sensor has moved by its lever arm (the rms distance of the matched points) the map consists of new scans, and one
     more independent registration error has entered it. In between, registrations against the same map share its
     error. So per scan the map's covariance grows by (step / lever arm) times the registration's, and a rotation error
-    moves all later positions. A stationary sensor does not drift.
+    moves all later positions. A sensor at rest does not drift: its scans enter at one pose, and leave the map's error as it is.
 
     A young map is the mean of its scans: one part in k of the error of the k-th stays in all that follow. The registrations
     of the first few are the least accurate, which the later covariances do not model.
@@ -79,7 +79,10 @@ class PoseUncertainty(Stateful):
         step = position - self._position
         self._position = position.copy()
         self._map = noise.transported(self._map, step)
-        if result.ok:
+        if result.is_stationary:
+            self._scans += 1
+            self.map_age += 1
+        elif result.ok:
             renewed = 1.0 if self.is_scan_to_scan else float(np.linalg.norm(step)) / max(result.lever_arm, 1.0)
             self._scans += 1
             self._map += max(renewed, 1 / self._scans**2) * result.covariance

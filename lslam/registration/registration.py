@@ -20,6 +20,7 @@ from lslam.registration.attempt import Attempt, Policy, Target
 from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
 from lslam.registration.policies import policies_of
+from lslam.registration.rest_detector import RestDetector
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import VoxelTarget
@@ -43,7 +44,7 @@ class Registration(Stateful):
     (4, 4)
     """
 
-    STATE = ("target", "history", "_last", "_index")
+    STATE = ("target", "history", "rest_detector", "_last", "_index")
 
     def __init__(
         self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None,
@@ -53,6 +54,7 @@ class Registration(Stateful):
         self.target: Any = VoxelTarget(self.config, self.preprocess) if target is None else target
         self.policies = policies_of(recovery or RecoveryConfig()) if policies is None else tuple(policies)
         self.history = History(self.config, self.preprocess)
+        self.rest_detector = RestDetector(self.config.sigma)
         # Of `register`: the last two poses, and how many scans there were.
         self._last, self._index = (np.eye(4), np.eye(4)), 0
 
@@ -76,8 +78,7 @@ class Registration(Stateful):
         T_prior = se3.normalise(last @ se3.relative(before, last)) if prior is None else np.asarray(prior, np.float64)
         if T_prior.shape != (4, 4) or not np.isfinite(T_prior).all():
             raise InputError(f"the motion prior has shape {T_prior.shape}: a finite (4, 4) pose is needed")
-        result = self.locate(points, T_prior)
-        self.update(result)
+        result = self.update(self.locate(points, T_prior))
         self._last = (last, result.T_world_lidar) if self._index else (result.T_world_lidar, result.T_world_lidar)
         self._index += 1
         return result
@@ -107,14 +108,19 @@ class Registration(Stateful):
         ready = self.target.ready(points, self.history)
         return Attempt(self.target, ready, T_prior, self.config, self.history, is_near, clock or StageClock())
 
-    def update(self, result: RegistrationResult) -> None:
-        """Insert the scan into the map unless its registration failed; adapt to it unless its pose was rejected."""
+    def update(self, result: RegistrationResult) -> RegistrationResult:
+        """Insert the scan into the map unless its registration failed; adapt to it unless its pose was rejected.
+
+        Returns the result, which says whether the sensor is at rest.
+        """
         is_first = len(self.target) == 0
+        result = self.rest_detector.judged(result)
         self.enter(result)
         if not (result.ok and is_first):
             self.history.observe(result)
         else:
             self.history.matches.observe(self._own_share(result))
+        return result
 
     def _own_share(self, result: RegistrationResult) -> float:
         """Inlier share of the first scan on the map that it made: so much can agree where the pose is right.
@@ -128,9 +134,15 @@ class Registration(Stateful):
         return float(self.target.align(attempt, result.T_world_lidar, at_once).inlier_share)
 
     def enter(self, result: RegistrationResult) -> None:
-        """Insert the scan into the map at its pose unless its registration failed."""
+        """Insert the scan into the map at its pose unless its registration failed.
+
+        Scans from one place share the error of their rays: a map that each enters at its own pose follows that error. A scan
+        of a sensor at rest enters at the pose of the one before.
+        """
         if not result.ok:
             self.target.miss(result)
             return
+        if result.is_stationary:
+            result = replace(result, T_world_lidar=self.history.recent[-1][1])
         self.target.enter(result)
         self.history.enter(self.target.cloud(result.points), result.T_world_lidar, result.lever_arm)

@@ -42,6 +42,7 @@ class RegistrationResult:
     is_rejected : the pose is not the registration's, since the IMU or the laws of motion contradict that: the scan enters
         the map there, and adaptive thresholds do not learn from it
     pose_source : the recovery policy or the fallback that found the pose; empty: the registration itself
+    is_stationary : the sensor is at rest, as its last poses say
     inliers : source points within the final kernel
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
@@ -68,6 +69,7 @@ class RegistrationResult:
     prior_error: tuple[float, float] = (0.0, 0.0)
     lever_arm: float = 1.0
     is_rejected: bool = False
+    is_stationary: bool = False
     pose_source: str = ""
     replaced: RegistrationResult | None = None
     points: Any = None

@@ -38,8 +38,8 @@ class RunFacts:
     """Numbers of a run.
 
     status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
-    registered, bridged, skipped, standing : scans that were registered, followed the motion prior, could not be read, and
-        were not registered because the sensor stood
+    registered, bridged, skipped : scans that were registered, followed the motion prior, could not be read
+    standing : scans of a sensor at rest, registered or not
     stand_ins : scans by who posed them in place of the method, in the order in which they first did
     path_length : m; duration : s between the first and the last pose
     stages : in the order they ran; total : the sum of stages per scan
@@ -90,7 +90,7 @@ def run_facts(record: RunRecord) -> RunFacts:
         status=status,
         reasons=reasons,
         scans=len(results),
-        registered=sum(r.status == "ok" and not r.is_stationary for r in results),
+        registered=sum(r.status == "ok" and not r.is_repeated for r in results),
         bridged=sum(r.status == "bridged" for r in results),
         skipped=sum(r.status == "skipped" for r in results),
         standing=sum(r.is_stationary for r in results),

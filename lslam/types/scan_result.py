@@ -28,7 +28,8 @@ class ScanResult:
     points_covariance : as `covariance`, of the local map by the points of all scans alone, where `covariance` knows of an IMU
         that a pose graph may get beside; None elsewhere
     map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
-    is_stationary : the sensor had not moved, so the scan was not registered and has the pose of the one before
+    is_stationary : the sensor had not moved since the scan before
+    is_repeated : for that reason the scan was not registered and has the pose of the one before
     posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
         empty: the method itself
     segment : number of the local map it was registered on; frame : of the coordinates that its pose is in, 0 for those of the
@@ -59,6 +60,7 @@ class ScanResult:
     rmse: float = 0.0
     overlap: float = 0.0
     is_stationary: bool = False
+    is_repeated: bool = False
     posed_by: str = ""
     segment: int = 0
     frame: int = 0
@@ -86,7 +88,7 @@ class ScanResult:
         return replace(self, covariance=self.points_covariance, registration_covariance=None)
 
     def poser(self, method: str) -> str:
-        """What posed the scan: the `method`, its fallback, the motion prior, or the scan before while stationary."""
-        if self.is_stationary:
+        """What posed the scan: the `method`, its fallback, the motion prior, or the scan before where it repeats that pose."""
+        if self.is_repeated:
             return STATIONARY
         return (self.posed_by or method) if self.status == "ok" else MOTION_PRIOR

@@ -85,7 +85,7 @@ def test_the_map_is_of_scans_that_left_the_window_and_a_run_goes_on_where_it_was
         # All scans but the first have equations, and each is in the map or waits for it.
         assert all(m.equations is not None for m in motion.window.moments if m.stamp_ns != loaded[0].stamp_ns)
         assert odometry.registration.history.inserted + len(odometry.pending) == k + 1
-        assert all(np.array_equal(T, motion.poses()[stamp]) for stamp, _, T in odometry.pending)
+        assert all(np.array_equal(T, motion.poses()[stamp]) for stamp, _, T, _ in odometry.pending)
         if k == 11:
             write_state(tmp_path / "12.npz", tracker.state())
     # One more waits in the window than enters the map while it fills.

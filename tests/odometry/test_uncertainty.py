@@ -37,6 +37,17 @@ def test_a_standing_sensor_does_not_drift() -> None:
         assert (now < C * (1 + np.pi**2 / 6) + 1e-18).all()
 
 
+def test_scans_of_a_sensor_at_rest_leave_the_error_of_the_map_as_it_is() -> None:
+    uncertainty = PoseUncertainty()
+    first = uncertainty.add(result(3.0))
+    resting = dataclasses.replace(result(3.0), is_stationary=True)
+    for _ in range(20):
+        np.testing.assert_allclose(uncertainty.add(resting), first, rtol=1e-12)
+    # It is as old as its reference, and made of all of them.
+    assert uncertainty.map_age == 21
+    np.testing.assert_allclose(uncertainty.add(result(3.0)), C * (2 + 1 / 22**2), rtol=1e-9)
+
+
 def test_errors_of_the_first_registrations_remain_in_all_later_poses() -> None:
     """They agree with each other, so half of a large error of the second lasts, however good the later ones are."""
     exact, poor, good = 1e-9 * C, 100 * C, 0.01 * C

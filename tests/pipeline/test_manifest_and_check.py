@@ -177,7 +177,7 @@ def test_coordinates_of_a_run_with_no_place_on_the_earth_are_refused() -> None:
 def test_scans_are_counted_by_the_method_that_posed_them() -> None:
     manifest = Manifest("lslam run x", Stub(["gone"] * 4), Config())
     ok, policy, bridged, standing = results("ok", "ok", "bridged", "ok")
-    policy, standing = replace(policy, posed_by="start search"), replace(standing, is_stationary=True)
+    policy, standing = replace(policy, posed_by="start search"), replace(standing, is_stationary=True, is_repeated=True)
     manifest.judge([ok, policy, bridged, standing], 4, False)
     assert manifest.as_dict("done")["posed_by"] == {"icp": 1, "start search": 1, "motion prior": 1, "standing": 1}
 
