@@ -20,7 +20,7 @@ from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
 from lslam.simulation.hall import build_hall
 from lslam.simulation.kinematics import PosePath
 from lslam.simulation.living_room import build_room
-from lslam.simulation.moving import Mover, add_traffic
+from lslam.simulation.moving import Mover, add_queue, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
 from lslam.simulation.ray_scene import RayScene
@@ -114,13 +114,17 @@ def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCi
 
 def populate(scenario: Scenario, city: City, path: PosePath, seeds: tuple[int, ...]) -> list[Mover]:
     """What moves in `city` while the LiDAR is on `path`."""
-    traffic = scenario.traffic
+    traffic, queue = scenario.traffic, []
+    if traffic.queue_s is not None:
+        rng = np.random.default_rng([*seeds, 2**32 - 5])
+        queue = add_queue(city.streets, city.terrain, path.poses(np.zeros(1))[0], traffic.queue_s, rng)
     movers = add_traffic(
         city.streets, city.terrain, path.poses, path.duration, np.random.default_rng([*seeds, 2**32 - 4]),
         cars_per_km=traffic.cars, people_per_km=traffic.people, lanes=traffic.lanes,
         pavement=scenario.layout.road + 0.6 * scenario.layout.pavement, speed=traffic.speed,
     )  # fmt: skip
-    return keep_out_of_walls(movers, city, path.duration) if isinstance(city, OsmCity) else movers
+    movers = keep_out_of_walls(movers, city, path.duration) if isinstance(city, OsmCity) else movers
+    return [*movers, *queue]
 
 
 def _terrain(scenario: Scenario, rng: np.random.Generator) -> Terrain:

@@ -21,6 +21,8 @@ from lslam.simulation.terrain import Terrain
 Floats = NDArray[np.float64]
 
 MODELS = 6  # different cars and different people
+BUS = (11.0, 2.5, 3.3)  # m
+LANE = 3.2  # m
 NEAREST = 2.3  # m that the middle of anything moving keeps from the LiDAR's line on the ground
 
 
@@ -29,6 +31,7 @@ class Mover:
     """A body on a street: `begin` m along at 0 s, `speed` m/s along it (negative: against it), `offset` m to the left.
 
     On a closed street it goes round and round; an open one it enters and leaves, and where it is not, it is far below.
+    start : s and m/s2, when it drives off and how it gains its speed; None: it has it from the first
     """
 
     scene: RayScene
@@ -39,12 +42,21 @@ class Mover:
     speed: float
     offset: float
     lift: float = 0.0
+    start: tuple[float, float] | None = None
+
+    def along(self, times: NDArray[Any]) -> Floats:
+        """(M,) m along the street at `times` (M,), s."""
+        t = np.asarray(times, np.float64)
+        if self.start is None:
+            return self.begin + self.speed * t
+        begin, gain = self.start
+        t = np.maximum(t - begin, 0.0)
+        gaining = np.minimum(t, self.speed / gain)
+        return np.asarray(self.begin + 0.5 * gain * gaining**2 + self.speed * (t - gaining))
 
     def poses(self, times: NDArray[Any]) -> Floats:
         """(M, 4, 4) T_city_body at `times` (M,), s."""
-        at, tangent, slope = _on_street(
-            self.street, self.terrain, self.begin + self.speed * np.asarray(times, np.float64), self.offset, self.lift
-        )
+        at, tangent, slope = _on_street(self.street, self.terrain, self.along(times), self.offset, self.lift)
         tangent = np.sign(self.speed) * tangent
         up = np.column_stack([-slope, np.ones(len(at))])
         up /= np.linalg.norm(up, axis=1, keepdims=True)
@@ -88,6 +100,42 @@ def add_traffic(
     return movers
 
 
+def add_queue(
+    streets: list[RouteCurve], terrain: Terrain, T_city_lidar: Floats, starts: float, rng: np.random.Generator
+) -> list[Mover]:
+    """Two buses beside a LiDAR at (4, 4) and a truck ahead of it, that drive off `starts` s later, within half a second."""
+    place = T_city_lidar[:2, 3]
+
+    def nearest(street: RouteCurve) -> tuple[float, float]:
+        s = street.sample(0.5)
+        away = portable.hypot(*(street.position(s) - place).T)
+        return float(away.min()), float(s[int(np.argmin(away))])
+
+    street = min(streets, key=lambda one: nearest(one)[0])
+    at = nearest(street)[1]
+    left = np.array([-street.tangent(np.array([at]))[0, 1], street.tangent(np.array([at]))[0, 0]])
+    own = float((place - street.position(np.array([at]))[0]) @ left)
+    movers = []
+    for ahead, offset in (
+        (rng.uniform(-2, 3), LANE),
+        (rng.uniform(-2, 3), -LANE),
+        (rng.uniform(6, 9) + BUS[0] / 2, 0.0),
+    ):
+        scene = RayScene(bus(rng))
+        radius = float(np.linalg.norm(scene.mesh.vertices, axis=1).max())
+        start = starts + rng.uniform(0, 0.5), rng.uniform(1.0, 2.0)
+        movers.append(Mover(scene, radius, street, terrain, at + ahead, 9.0, own + offset, start=start))
+    return movers
+
+
+def bus(rng: np.random.Generator) -> SceneMesh:
+    """A bus or a truck along x, a box on wheels that are not seen."""
+    length, width, height = np.array(BUS) * rng.uniform([0.9, 0.95, 0.9], [1.1, 1.05, 1.1])
+    builder = MeshBuilder()
+    builder.add_box([-length / 2, -width / 2, 0.3], [length / 2, width / 2, height], Surface.CAR)
+    return builder.build()
+
+
 def pedestrian(rng: np.random.Generator) -> SceneMesh:
     """Somebody in the middle of a step along +x."""
     builder = MeshBuilder()
@@ -121,8 +169,8 @@ def _centres(movers: list[Mover], time: float) -> Floats:
     centres = np.zeros((len(movers), 3))
     for members in streets.values():
         some = [movers[i] for i in members]
-        begin, speed, offset, lift = np.array([(m.begin, m.speed, m.offset, m.lift) for m in some]).T
-        centres[members] = _on_street(some[0].street, some[0].terrain, begin + speed * time, offset, lift)[0]
+        s, offset, lift = np.array([(float(m.along(time)), m.offset, m.lift) for m in some]).T  # type: ignore[arg-type]
+        centres[members] = _on_street(some[0].street, some[0].terrain, s, offset, lift)[0]
     return centres
 
 

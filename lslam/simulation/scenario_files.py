@@ -191,13 +191,14 @@ class WorldSection(Section):
 
 class TrafficSection(Section):
     """What moves: cars and people per km of street; lanes : m to the left of the middle, cars come towards us there;
-    speed : of the cars, m/s.
+    speed : of the cars, m/s; queue_s : s after which two buses and a truck drive off that wait around the start, or nothing.
     """
 
     cars: float = Field(0.0, ge=0, le=200)
     people: float = Field(0.0, ge=0, le=500)
     lanes: tuple[float, ...] = (1.7,)
     speed: float = Field(9.0, gt=0, le=60)
+    queue_s: float | None = Field(None, ge=0, le=600)
 
 
 class Scenario(Section):
@@ -207,7 +208,7 @@ class Scenario(Section):
         acceleration in bends, m/s2, to which a car and a walker slow down and which a drone must not exceed, of eights the
         greatest thrust; roof : m behind, ahead, aside and below the LiDAR that the car's own roof takes up, or nothing;
         roof_returns : whether the roof is seen, or what it is in the way of is only missing
-    overlap : distance beyond one lap of a closed line, m
+    overlap : distance beyond one lap of a closed line, m; stand_s : s of standing before the drive
     lidars : further LiDARs that ride along
     """
 
@@ -223,6 +224,7 @@ class Scenario(Section):
     roof_returns: bool = False
     rate_hz: float = Field(10.0, ge=1, le=100)
     overlap: float = Field(0.0, ge=0, le=1000)
+    stand_s: float = Field(0.0, ge=0, le=600)
     motion_compensated: bool = False
     lidars: tuple[LidarMount, ...] = ()
     path: PathSection = PathSection()

@@ -200,7 +200,7 @@ def simulate(
     origin : lat, lon (deg) and perhaps height (m) of the city's x = y = 0 (default: the middle of the extract's buildings,
         else the first point of GeoJSON way-points, else a place of no meaning)
     imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along
-    static_start : s of standing still before the drive begins; its scans come on top of a default `count`
+    static_start : s of standing before the drive begins, 0: as the scenario has it; its scans come on top of a default `count`
     visit : another drive through the same town: other traffic and noise, another start, the opposite direction
 
     Raises
@@ -234,6 +234,7 @@ def simulate(
         chosen = chosen.model_copy(
             update={"name": osm.stem, "summary": f"As {chosen.name!r}, in the city of {osm.name}."}
         )
+    static_start = static_start or chosen.stand_s
     standing = int(static_start * chosen.rate_hz)
     place = build_scenario(chosen, seed, count, line, extract, standing, visit)
     scene = RayScene(place.city.mesh)

@@ -35,7 +35,7 @@ def test_list_names_scenarios_and_sensors() -> None:
     assert listed.returncode == 0
     assert [line.split()[1] for line in listed.stdout.splitlines()] == [
         "block", "carpark", "climbing", "climbing-hard", "closed", "closed-hard", "corridor", "forest-road", "identical",
-        "large-eight", "large-eight-hard", "motorway", "open", "open-hard", "park", "quadrotor", "residential",
+        "large-eight", "large-eight-hard", "lights", "motorway", "open", "open-hard", "park", "quadrotor", "residential",
         "residential-hard", "room",
         "small-eight", "small-eight-hard", "stairs", "street", "two-lidars", "urban", "urban-hard", "walk",
         "sample", "vlp16", "hdl64", "hdl64-kitti",
