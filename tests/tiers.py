@@ -1,6 +1,6 @@
 """Two tiers: `python -m pytest` runs what is quick, `python -m pytest -m slow` the rest; files that are named run whole.
 
-slow_tests.txt lists the functions one example of which takes more than `SLOW_S` of a core alone, with all that its fixtures make.
+slow_tests.txt lists the functions one example of which takes `SLOW_S` or more of a core alone, with all that its fixtures make.
 `python -m pytest -m "" --time-tests` writes it anew. `@pytest.mark.slow` and `@pytest.mark.quick` say it by hand.
 """
 
@@ -29,9 +29,9 @@ def read_table() -> dict[str, float]:
 
 
 def write_table(costs: Mapping[str, float]) -> None:
-    """Functions that cost more than `SLOW_S`, by name."""
+    """Functions that cost `SLOW_S` or more, by name."""
     head = '# Core seconds of the slowest example; written by `python -m pytest -m "" --time-tests`, read by tests/tiers.py.\n'
-    TABLE.write_text(head + "".join(f"{costs[name]:.1f} {name}\n" for name in sorted(costs) if costs[name] > SLOW_S))
+    TABLE.write_text(head + "".join(f"{costs[name]:.1f} {name}\n" for name in sorted(costs) if costs[name] >= SLOW_S))
 
 
 def function_of(nodeid: str) -> str:
