@@ -7,8 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.kernels.discs import disc
 from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
-from lslam.kernels.gaussians import FREE
+from lslam.kernels.gaussians import EMPTY, FREE
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import invert_symmetric, plane_of
 from lslam.kernels.linearisation import Pose, Search, Settings, Sums, Width
@@ -39,11 +40,12 @@ def mixture(size: float) -> tuple[float, float]:
 
 @kernel
 def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, used: int, min_points: float, floor: float,
-             shapes: Floats) -> None:  # fmt: skip
+             extent2: float, shapes: Floats) -> None:  # fmt: skip
     """Bring shapes (C, 14) up to date: mean, inverse covariance xx..zz, smallest eigenvalue, count when it was computed,
     unit vector of the smallest eigenvalue.
 
-    Voxels that hold too few points, or a line, have a smallest eigenvalue of 0.
+    The variance within the plane of a plane voxel is `extent2`, m2: that of its points tells where the beams of earlier scans
+    were, not where the surface is. Voxels that hold too few points, a line, or one ring have a smallest eigenvalue of 0.
     """
     for slot in range(used):
         p, q = planes[slot], shapes[slot]
@@ -60,9 +62,11 @@ def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, us
         xx, xy, xz = s[4] * w - mx * mx + floor, s[5] * w - mx * my, s[6] * w - mx * mz
         yy, yz, zz = s[7] * w - my * my + floor, s[8] * w - my * mz, s[9] * w - mz * mz + floor
         l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
-        if l1 < LINE_SHARE * l2:
+        if l1 < LINE_SHARE * l2 or p[7] == EMPTY:
             continue
         lift = max(SMALLEST_SHARE * l2 - l0, 0.0)
+        if p[7] >= 0.0:
+            xx, xy, xz, yy, yz, zz = disc(nx, ny, nz, l0, extent2)
         q[3], q[4], q[5], q[6], q[7], q[8] = invert_symmetric(
             xx + lift * nx * nx, xy + lift * nx * ny, xz + lift * nx * nz,
             yy + lift * ny * ny, yz + lift * ny * nz, zz + lift * nz * nz,

@@ -66,13 +66,14 @@ class GaussianMap(Stateful):
 
     def shapes(self) -> NDArray[np.float64]:
         """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
+        from lslam.kernels.discs import EXTENT2
         from lslam.kernels.ndt_residual import describe
 
         if len(self._shapes) < len(self.keys):
             self._shapes = np.zeros((len(self.keys), 14))
         describe(
             self.moments, self.planes, self.keys, self.refreshed, int(self.pool[gaussians.USED]),
-            float(self.min_points), FLOOR, self._shapes,
+            float(self.min_points), FLOOR, max(EXTENT2, self.size**2), self._shapes,
         )  # fmt: skip
         return self._shapes
 

@@ -140,6 +140,9 @@ def ndt_pairs(target: VoxelMap, source: Floats, R: Floats, t: Floats) -> list[Pa
             values, vectors = np.linalg.eigh(covariance + FLOOR * np.eye(3))
             if values[1] < 0.1 * values[2]:
                 continue
+            kind = kind_of(voxel, MIN_POINTS, PLANARITY)[0]
             values = np.maximum(values, 0.01 * values[2])
+            if kind == "plane":
+                values = np.array([values[0], *[max(EXTENT2, target.size**2)] * 2])
             out.append(Pair(i, s, mean, (vectors / values) @ vectors.T, float(values[0]), normal=vectors[:, 0]))
     return out
