@@ -49,6 +49,8 @@ def test_the_best_so_far_is_a_table_once_there_are_rows() -> None:
 
 
 def test_it_is_live_on_a_terminal_and_nothing_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The handlers of a quiet command that ran in this process before.
+    monkeypatch.setattr(study_screen.log, "handlers", [])
     for stream, shown in ((Terminal(), True), (io.StringIO(), False)):
         monkeypatch.setattr(sys, "stderr", stream)
         console = Console(file=stream, width=120, force_terminal=True)
