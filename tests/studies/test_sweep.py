@@ -244,7 +244,7 @@ def test_a_scenario_has_the_scans_that_its_own_range_needs(tmp_path: Path) -> No
 
 
 def test_scans_beyond_the_end_of_a_sequence_are_refused(sweep: Sweep, made: list[StudyRow], tmp_path: Path) -> None:
-    recorded = str(next((sweep.output.scenes or tmp_path).rglob("sequences/00")))
+    recorded = str(min((sweep.output.scenes or tmp_path).rglob("sequences/00")))
     street, drive = {"scenario": "street", "columns": 256}, {"path": recorded}
     for sequence, name in (
         (TREE["sequences"][0] | {"start": 16}, "block has 16 scans: start = 16 goes"),
