@@ -25,7 +25,7 @@ SETTINGS = {
         "OPENBLAS_NUM_THREADS": "4",
         "NUMBA_CPU_NAME": "generic",
     },
-    "SkylakeX": {"OPENBLAS_CORETYPE": "SkylakeX"},
+    "SkylakeX, numba x86-64-v3": {"OPENBLAS_CORETYPE": "SkylakeX", "NUMBA_CPU_NAME": "x86-64-v3"},
     "Zen, numpy without vector units": {"OPENBLAS_CORETYPE": "Zen", "NPY_DISABLE_CPU_FEATURES": NO_VECTORS},
     "Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
 }

@@ -25,7 +25,7 @@ QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.use=tru
 
 @cache
 def walk() -> Stub:
-    lidar = replace(LIDARS["vlp16"], columns=450)
+    lidar = replace(LIDARS["vlp16"], columns=900)
     drive = simulate("walk", lidar=lidar, seed=100, count=COUNT, imu="icm20948-calibrated", motion_compensated=False)
     scans = [drive.scan(i) for i in range(COUNT)]
     return Stub(scans, drive.ground_truth, drive.calibration, motion_compensated=False, imu=drive.imu)

@@ -254,7 +254,7 @@ def test_damaged_checkpoints_cost_time_only(
 def begun(out: Path, *settings: str) -> Config:
     config = config_of("map.write=false", *settings)
     with pytest.raises(InterruptedRunError):
-        lslam.run(drive(), config, out=out, watch=interrupted("odometry", 4))
+        lslam.run(drive(), config, out=out, watch=interrupted("odometry", 6))
     return config
 
 
