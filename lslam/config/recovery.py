@@ -32,4 +32,11 @@ class RecoveryConfig(Section):
 
 
 # Of methods whose filter, smoother or window bridges a scan.
-NO_RECOVERY = RecoveryConfig(coarse_to_fine=False, start_search=False, less_planar=False, fallback="none")
+NO_RECOVERY = RecoveryConfig(
+    coarse_to_fine=False, start_search=False, at_rest=False, less_planar=False, fallback="none"
+)
+
+
+def rest_alone(recovery: RecoveryConfig) -> RecoveryConfig:
+    """No policy but `at_rest`, as configured: of a filter, whose IMU cannot tell standing from a steady motion."""
+    return NO_RECOVERY.model_copy(update={"at_rest": recovery.at_rest})

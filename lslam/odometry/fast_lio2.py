@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.recovery import NO_RECOVERY
+from lslam.config.recovery import rest_alone
 from lslam.odometry.icp import Icp, registration_of
 from lslam.types.motion_prior import MotionPrior
 
 
 def create(config: Config) -> FastLio2:
     """The method as the configuration wants it: point to plane, with no recovery beside the filter."""
-    return FastLio2(registration_of(config, recovery=NO_RECOVERY))
+    return FastLio2(registration_of(config, recovery=rest_alone(config.recovery)))
 
 
 class FastLio2(Icp):

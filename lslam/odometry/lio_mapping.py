@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.recovery import NO_RECOVERY
+from lslam.config.recovery import rest_alone
 from lslam.geometry import normal_equations
 from lslam.odometry.fast_lio2 import FastLio2
 from lslam.odometry.icp import registration_of
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 def create(config: Config) -> LioMapping:
     """The method as the configuration wants it: point to plane, with no recovery beside the window."""
-    return LioMapping(registration_of(config, recovery=NO_RECOVERY), config.lio_mapping.window - 1)
+    return LioMapping(registration_of(config, recovery=rest_alone(config.recovery)), config.lio_mapping.window - 1)
 
 
 class LioMapping(FastLio2):

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lslam.config.config import Config
-from lslam.config.recovery import NO_RECOVERY
+from lslam.config.recovery import rest_alone
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
 from lslam.odometry.loam import Loam
@@ -24,14 +24,14 @@ from lslam.types.state import Stateful
 
 
 def create(config: Config) -> LioSam | LioSamOfPoints:
-    """The method on features or on all points, with no recovery beside the smoother."""
+    """The method on features or on all points, with no recovery beside the smoother but `at_rest`."""
     own = config.lio_sam
     if own.features == "loam":
         keyframes = own.keyframes, own.keyframe_m, float(np.deg2rad(own.keyframe_deg))
-        quiet = config.model_copy(update={"recovery": NO_RECOVERY})
+        quiet = config.model_copy(update={"recovery": rest_alone(config.recovery)})
         return LioSam(quiet, LoamVariant(None, with_map=True, keyframes=keyframes))
     keys: dict[str, Any] = {"keyframes": own.keyframes, "keyframe_m": own.keyframe_m, "keyframe_deg": own.keyframe_deg}
-    return LioSamOfPoints(registration_of(config, recovery=NO_RECOVERY, target="keyframe", **keys))
+    return LioSamOfPoints(registration_of(config, recovery=rest_alone(config.recovery), target="keyframe", **keys))
 
 
 class SmoothedUncertainty(PoseUncertainty):

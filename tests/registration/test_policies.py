@@ -8,8 +8,9 @@ from analytic_scenes import distance, is_near, pose_at, room, seen_from
 from numpy.typing import NDArray
 from recovery_drives import driven
 
+from lslam.config import load_config
 from lslam.config.config import Config
-from lslam.config.recovery import RecoveryConfig
+from lslam.config.recovery import NO_RECOVERY, RecoveryConfig, rest_alone
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.policies import AtRest, CoarseToFine, policies_of
@@ -88,3 +89,16 @@ def test_with_a_near_prior_no_policy_is_tried(monkeypatch: pytest.MonkeyPatch) -
     first, second = (prepare_points(room(rng).astype(np.float32), registration.preprocess, k) for k in range(2))
     registration.update(registration.locate(first, np.eye(4)))
     assert registration.locate(second, pose_at((0.05, 0.0, 0.0)), is_near=True).ok
+
+
+def test_no_recovery_has_no_policy_and_a_filter_has_the_one_that_the_user_leaves_it() -> None:
+    assert not any(value is True for value in NO_RECOVERY.model_dump().values())
+    assert policies_of(NO_RECOVERY) == ()
+    assert [policy.name for policy in policies_of(rest_alone(RecoveryConfig()))] == ["at rest"]
+    assert policies_of(rest_alone(RecoveryConfig(at_rest=False))) == ()
+
+
+@pytest.mark.parametrize("preset", ["thesis-icp", "thesis-loam", "thesis-loam-map", "hdl"])
+def test_a_preset_has_no_policy_that_its_source_has_not(preset: str) -> None:
+    recovery = load_config(None, [f"odometry.preset={preset}"], {}).recovery
+    assert policies_of(recovery) == ()

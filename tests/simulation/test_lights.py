@@ -53,9 +53,9 @@ def test_vehicles_gain_their_speed_and_keep_it() -> None:
 
 @pytest.mark.parametrize("method", ["icp", "loam", "icp imu", "fast-lio2 imu"])
 def test_methods_stay_where_the_sensor_stands(method: str) -> None:
-    """Without the policy they follow the truck, by 14 m and more."""
+    """Without the policy they follow the truck, by 1.8 to 7.8 m."""
     name, _, imu = method.partition(" ")
     settings = f"odometry.method={name}", f"imu.use={str(bool(imu)).lower()}"
     assert farthest(1, *settings) < 0.1
-    if method == "icp":
+    if method in ("icp", "fast-lio2 imu"):
         assert farthest(1, *settings, "recovery.at_rest=false") > 1.0
