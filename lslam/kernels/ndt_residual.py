@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.kernels.discs import disc
 from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
-from lslam.kernels.gaussians import EMPTY, FREE
+from lslam.kernels.gaussians import BLOB, FREE
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import invert_symmetric, plane_of
 from lslam.kernels.linearisation import Pose, Search, Settings, Sums, Width
@@ -39,7 +39,7 @@ def mixture(size: float) -> tuple[float, float]:
 
 
 @kernel
-def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, used: int, min_points: float, floor: float,
+def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, used: int, floor: float,
              extent2: float, shapes: Floats) -> None:  # fmt: skip
     """Bring shapes (C, 14) up to date: mean, inverse covariance xx..zz, smallest eigenvalue, count when it was computed,
     unit vector of the smallest eigenvalue.
@@ -54,15 +54,15 @@ def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, us
         q[0], q[1], q[2] = p[0], p[1], p[2]
         q[10] = refreshed[slot]
         q[9] = 0.0
-        s = moments[slot]
-        if s[0] < min_points:
+        if p[7] < BLOB:
             continue
+        s = moments[slot]
         w = 1.0 / s[0]
         mx, my, mz = s[1] * w, s[2] * w, s[3] * w
         xx, xy, xz = s[4] * w - mx * mx + floor, s[5] * w - mx * my, s[6] * w - mx * mz
         yy, yz, zz = s[7] * w - my * my + floor, s[8] * w - my * mz, s[9] * w - mz * mz + floor
         l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
-        if l1 < LINE_SHARE * l2 or p[7] == EMPTY:
+        if l1 < LINE_SHARE * l2:
             continue
         lift = max(SMALLEST_SHARE * l2 - l0, 0.0)
         if p[7] >= 0.0:

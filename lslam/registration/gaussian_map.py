@@ -73,7 +73,7 @@ class GaussianMap(Stateful):
             self._shapes = np.zeros((len(self.keys), 14))
         describe(
             self.moments, self.planes, self.keys, self.refreshed, int(self.pool[gaussians.USED]),
-            float(self.min_points), FLOOR, max(EXTENT2, self.size**2), self._shapes,
+            FLOOR, max(EXTENT2, self.size**2), self._shapes,
         )  # fmt: skip
         return self._shapes
 

@@ -35,7 +35,7 @@ class History(Stateful):
         self.agreement, self.matches = (UsualAgreement(config.min_agreement) for _ in range(2))
         self.starting, self.inserted = config.start_scans, 0
         self.recent: tuple[tuple[NDArray[Any], Floats], ...] = ()
-        self.rest = Rest(preprocess or PreprocessConfig(), config.sigma)
+        self.rest = Rest(preprocess or PreprocessConfig(), config.sigma, config.voxel_size)
 
     @property
     def is_young(self) -> bool:

@@ -49,14 +49,14 @@ class AtRest:
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
         """Acts on results that leave the spot on which the sensor stood."""
-        rest, T_found = attempt.history.rest, result.T_world_lidar
+        rest, T_registered = attempt.history.rest, result.T_world_lidar
         is_standing = rest.scans >= attempt.config.start_scans
-        if not (result.ok and is_standing) or rest.is_here(T_found, result.lever_arm):
+        if not (result.ok and is_standing) or rest.is_here(T_registered, result.lever_arm):
             return result
-        if not rest.votes(attempt.target.cloud(attempt.points), T_found).is_standing:
+        if not rest.votes(attempt.target.cloud(attempt.points), T_registered).is_standing:
             return result
-        held = result.moved(rest.T_world_lidar.copy(), result.covariance)
-        return replace(held, prior_error=correction(attempt.T_prior, held.T_world_lidar), pose_source=self.name)
+        at_rest = result.moved(rest.T_world_lidar.copy(), result.covariance)
+        return replace(at_rest, prior_error=correction(attempt.T_prior, at_rest.T_world_lidar), pose_source=self.name)
 
 
 def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:

@@ -19,10 +19,8 @@ Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-# m; points of one wall in plan, as wide as a voxel reaches.
-NEIGHBOURHOOD_M = 0.8
-# m; surfaces farther apart are of different things.
-THINGS_APART_M = 2.0
+# Voxels between surfaces of different things.
+THINGS_APART_VOXELS = 2.5
 # Squared sigmas beyond which a point is no inlier, so that two points at least make a vote.
 MOST_CHI2 = 9.0
 # Squared sigmas by which a point tells two poses apart.
@@ -48,17 +46,21 @@ class PlanWalls:
     A thing is a wall where its points are thin in plan, and lie across beams (`BREADTH`): a ring on a slope is thin, too.
 
     cloud : (N, 3) m, LiDAR frame
+    sigma : m, noise of a point
+    voxel_size : m, length of wall that a line is fitted to
     """
 
-    def __init__(self, cloud: NDArray[np.float32], preprocess: PreprocessConfig, sigma: float) -> None:
+    def __init__(
+        self, cloud: NDArray[np.float32], preprocess: PreprocessConfig, sigma: float, voxel_size: float
+    ) -> None:
         from scipy.spatial import cKDTree
 
-        self._preprocess, self._sigma2 = preprocess, sigma**2
+        self._preprocess, self._sigma2, self._voxel_size = preprocess, sigma**2, voxel_size
         ground = ground_of(cloud, preprocess.ground_slope, preprocess.ground_tolerance, up_of(preprocess))
         self._R = ground.R
         high = cloud[ground.above(cloud, preprocess.ground_tolerance)].astype(np.float64) @ self._R.T
         self._tree = cKDTree(high[:, :2])
-        pairs = self._tree.query_pairs(NEIGHBOURHOOD_M, output_type="ndarray")
+        pairs = self._tree.query_pairs(voxel_size, output_type="ndarray")
         own = np.arange(len(high))
         at, of = np.concatenate([own, pairs[:, 0], pairs[:, 1]]), np.concatenate([own, pairs[:, 1], pairs[:, 0]])
         count = np.bincount(at, minlength=len(high))
@@ -89,13 +91,13 @@ class PlanWalls:
         telling = np.flatnonzero(np.abs(gain) > TELLING_CHI2)
         if not len(telling):
             return Votes(0, 0)
-        things = _connected(here[telling, :2])
+        things = _connected(here[telling, :2], THINGS_APART_VOXELS * self._voxel_size)
         sums = np.bincount(things, gain[telling])
         return Votes(*(int(np.count_nonzero(sign * sums > MOST_CHI2)) for sign in (1, -1)))
 
     def _cost(self, points: Floats) -> tuple[Floats, Flags]:
         """(N,) squared sigmas of levelled points from their wall, NaN where none is known, and whether anything is near."""
-        away, near = self._tree.query(points[:, :2], distance_upper_bound=NEIGHBOURHOOD_M)
+        away, near = self._tree.query(points[:, :2], distance_upper_bound=self._voxel_size)
         is_near = np.isfinite(away)
         near = np.where(is_near, near, 0)
         off = ((points - self._mean[near])[:, :2] * self._normal[near]).sum(1)
@@ -103,13 +105,13 @@ class PlanWalls:
         return np.where(is_near, np.where(self._is_wall[near], cost, np.nan), MOST_CHI2), is_near
 
 
-def _connected(points: Floats) -> Longs:
-    """(N,) numbers of the things that points (N, 2) in plan belong to."""
+def _connected(points: Floats, apart_m: float) -> Longs:
+    """(N,) numbers of the things that points (N, 2) in plan belong to, which lie `apart_m` from one another."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    pairs = cKDTree(points).query_pairs(THINGS_APART_M, output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(apart_m, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(points),) * 2)
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
@@ -120,12 +122,13 @@ class Rest(Stateful):
     Walls tell of level motion alone, and so does this: a car that is about to start pitches.
 
     sigma : m, noise of a point, by which two poses of one spot may differ
+    voxel_size : m, as of `PlanWalls`
     """
 
     STATE = ("scans", "T_world_lidar", "_cloud", "_squares")
 
-    def __init__(self, preprocess: PreprocessConfig, sigma: float) -> None:
-        self.preprocess, self.sigma, self.scans = preprocess, sigma, 0
+    def __init__(self, preprocess: PreprocessConfig, sigma: float, voxel_size: float) -> None:
+        self.preprocess, self.sigma, self.voxel_size, self.scans = preprocess, sigma, voxel_size, 0
         # Sum of the squared distances of these scans, m2.
         self._squares = 0.0
         self.T_world_lidar = np.eye(4)
@@ -167,5 +170,5 @@ class Rest(Stateful):
         """Of a scan (N, 3) for the spot, and for the pose (4, 4)."""
         assert self._cloud is not None
         if self._walls is None:
-            self._walls = PlanWalls(self._cloud, self.preprocess, self.sigma)
+            self._walls = PlanWalls(self._cloud, self.preprocess, self.sigma, self.voxel_size)
         return self._walls.votes(cloud, se3.relative(self.T_world_lidar, T_world_lidar))

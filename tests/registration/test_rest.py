@@ -14,6 +14,7 @@ Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 
 SIGMA = 0.03
+VOXEL_M = 0.8
 # m, ends of walls in plan, and between which heights: the back of a truck, and what the sensor sees of two houses.
 TRUCK = ((7.0, -1.3), (7.0, 1.3), -1.5, 1.8)
 HOUSES = (((-36.0, 10.0), (-36.0, 13.0), -1.0, 4.0), ((-51.0, -12.0), (-51.0, -9.0), -1.0, 4.0))
@@ -47,7 +48,7 @@ def ahead(metres: float) -> Floats:
 @pytest.fixture(scope="module")
 def walls() -> PlanWalls:
     """Of the scan at rest."""
-    return PlanWalls(scan(), PreprocessConfig(), SIGMA)
+    return PlanWalls(scan(), PreprocessConfig(), SIGMA, VOXEL_M)
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def test_rings_on_a_slope_and_open_ground_are_no_walls() -> None:
     ring = np.column_stack([30 * np.cos(angle), 30 * np.sin(angle), rng.normal(3.0, 0.005, 80)])
     ground = scan()[: 80 * 31]
     for cloud in (np.vstack([ground, ring]).astype(np.float32), ground, ground[:0]):
-        assert PlanWalls(cloud, PreprocessConfig(), SIGMA).votes(cloud, ahead(0.5)).stay == 0
+        assert PlanWalls(cloud, PreprocessConfig(), SIGMA, VOXEL_M).votes(cloud, ahead(0.5)).stay == 0
 
 
 def test_a_sensor_that_is_pitched_sees_the_same_walls() -> None:
@@ -92,13 +93,18 @@ def test_a_sensor_that_is_pitched_sees_the_same_walls() -> None:
     def tilted(points: Points) -> Points:
         return se3.apply(T, points.astype(np.float64)).astype(np.float32)
 
-    walls = PlanWalls(tilted(scan()), PreprocessConfig(), SIGMA)
+    walls = PlanWalls(tilted(scan()), PreprocessConfig(), SIGMA, VOXEL_M)
     motion = T @ ahead(-0.1) @ se3.inverse(T)
     assert walls.votes(tilted(scan(0.1, seed=1)), motion) == Votes(2, 1)
 
 
+def test_in_a_room_a_tenth_as_large_things_are_told_apart_as_in_a_street() -> None:
+    walls = PlanWalls(scan() / 10, PreprocessConfig(ground_tolerance=0.05), SIGMA, VOXEL_M / 10)
+    assert walls.votes(scan(1.0, seed=1) / 10, ahead(-0.1)) == Votes(2, 1)
+
+
 def test_the_spot_is_left_beyond_three_sigma_and_restored_with_its_scan() -> None:
-    rest = Rest(PreprocessConfig(), SIGMA)
+    rest = Rest(PreprocessConfig(), SIGMA, VOXEL_M)
     for k, (metres, scans) in enumerate([(0.0, 1), (0.02, 2), (0.08, 3), (0.1, 1), (0.18, 2)]):
         rest.enter(scan(seed=k), ahead(metres), 10.0)
         assert rest.scans == scans
@@ -111,7 +117,7 @@ def test_the_spot_is_left_beyond_three_sigma_and_restored_with_its_scan() -> Non
     assert rest.is_here(turned, 1.0)
     assert not rest.is_here(turned, 10.0)
     assert rest.is_here(pitched, 10.0)
-    again = Rest(PreprocessConfig(), SIGMA)
+    again = Rest(PreprocessConfig(), SIGMA, VOXEL_M)
     again.restore(rest.state())
     moved = scan(0.1, seed=9), ahead(0.0)
     assert again.scans == 2
