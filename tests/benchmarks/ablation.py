@@ -3,12 +3,14 @@
     python tests/benchmarks/ablation.py [--method loam] [--seeds 100,101] [--rows hdl64,vlp16,os1-16] [--without breadth]
         [--write docs/results.md]
     python tests/benchmarks/ablation.py --starts
+    python tests/benchmarks/ablation.py --lights [--method loam] [--seeds 100-104] [--without 'held at rest']
     python tests/benchmarks/ablation.py --recordings FOLDER
 
 Recordings are those of the folder given, with all rings, every second and every fourth. Drives are simulated with compensated
 scans: standing 2.5 s before they drive off, and moving from the first scan. A run is lost when its error, the first pose on
 the first true pose, exceeds a twentieth of the path. Starts are ten scans from the first step at 30 m/s, or forty metres above a
-town, by sixteen beams, on seeds from 200 on; one is lost half a metre off. `acted` counts scans that a policy posed.
+town, by sixteen beams, on seeds from 200 on. At lights the sensor stands. One of both is lost half a metre off. `acted` counts
+scans that a policy posed.
 """
 
 from __future__ import annotations
@@ -113,6 +115,13 @@ def starts() -> Iterator[Case]:
         yield f"{scenario} start {lidar} {seed}", [line.scan(i) for i in range(10)], line.ground_truth.poses
 
 
+def lights(lidars: list[str], seeds: list[int]) -> Iterator[Case]:
+    """Standing among traffic that starts."""
+    for lidar, seed in product(lidars, seeds):
+        line = simulate("lights", seed=seed, lidar=lidar, count=SCANS, motion_compensated=True)
+        yield f"lights {lidar} {seed}", [line.scan(i) for i in range(SCANS)], line.ground_truth.poses
+
+
 def recorded(folder: Path) -> Iterator[Case]:
     """Their rings are thinned, so that no method asks for them: stamps are those of ten scans a second."""
     for name, clouds, truth in thinned(folder):
@@ -141,6 +150,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--starts", action="store_true")
+    parser.add_argument("--lights", action="store_true")
     parser.add_argument("--rows", default="hdl64,vlp16,os1-32")
     parser.add_argument("--method", default="icp", choices=list(WITHOUT))
     parser.add_argument("--without", help="names of this table, comma-separated; default: all")
@@ -154,6 +164,8 @@ def main() -> None:
         cases = recorded(args.recordings)
     elif args.starts:
         cases = starts()
+    elif args.lights:
+        cases = lights(args.rows.split(","), tables.numbers(args.seeds))
     else:
         cases = drives(args.rows.split(","), tables.numbers(args.seeds))
     variants: dict[str, Variant] = {"-": ((), ()), **{name: known[name] for name in asked}}
@@ -163,7 +175,7 @@ def main() -> None:
         whole, count = 0.0, count + 1
         for name, variant in variants.items():
             start, shape, turn, failed, acted = row(args.method, variant, case)
-            limit = 0.5 if args.starts else 0.05 * length(case[2])
+            limit = 0.5 if args.starts or args.lights else 0.05 * length(case[2])
             is_lost = start > limit and not args.recordings
             whole = shape if name == "-" else whole
             lost[name] += is_lost
@@ -171,8 +183,9 @@ def main() -> None:
             if name == "-" or is_lost or shape > max(1.1 * whole, whole + 0.002):
                 who = ", ".join(f"{k} {v}" for k, v in acted.items())
                 print(f"{case[0]:38} {name:15} {start:9.3f} {shape:8.4f} {turn:9.3f} {failed:7d}  {who}", flush=True)
-    kind = "recordings" if args.recordings else "starts" if args.starts else args.method
-    limit = "half a metre off" if args.starts else "a twentieth of its path off"
+    drive = f"lights-{args.method}" if args.lights else args.method
+    kind = "recordings" if args.recordings else "starts" if args.starts else drive
+    limit = "half a metre off" if args.starts or args.lights else "a twentieth of its path off"
     caption = (
         f"{args.method}, {count} runs: lost is one {limit}, worse one whose ATE se3 grows by half and a centimetre."
     )
