@@ -33,6 +33,7 @@ from lslam.readers.bag_topics import (
     load_companion,
     put_in_order,
 )
+from lslam.readers.clocks import ahead_of
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import measured_rate
 from lslam.readers.pcap_revolutions import Opened, Revolutions, read_scan
@@ -73,6 +74,11 @@ class BagSequence(SequenceOnDisk):
     halves: Halves = field(default_factory=dict)
     revolutions: Revolutions | None = None
 
+    @property
+    def recorded_ns(self) -> NDArray[np.int64]:
+        """When the message of each scan was recorded, (N,)."""
+        return self.topic.stamps_ns[self.messages]
+
     def _read(self, index: int) -> Scan:
         if self.revolutions is not None:
             return read_scan(self.revolutions, index, not self.motion_compensated)
@@ -96,6 +102,17 @@ class BagSequence(SequenceOnDisk):
         k = int(self.messages[index])
         cloud, shift, _ = put_together(self.bag, self.topic, (k, *self.halves.get(k, ())))
         return in_metres(cloud, self.unit_m), shift
+
+    def ahead(self, stamps: NDArray[np.int64], recorded: NDArray[np.int64], what: str) -> int:
+        """By how much another clock is ahead of that of these scans, ns, see `ahead_of`."""
+        if self.revolutions is not None:
+            return 0
+        voice = Voice(self.notes, self.problems)
+        return ahead_of(self.headers_ns, self.recorded_ns, stamps, recorded, what, voice)
+
+    def on_its_clock(self, stream: Stream, what: str) -> Stream:
+        """What rides along, on the clock of these scans."""
+        return replace(stream, stamps_ns=stream.stamps_ns - self.ahead(stream.stamps_ns, stream.recorded_ns, what))
 
 
 # One LiDAR of a bag: which messages, its scans, and what its packets tell where it has any.
@@ -142,13 +159,15 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
     imu = load_companion(bag, IMU, info.imu_topic, voice) if own is None or own.imu is None else None
     gnss = load_companion(bag, GNSS, info.gnss_topic, voice)
     if imu is not None:
+        imu = sequence.on_its_clock(imu, "IMU")
         sequence.imu = ImuStream(imu.stamps_ns, imu.values[:, :3].copy(), imu.values[:, 3:].copy())
     if gnss is not None:
+        gnss = sequence.on_its_clock(gnss, "GNSS")
         sequence.gnss = GnssStream(gnss.stamps_ns, gnss.values[:, :3].copy(), gnss.values[:, 3].copy())
     voice.problems += sequence.streams_apart()
     links = Links(bag, voice)
     sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(links, frame, imu, gnss, info, voice)
-    sequence.ground_truth = find_truth(bag, links, frame, voice)
+    sequence.ground_truth = find_truth(sequence, links, frame, voice)
     if own is not None and own.imu is not None:
         if left_out := [t.name for t in bag.of_type("Imu")]:
             voice.notes.append(f"IMU from the sensor's packets: {', '.join(left_out)} left out; --imu-topic reads one")
@@ -159,9 +178,12 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
     if not places:
         return sequence
     voice.notes.append(f"scans are the sweeps of {leading}, the leading one of {len(lidars)} LiDARs")
-    others = [
-        FurtherLidar(str(index), scans, *place) for (index, scans, _), place in zip(lidars[1:], places, strict=True)
-    ]
+    others = []
+    for (index, scans, turns), place in zip(lidars[1:], places, strict=True):
+        if turns is None:
+            ahead = sequence.ahead(scans.headers_ns, scans.recorded_ns, str(index))
+            scans.headers_ns, scans.stamps_ns = scans.headers_ns - ahead, scans.stamps_ns - ahead
+        others.append(FurtherLidar(str(index), scans, *place))
     return MergedLidars(sequence, others)
 
 
@@ -293,8 +315,9 @@ def truth_topics(bag: Bag) -> list[BagTopic]:
     return [t for t in bag.of_type("Odometry", "PoseStamped") if _TRUTH.search(t.name)]
 
 
-def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory | None:
+def find_truth(sequence: BagSequence, links: Links, lidar: str, voice: Voice) -> Trajectory | None:
     """LiDAR poses of the first topic whose name says ground truth (Odometry or PoseStamped), None when there is none."""
+    bag = sequence.bag
     topics = truth_topics(bag)
     if not topics:
         return None
@@ -306,7 +329,9 @@ def find_truth(bag: Bag, links: Links, lidar: str, voice: Voice) -> Trajectory |
     order, stamps = put_in_order(stream.stamps_ns, stream.recorded_ns, f"{topic.name}: poses", voice)
     if not len(order):
         return None
-    poses, body = stream.values[order], stream.frame
+    stream = replace(stream, stamps_ns=stamps, values=stream.values[order], recorded_ns=stream.recorded_ns[order])
+    stream = sequence.on_its_clock(stream, f"ground truth {topic.name}")
+    stamps, poses, body = stream.stamps_ns, stream.values, stream.frame
     rigid = links.find(body, lidar)
     if rigid is None:
         voice.problems.append(

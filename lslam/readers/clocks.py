@@ -27,6 +27,7 @@ _MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others ar
 MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
 _JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
 _OFFSETS = 100  # of different clocks that are tried
+_LATER_NS = 10**9  # by which some messages are recorded later than others; ten times that where their stamps share time
 _JITTER = 0.03  # of the interval, by which stamps of arrival vary and those of a sensor do not
 _MANY, _UNEVEN = 0.3, 0.25  # share of all messages; of the interval
 
@@ -134,6 +135,28 @@ def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
     }
     best: Stamps = repaired + max(shared, key=lambda offset: (shared[offset], offset == 0))
     return best
+
+
+def ahead_of(own: Stamps, recorded: Stamps, stamps: Stamps, its_recorded: Stamps, what: str, voice: Voice) -> int:
+    """By how much the clock of a stream, `stamps` (N,), is ahead of that of the scans, `own` (M,), ns; 0 unless these are two
+    clocks of one time.
+
+    recorded, its_recorded : when the messages of each were recorded; the one with the least delay says how far apart clocks are,
+    unless the times of recording run at another speed
+    """
+    for h, w in (own, recorded), (stamps, its_recorded):
+        if len(h) < 2 or not _SLOWEST <= _period_and_speed(h, w)[1] <= _FASTEST:
+            return 0
+    ahead = int((stamps - its_recorded).max() - (own - recorded).max())
+    is_apart = stamps[0] > own[-1] or stamps[-1] < own[0]
+    is_together = its_recorded.min() <= recorded.max() and its_recorded.max() >= recorded.min()
+    if not is_together or abs(ahead) <= (_LATER_NS if is_apart else 10 * _LATER_NS):
+        return 0
+    voice.problems.append(
+        f"{what}: its clock is {ahead * 1e-9:+.3f} s off that of the scans, though both were recorded at one time: moved onto it "
+        "by the times of recording"
+    )
+    return ahead
 
 
 def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_builders import GRAVITY, START_NS, STEP_NS, Fill, bag, clouds, raw_cloud, scan, together
+from bag_builders import GRAVITY, START_NS, STEP_NS, Fill, bag, clouds, raw_cloud, scan, together, transforms
 from numpy.typing import NDArray
 
 from lslam.convert import bag_messages
@@ -168,6 +168,46 @@ def test_a_step_does_not_tear_scans_and_imu_of_one_clock_apart(tmp_path: Path, s
     np.testing.assert_array_equal(sequence.imu.stamps_ns, START_NS + np.arange(COUNT * 10) * 10_000_000)
     np.testing.assert_allclose(sequence.imu.gyro[:, 2], 0.001 * np.arange(COUNT * 10))
     assert sum("brought onto one clock" in p for p in sequence.problems) == 2
+
+
+STREAMS = ("/points", "/rear", "/imu", "/fix", "/ground_truth")
+
+
+def on_clocks(epochs_ns: dict[str, int]) -> Fill:
+    """Two LiDARs, an IMU, fixes and truth of one time; stamps of each topic are so many ns off the true time."""
+
+    def fill(writer: BagWriter) -> None:
+        store = writer.store
+        for k in range(COUNT):
+            at = {topic: int(TRUE[k]) + epochs_ns[topic] for topic in STREAMS}
+            place = np.array([48.0, 11.0 + 1e-6 * k, 500.0])
+            for topic, message in {
+                "/points": bag_messages.cloud(store, scan(k, 50, stamp_ns=at["/points"]), "lidar"),
+                "/rear": bag_messages.cloud(store, scan(100 + k, 50, stamp_ns=at["/rear"]), "rear"),
+                "/imu": bag_messages.imu(store, at["/imu"], GRAVITY, np.full(3, 0.01 * k), "imu"),
+                "/fix": bag_messages.fix(store, at["/fix"], place, 1.0, "gnss"),
+                "/ground_truth": bag_messages.odometry(store, at["/ground_truth"], np.eye(4), "map", "lidar"),
+            }.items():
+                writer.write(topic, int(TRUE[k]) + 15_000_000, message)
+
+    return together(transforms({("lidar", "rear"): np.eye(4)}), fill)
+
+
+@pytest.mark.parametrize("off_s", [-1_699_999_990.0, 37.0, 5.0])
+@pytest.mark.parametrize("other", STREAMS)
+def test_streams_on_a_clock_of_another_epoch_are_brought_onto_that_of_the_scans(
+    tmp_path: Path, other: str, off_s: float
+) -> None:
+    """What was recorded together happened together."""
+    epochs = {topic: int(off_s * 1e9) * (topic == other) for topic in STREAMS}
+    path = bag(tmp_path / "a.mcap", on_clocks(epochs), "mcap")
+    sequence = open_sequence(path, lidar_topic="/points,/rear")
+    for stream in (sequence, sequence.imu, sequence.gnss, sequence.ground_truth):
+        assert stream is not None
+        np.testing.assert_array_equal(stream.stamps_ns, TRUE + epochs["/points"])
+    assert [len(sequence.scan(k)) for k in (0, 10, COUNT - 1)] == [100, 100, 100]
+    said = [problem.split(":")[0] for problem in sequence.problems if "s off that of the scans" in problem]
+    assert len(said) == (4 if other == "/points" else 1), said
 
 
 def by_points(start_s: float, with_imu: bool = False) -> Fill:
