@@ -18,11 +18,12 @@ import blas_kernels  # noqa: F401
 import pytest
 from compiled_once import compile_once
 from hypothesis import settings
-from shared_towns import Towns
+from shared_towns import Towns, TracedScans
 
 from lslam.errors import InputError
 from lslam.foreign import importing_open3d
 from lslam.locks import one_at_a_time
+from lslam.simulation.scenarios import SimulatedDrive
 
 pytest_plugins = ["perturbed_scans", "tiers"]
 compile_once()
@@ -104,16 +105,20 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path
     return unpack
 
 
-TOWNS = Towns()
+TOWNS, SCANS = Towns(), TracedScans()
 
 
 @pytest.fixture(scope="module", autouse=True)
 def shared_towns(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Towns are built once for all tests but those of the simulator, which build each anew unless `SHARES_TOWNS` there."""
+    """Towns are built once, and a drive traces its scans once, for all tests but those of the simulator.
+
+    These build and trace each anew unless `SHARES_TOWNS` there.
+    """
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name != "simulation" or getattr(request.module, "SHARES_TOWNS", False):
             patch.setattr("lslam.simulation.built_scenario._city", TOWNS.city)
             patch.setattr("lslam.simulation.scenarios.RayScene", TOWNS.scene)
+            patch.setattr(SimulatedDrive, "scan", SCANS.once(SimulatedDrive.scan))
         yield
 
 

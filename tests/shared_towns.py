@@ -1,10 +1,13 @@
-"""Towns of scenarios that are built once, however many tests of a worker drive through them: to build one takes seconds."""
+"""Towns of scenarios that are built once, and scans that are traced once, however many tests of a worker ask for them."""
 
 from __future__ import annotations
 
 import hashlib
 import pickle
 from collections import OrderedDict
+from collections.abc import Callable
+from itertools import count
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -13,10 +16,14 @@ from lslam.simulation.city import City
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenario_files import Scenario
+from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.scene_mesh import SceneMesh
 from lslam.simulation.terrain import Terrain
+from lslam.studies.worker import ScanStore
+from lslam.types.scan import Scan
 
 HELD = 5  # towns, of some 100 MB each with what rays need
+HELD_BYTES = 300_000_000  # of scans
 
 
 class Towns:
@@ -48,3 +55,21 @@ class Towns:
                     self._scenes[key] = RayScene(mesh)
                 return self._scenes[key]
         return RayScene(mesh)
+
+
+class TracedScans:
+    """Stands in for `SimulatedDrive.scan`: what one drive has traced is kept, for the next run that it is given to."""
+
+    def __init__(self, most_bytes: int = HELD_BYTES) -> None:
+        self._store, self._numbers = ScanStore(most_bytes), count()
+        self._drives: WeakKeyDictionary[SimulatedDrive, int] = WeakKeyDictionary()
+
+    def once(self, trace: Callable[[SimulatedDrive, int], Scan]) -> Callable[[SimulatedDrive, int], Scan]:
+        """As `trace`, but for the time that it takes."""
+
+        def scan(drive: SimulatedDrive, index: int) -> Scan:
+            if drive not in self._drives:
+                self._drives[drive] = next(self._numbers)
+            return self._store.get((self._drives[drive], index), lambda: trace(drive, index))
+
+        return scan

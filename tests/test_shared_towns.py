@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-from shared_towns import HELD, Towns
+from shared_towns import HELD, Towns, TracedScans
 
 from lslam.simulation import built_scenario, scenarios
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenarios import simulate
+from lslam.types.scan import Scan
 
 
 def test_a_shared_town_is_the_one_that_is_built_anew(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,3 +30,17 @@ def test_a_shared_town_is_the_one_that_is_built_anew(monkeypatch: pytest.MonkeyP
     held = simulate("block", seed=1, count=5)
     assert held.scene is simulate("block", seed=1, count=2, lidar="vlp16").scene
     assert held.city is not simulate("block", seed=0).city
+
+
+def test_a_scan_that_is_kept_is_the_one_of_its_drive() -> None:
+    asked: list[int] = []
+    drives = [simulate("block", seed=seed, count=3, lidar="vlp16") for seed in (0, 1)]
+
+    def trace(drive: scenarios.SimulatedDrive, index: int) -> Scan:
+        asked.append(index)
+        return Scan(np.full((1000, 3), 10 * drive.seed + index, np.float32), 0, index)
+
+    scan = TracedScans(2 * 12_000).once(trace)
+    for drive, index, times in ((0, 1, 1), (1, 1, 2), (0, 1, 2), (0, 2, 3), (0, 1, 3), (1, 1, 4)):
+        assert scan(drives[drive], index).points[0, 0] == 10 * drive + index
+        assert len(asked) == times, "two are kept, those used last"

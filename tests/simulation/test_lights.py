@@ -10,6 +10,8 @@ import pytest
 import lslam
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
+SHARES_TOWNS = True
+
 
 @cache
 def standing(seed: int) -> SimulatedDrive:
