@@ -25,7 +25,7 @@ from lslam.foreign import importing_open3d
 from lslam.locks import one_at_a_time
 from lslam.simulation.scenarios import SimulatedDrive
 
-pytest_plugins = ["perturbed_scans", "tiers"]
+pytest_plugins = ["perturbed_scans", "shared_starts", "tiers"]
 compile_once()
 
 # How long an example takes is the machine's affair.

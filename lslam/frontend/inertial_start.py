@@ -151,7 +151,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     Where the IMU begins later, its first seconds, and all scans before.
     """
     whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
-    begin_ns = _first_heard_ns(sequence.imu, whole.stamps_ns[first:], config)
+    begin_ns = first_heard_ns(sequence.imu, whole.stamps_ns[first:], config)
     if motion is None and begin_ns > whole.stamps_ns[first]:
         log.info("the IMU begins %.1f s after the first scan", 1e-9 * (begin_ns - whole.stamps_ns[first]))
     end_ns = begin_ns + round(1e9 * config.imu.start_s)
@@ -187,7 +187,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     )  # fmt: skip
 
 
-def _first_heard_ns(imu: ImuStream | None, stamps_ns: NDArray[np.int64], config: Config) -> int:
+def first_heard_ns(imu: ImuStream | None, stamps_ns: NDArray[np.int64], config: Config) -> int:
     """Since when the IMU tells of the scans: from the first on, unless it begins among the later ones."""
     first_ns = int(stamps_ns[0])
     if imu is None:

@@ -17,6 +17,7 @@ from lslam.geometry import so3
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 
+pytestmark = pytest.mark.usefixtures("shared_first_poses")
 COUNT = 40
 # m, of the ATE: a walk of 4 s.
 BOUND = 0.05

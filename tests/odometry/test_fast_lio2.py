@@ -19,6 +19,7 @@ from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 
+pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")
 
 

@@ -28,6 +28,7 @@ from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.types.imu import ImuStream
 
+pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")
 WINDOW = 5
 

@@ -35,6 +35,7 @@ from lslam.types.imu import ImuStream
 from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 
+pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "odometry.integrity=false", "imu.start_s=1")
 COUNT = 24
 

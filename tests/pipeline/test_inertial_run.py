@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -20,12 +19,10 @@ from lslam.doctor.findings import Finding
 from lslam.errors import GateError, InputError
 from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend import inertial_start
-from lslam.frontend.inertial_start import _first_heard_ns, begin_inertial, close_inertial, first_poses
+from lslam.frontend.inertial_start import begin_inertial, close_inertial
 from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.initialise import FirstPoses
 from lslam.odometry import create_odometry
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
@@ -34,9 +31,9 @@ from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
-from lslam.types.selection import Selection, select
-from lslam.types.sequence import Sequence
+from lslam.types.selection import select
 
+pytestmark = pytest.mark.usefixtures("shared_first_poses")
 COUNT = 60
 
 
@@ -58,32 +55,6 @@ def walk() -> Stub:
         motion_compensated=False,
         imu=drive.imu,
     )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def shared_first_poses() -> Iterator[None]:
-    """The first seconds are registered without the IMU: once, whatever it says, for the same scans of the walk."""
-    held: dict[tuple[object, ...], FirstPoses] = {}
-
-    def once(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
-        whole, indices = (
-            (sequence.whole, sequence.indices.tobytes()) if isinstance(sequence, Selection) else (sequence, b"")
-        )
-        assert isinstance(whole, Stub)
-        # What is held keeps the scans, and with them their numbers.
-        scans = tuple(map(id, whole.scans))
-        since = _first_heard_ns(whole.imu, whole.stamps_ns, config)
-        given = config.imu.model_dump_json(), config.preprocess.model_dump_json(), config.input.workers
-        key = scans, indices, since, given
-        if motion is not None:
-            return first_poses(sequence, config, motion)
-        if key not in held:
-            held[key] = first_poses(sequence, config, None)
-        return held[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(inertial_start, "first_poses", once)
-        yield
 
 
 def imu_of(stub: Stub) -> ImuStream:
