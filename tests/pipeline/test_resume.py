@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -251,14 +252,29 @@ def test_damaged_checkpoints_cost_time_only(
     assert any(("keyframe 1 is missing" if damage == "cloud" else "is damaged") in sentence for sentence in said)
 
 
-def begun(out: Path, *settings: str) -> Config:
-    config = config_of("map.write=false", *settings)
-    with pytest.raises(InterruptedRunError):
-        lslam.run(drive(), config, out=out, watch=interrupted("odometry", 6))
-    return config
+Begun = Callable[..., Config]
 
 
-def test_another_configuration_is_refused_and_what_changes_nothing_is_not(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Begun:
+    """`begun(out, *settings)`: the configuration of a run whose first six scans are in `out`, made once of each kind."""
+
+    @cache
+    def made_once(*settings: str) -> tuple[Config, Path]:
+        config, out = config_of("map.write=false", *settings), tmp_path_factory.mktemp("begun") / "out"
+        with pytest.raises(InterruptedRunError):
+            lslam.run(drive(), config, out=out, watch=interrupted("odometry", 6))
+        return config, out
+
+    def copied(out: Path, *settings: str) -> Config:
+        config, kept = made_once(*settings)
+        shutil.copytree(kept, out)
+        return config
+
+    return copied
+
+
+def test_another_configuration_is_refused_and_what_changes_nothing_is_not(begun: Begun, tmp_path: Path) -> None:
     out = tmp_path / "out"
     begun(out, "odometry.checkpoint_s=5")
     before = result_of(out)
@@ -283,13 +299,13 @@ def test_another_configuration_is_refused_and_what_changes_nothing_is_not(tmp_pa
         (lambda s: replace(s, calibration=replace(s.calibration, T_lidar_imu=np.eye(4))), "read in another way"),
     ],
 )
-def test_another_input_is_refused(change: Callable[[Stub], Stub], why: str, tmp_path: Path) -> None:
+def test_another_input_is_refused(change: Callable[[Stub], Stub], why: str, begun: Begun, tmp_path: Path) -> None:
     config = begun(tmp_path / "out")
     with pytest.raises(OutputExistsError, match=why):
         lslam.run(change(drive()), config, out=tmp_path / "out", resume=True)
 
 
-def test_another_version_or_a_run_that_says_nothing_is_refused(tmp_path: Path) -> None:
+def test_another_version_or_a_run_that_says_nothing_is_refused(begun: Begun, tmp_path: Path) -> None:
     out = tmp_path / "out"
     config = begun(out)
     facts = manifest(out)
@@ -328,7 +344,7 @@ def test_a_run_that_diverged_or_missed_its_gate_stays_so(tmp_path: Path) -> None
             lslam.run(drive(), strict, out=tmp_path / "strict", resume=resume)
 
 
-def test_without_flags_an_interrupted_run_is_refused_and_both_ways_are_named(tmp_path: Path) -> None:
+def test_without_flags_an_interrupted_run_is_refused_and_both_ways_are_named(begun: Begun, tmp_path: Path) -> None:
     config = begun(tmp_path / "out")
     with pytest.raises(OutputExistsError, match=r"--resume goes on.*--overwrite replaces"):
         lslam.run(drive(), config, out=tmp_path / "out")
