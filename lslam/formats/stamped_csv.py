@@ -58,7 +58,24 @@ def read_stamped_csv(
     rest = unread_columns(table, clock.columns.union(columns_read))
     for note in filter(None, [clock.note, rest and f"columns left out: {shown(rest)}"]):
         log.info("%s: %s", path, note)
-    return clock.stamps_ns, values
+    return _in_order(path, clock.stamps_ns, values)
+
+
+def _in_order(
+    path: Path, stamps: NDArray[np.int64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Rows (N,) by their stamps, copies of rows once; as they are where that interleaves them, as behind a clock set back."""
+    order = np.argsort(stamps, kind="stable")
+    rows = np.column_stack([stamps - stamps.min(initial=0), values])[order]
+    own = np.ones(len(rows), bool)
+    own[1:] = ~np.isclose(rows[1:], rows[:-1], 0, 0, equal_nan=True).all(axis=1)
+    order = order[own]
+    steps = np.diff(stamps[order])
+    if not len(steps) or (np.diff(stamps) > 0).all() or steps.min() < 0.5 * np.median(steps):
+        return stamps, values
+    copies = f", {len(stamps) - len(order)} copies left out" if len(order) < len(stamps) else ""
+    log.warning("%s: its rows are in another order than their stamps: sorted%s", path, copies)
+    return stamps[order], values[order]
 
 
 def write_stamped_csv(

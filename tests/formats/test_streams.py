@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_mcd_extrinsics
@@ -80,6 +81,37 @@ def test_imu_round_trip_is_exact(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.stamps_ns, stream.stamps_ns)
     np.testing.assert_array_equal(back.accel, stream.accel)
     np.testing.assert_array_equal(back.gyro, stream.gyro)
+
+
+def _rows(order: NDArray[np.int64]) -> ImuStream:
+    stream = imu()
+    return ImuStream(stream.stamps_ns[order], stream.accel[order], stream.gyro[order])
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        np.r_[12:20, 0:12],
+        np.arange(20)[::-1],
+        np.repeat(np.arange(20), 2),
+        np.random.default_rng(2).permutation(20),
+    ],
+    ids=["parts", "backwards", "twice", "shuffled"],
+)
+def test_rows_in_another_order_than_their_stamps_are_sorted(order: NDArray[np.int64], tmp_path: Path) -> None:
+    write_imu_csv(tmp_path / "imu.csv", _rows(order))
+    back, expected = read_imu_csv(tmp_path / "imu.csv"), imu()
+    np.testing.assert_array_equal(back.stamps_ns, expected.stamps_ns)
+    np.testing.assert_array_equal(back.accel, expected.accel)
+    np.testing.assert_array_equal(back.gyro, expected.gyro)
+
+
+def test_rows_behind_a_clock_that_was_set_back_stay_where_they_are(tmp_path: Path) -> None:
+    """Sorted, one time would be told of twice."""
+    stream = imu()
+    stamps = stream.stamps_ns - 57_000_000 * (np.arange(20) >= 12)
+    write_imu_csv(tmp_path / "imu.csv", ImuStream(stamps, stream.accel, stream.gyro))
+    np.testing.assert_array_equal(read_imu_csv(tmp_path / "imu.csv").stamps_ns, stamps)
 
 
 def test_euroc_imu_reads_with_its_column_order(tmp_path: Path) -> None:
