@@ -115,6 +115,10 @@ class Projection:
                 f"--crs {self.name} ({self._crs.name}) does not count in metres on a plane: choose a projected "
                 f"one, for example EPSG:{Projection(_without_epsg(self.georeference)).epsg}"
             )
+        if self.georeference.geoid and not has_heights(self._crs) and len(self._crs.axis_info) > 2:
+            raise UsageError(
+                f"--geoid: heights in {self.name} count from the ellipsoid, by its name: leave out one of them"
+            )
         self.apply(np.zeros((1, 3)))
 
     @cached_property

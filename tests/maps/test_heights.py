@@ -55,6 +55,16 @@ def test_heights_without_an_exact_operation_are_refused() -> None:
         Projection(reference(25832, 4326)).check()
 
 
+def test_a_plane_of_another_place_and_a_geoid_beside_ellipsoidal_heights_are_refused(grid: str) -> None:
+    """Neither is a matter of a missing grid, and the sentence says which it is."""
+    with pytest.raises(UsageError, match=r"EPSG:28992: PROJ knows no operation at 49.01, 8.43 deg") as far:
+        Projection(reference(28992)).check()
+    assert "--geoid" not in str(far.value)
+    Projection(reference(32632, 4979)).check()
+    with pytest.raises(UsageError, match=r"EPSG:32632\+4979 count from the ellipsoid"):
+        Projection(reference(32632, 4979, grid)).check()
+
+
 @pytest.mark.parametrize("codes", [(25832, None), (5555, None), (25832, 7837)])
 def test_a_geoid_gives_the_heights(codes: tuple[int, int | None], grid: str, tmp_path: Path) -> None:
     points = np.random.default_rng(4).uniform(-800, 800, (500, 3))
