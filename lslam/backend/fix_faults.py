@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry.interpolate import poses_at
 from lslam.graph.fix_errors import (
+    FEWEST,
     NO_HEIGHT,
     ClockOffset,
     actual_sigmas,
@@ -25,6 +26,8 @@ Floats = NDArray[np.float64]
 
 # Fixes that heights alone reject, at least, as a share of all.
 LEAST_SHARE = 0.05
+# Times as large as the next smaller one, a stated sigma is of another kind of fixes.
+APART = 4.0
 # Share of the heights from which those left out are as plausible.
 AMBIGUOUS = 0.4
 
@@ -108,18 +111,36 @@ def with_actual_sigmas(
     """The fixes with the sigmas of their scatter where they state less, up to the `largest`, m: beyond they are no fixes."""
     seconds = 1e-9 * (fixes.stamps_ns - fixes.stamps_ns[0])
     rough = rough_residuals(seconds, fixes.antenna @ level.T, fixes.positions)
-    factors = actual_sigmas(seconds, rough, fixes.sigmas, probability)
-    sigmas = fixes.sigmas if factors is None else fixes.sigmas * factors
-    if factors is None or float(np.median(sigmas[:, :2], axis=0).max()) > largest:
+    factors = np.ones_like(fixes.sigmas)
+    for own in _kinds(fixes.sigmas[:, 0]):
+        found = actual_sigmas(seconds[own], rough[own], fixes.sigmas[own], probability)
+        if found is not None and float(np.median(fixes.sigmas[own, :2] * found[:2], axis=0).max()) <= largest:
+            factors[own] = found
+    wrong = (factors > 1.0).any(axis=1)
+    if not wrong.any():
         return fixes, faults
-    stated, actual = np.median(fixes.sigmas, axis=0), np.median(sigmas, axis=0)
+    sigmas = fixes.sigmas * factors
+    stated, actual = np.median(fixes.sigmas[wrong], axis=0), np.median(sigmas[wrong], axis=0)
+    which = "fixes" if wrong.all() else f"{np.count_nonzero(wrong)} of {len(sigmas)} fixes"
     said = (
-        f"GNSS: fixes state {_axes(stated)} m (east, north, up) and scatter by {_axes(actual)} m where odometry is smooth: they "
-        "are weighted by their scatter"
+        f"GNSS: {which} state {_axes(stated)} m (east, north, up) and scatter by {_axes(actual)} m where odometry is smooth: "
+        "they are weighted by their scatter"
     )
     facts = {"stated": np.round(stated, 3).tolist(), "scatter": np.round(actual, 3).tolist()}
-    is_refuted = bool((factors[:2] > 1.0).any())
+    is_refuted = bool((factors[:, :2] > 1.0).any())
     return replace(fixes, sigmas=sigmas, is_refuted=is_refuted), faults.and_another(said, fix_sigma_m=facts)
+
+
+def _kinds(sigmas: Floats) -> list[NDArray[np.bool_]]:
+    """Which of the fixes state alike, by their sigmas (F,): a receiver says one thing of a fixed solution, another of a float."""
+    ordered = np.sort(sigmas)
+    edges, begin = [], 0
+    for at in (np.flatnonzero(ordered[1:] > APART * ordered[:-1]) + 1).tolist():
+        if min(at - begin, len(ordered) - at) >= FEWEST:
+            edges.append(ordered[at])
+            begin = at
+    kind = np.searchsorted(edges, sigmas, "right")
+    return [kind == k for k in range(len(edges) + 1)]
 
 
 def aligned(

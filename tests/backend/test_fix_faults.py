@@ -48,8 +48,8 @@ def wandering(count: int, memory: float, rng: np.random.Generator) -> np.ndarray
 
 
 def placed(
-    late: float = 0.0, noise: float = 0.5, stated: float = 0.5, climb: float = 0.0, seed: int = 0, memory: float = 0.0,
-    run_off: float = 0.0,
+    late: float = 0.0, noise: float = 0.5, stated: float | list[float] = 0.5, climb: float = 0.0, seed: int = 0,
+    memory: float = 0.0, run_off: float = 0.0,
 ) -> Placement:  # fmt: skip
     """By 5 fixes a second, of which those of the last 15 s are higher by `climb`, m.
 
@@ -60,7 +60,7 @@ def placed(
     error = noise * (wandering(len(taken), memory, rng) if memory else rng.normal(size=(len(taken), 3))) * [1, 1, 1.8]
     error[taken > 25, 2] += climb
     fixes = geodesy.from_local(at(taken)[:, :3, 3] + error, ORIGIN)
-    stream = GnssStream(np.round(1e9 * (taken + late)).astype(np.int64), fixes, np.full(len(taken), stated))
+    stream = GnssStream(np.round(1e9 * (taken + late)).astype(np.int64), fixes, np.resize(stated, len(taken)))
     config = Config.model_validate({"gnss": {"mode": "graph"}})
     results = drifting(run_off) if memory else RESULTS
     keyframes = [replace(k, T_world_lidar=results[k.scan].T_world_lidar) for k in KEYFRAMES]
@@ -109,6 +109,18 @@ def test_sigmas_that_are_far_too_small_are_those_of_the_scatter(seed: int) -> No
     assert found.walk == 0.0
     assert len(found.fixes) == 198
     assert np.abs(apart(found)[:, :2]).max() < 0.3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_some_sigmas_that_are_far_too_small_are_judged_beside_those_of_other_fixes(seed: int) -> None:
+    """A receiver that takes some of its solutions for fixed."""
+    found = placed(stated=[0.02, 5.0], seed=seed)
+    (problem,) = found.faults.problems
+    assert problem.startswith("GNSS: 99 of 198 fixes state 0.02, 0.02 and 0.04 m (east, north, up) and scatter by 0.")
+    sigmas = np.array([fix.sigma for fix in found.fixes])
+    np.testing.assert_allclose(np.median(sigmas[0::2], axis=0), [0.5, 0.5, 0.9], rtol=0.35)
+    np.testing.assert_allclose(sigmas[1::2], np.tile([5.0, 5.0, 9.0], (99, 1)), rtol=0.01)
+    assert np.abs(apart(found)[:, :2]).max() < 0.4
 
 
 @pytest.mark.parametrize("seed", range(5))
