@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +17,6 @@ from lslam.printable import shown
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 
-log = logging.getLogger("lslam")
 TIME_COLUMNS = "stamp_ns, timestamp, stamp, time, t, time_s, or sec and nanosec"
 IMU_COLUMNS = ("accel_x", "accel_y", "accel_z", "gyro_x", "gyro_y", "gyro_z")
 _STEMS = (
@@ -30,13 +28,17 @@ GNSS_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "sigma_m")
 
 
 def read_stamped_csv(
-    path: Path, columns: Sequence[tuple[str, ...]], optional: Sequence[tuple[str, ...]] = ()
+    path: Path,
+    columns: Sequence[tuple[str, ...]],
+    optional: Sequence[tuple[str, ...]] = (),
+    notes: list[str] | None = None,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps (N,) ns and values (N, K), one column per entry of `columns`, each entry its accepted names.
 
     Columns of `optional` follow and are NaN where the file has none. The header is the first line; a leading `#` or `%`,
     units in brackets, case and what stands before the last points or slashes (`field.linear_acceleration.x`) do not count.
-    The time is one column or two (`time_columns`). Raises InputError naming file, line and what is missing.
+    The time is one column or two (`time_columns`). What was chosen and left out goes to `notes`. Raises InputError naming file,
+    line and what is missing.
     """
     table = read_table(path)
     spellings = [_spellings(name) for name in table.names]
@@ -56,26 +58,26 @@ def read_stamped_csv(
     values = np.full((len(table.rows), len(where)), np.nan)
     values[:, [k is not None for k in where]] = table.values(columns_read)
     rest = unread_columns(table, clock.columns.union(columns_read))
-    for note in filter(None, [clock.note, rest and f"columns left out: {shown(rest)}"]):
-        log.info("%s: %s", path, note)
-    return _in_order(path, clock.stamps_ns, values)
+    order = _order(clock.stamps_ns, values)
+    said = [clock.note, rest and f"columns left out: {shown(rest)}"]
+    if order is not None:
+        copies = f", {len(values) - len(order)} copies left out" if len(order) < len(values) else ""
+        said.append(f"its rows are in another order than their stamps: sorted{copies}")
+    if notes is not None:
+        notes += [f"{path.name}: {sentence}" for sentence in said if sentence]
+    return (clock.stamps_ns, values) if order is None else (clock.stamps_ns[order], values[order])
 
 
-def _in_order(
-    path: Path, stamps: NDArray[np.int64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows (N,) by their stamps, copies of rows once; as they are where that interleaves them, as behind a clock set back."""
+def _order(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.intp] | None:
+    """Rows by their stamps, copies once; None where they are so, or would interleave, as behind a clock that was set back."""
     order = np.argsort(stamps, kind="stable")
     rows = np.column_stack([stamps - stamps.min(initial=0), values])[order]
     own = np.ones(len(rows), bool)
     own[1:] = ~np.isclose(rows[1:], rows[:-1], 0, 0, equal_nan=True).all(axis=1)
     order = order[own]
     steps = np.diff(stamps[order])
-    if not len(steps) or (np.diff(stamps) > 0).all() or steps.min() < 0.5 * np.median(steps):
-        return stamps, values
-    copies = f", {len(stamps) - len(order)} copies left out" if len(order) < len(stamps) else ""
-    log.warning("%s: its rows are in another order than their stamps: sorted%s", path, copies)
-    return stamps[order], values[order]
+    is_well = not len(steps) or bool((np.diff(stamps) > 0).all()) or steps.min() < 0.5 * np.median(steps)
+    return None if is_well else order
 
 
 def write_stamped_csv(
@@ -98,13 +100,13 @@ def _spellings(name: str) -> list[str]:
     return ["_".join(words[k:]).strip() for k in reversed(range(len(words)))]
 
 
-def read_imu_csv(path: Path) -> ImuStream:
+def read_imu_csv(path: Path, notes: list[str] | None = None) -> ImuStream:
     """Read specific force (m/s2, +g up at rest) and angular rate (rad/s) in the IMU frame; nothing is converted.
 
     Columns are `stamp_ns` (or seconds as `t`, `time`, `timestamp`), `accel_x..z` and `gyro_x..z` or their usual aliases.
     Raises InputError naming file and line.
     """
-    stamps, values = read_stamped_csv(path, _ALIASES)
+    stamps, values = read_stamped_csv(path, _ALIASES, notes=notes)
     return ImuStream(stamps, values[:, :3], values[:, 3:])
 
 
@@ -113,7 +115,7 @@ def write_imu_csv(path: Path, imu: ImuStream) -> None:
     write_stamped_csv(path, IMU_COLUMNS, imu.stamps_ns, np.hstack([imu.accel, imu.gyro]))
 
 
-def read_gnss_csv(path: Path) -> GnssStream:
+def read_gnss_csv(path: Path, notes: list[str] | None = None) -> GnssStream:
     """Read fixes: `stamp_ns` (or seconds), `lat_deg`, `lon_deg`, `alt_m` (WGS84) and, if known, `sigma_m`.
 
     Without `sigma_m` the one-sigma error is NaN: unknown. Raises InputError naming file and line.
@@ -126,6 +128,7 @@ def read_gnss_csv(path: Path) -> GnssStream:
             ("alt_m", "alt", "altitude", "height", "h", "ele"),
         ],
         [("sigma_m", "sigma", "pos_acc")],
+        notes,
     )
     return GnssStream(stamps, values[:, :3], values[:, 3])
 

@@ -137,7 +137,7 @@ class Folder:
         """The sequence of `parts`, see `FolderSequence`, with what is stated of every kind of folder, its points in m."""
         info, problems = self.info, self.voice.problems
         if "imu" not in parts:
-            parts["imu"], parts["gnss"] = load_streams(self.path, info, problems)
+            parts["imu"], parts["gnss"] = load_streams(self.path, info, self.voice)
         sequence = FolderSequence(**{
             "name": info.name or printable(self.path.name), "path": self.path, "kind": self.kind, "files": self.files,
             "motion_compensated": info.motion_compensated, "record": self.record, "rows": info.rows, "cols": info.cols,

@@ -81,7 +81,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
             "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
             "leaves scans as they are)"
         )
-    imu, gnss = load_streams(path, info, voice.problems)
+    imu, gnss = load_streams(path, info, voice)
     if oxts is not None and oxts.stamps_ns is not None:
         of_oxts = oxts_streams(oxts, oxts.stamps_ns)
         imu, gnss = imu or of_oxts[0], gnss or of_oxts[1]

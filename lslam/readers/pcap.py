@@ -76,7 +76,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
         stated_times=stated_times(info),
         calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),
     )  # fmt: skip
-    beside, sequence.gnss = load_streams(path.parent, info, voice.problems)
+    beside, sequence.gnss = load_streams(path.parent, info, voice)
     sequence.imu = opened.imu if beside is None else beside
     if beside is not None and info.T_lidar_imu is None:
         voice.problems.append(

@@ -50,7 +50,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
     calib = path / "calib.txt"
     T_cam0_lidar = folder.calibration(calib, read_odometry_calib) if calib.is_file() else None
     calibration = calibration_over(info, Calibration(T_cam0_lidar))
-    imu, gnss = load_streams(path, info, voice.problems)
+    imu, gnss = load_streams(path, info, voice)
     beside = [stream.stamps_ns for stream in (imu, gnss) if stream is not None and len(stream)]
     scans, truth = _stamps_and_truth(folder, beside, calibration)
     folder.files = scans.files

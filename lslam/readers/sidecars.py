@@ -15,6 +15,7 @@ from lslam.formats.point_files import read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.sequence_toml import EXTRINSICS, FILE_NAME, SequenceInfo, read_sequence_toml
 from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
+from lslam.readers.ground_truth import Voice
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Calibration, StatedTimes, readable
@@ -88,10 +89,10 @@ def _top_elevation_deg(files: list[Path], record: PointRecord | None) -> float |
     return None
 
 
-def load_streams(folder: Path, info: SequenceInfo, problems: list[str]) -> tuple[ImuStream | None, GnssStream | None]:
+def load_streams(folder: Path, info: SequenceInfo, voice: Voice) -> tuple[ImuStream | None, GnssStream | None]:
     """The IMU and the fixes in the files that `sequence.toml` names, or in `imu.csv` and `gnss.csv` in the sequence folder."""
-    imu = _load(folder, info.imu, "imu.csv", read_imu_csv, problems)
-    return imu, _load(folder, info.gnss, "gnss.csv", read_gnss_csv, problems)
+    imu = _load(folder, info.imu, "imu.csv", read_imu_csv, voice)
+    return imu, _load(folder, info.gnss, "gnss.csv", read_gnss_csv, voice)
 
 
 def calibration_over(info: SequenceInfo, found: Calibration) -> Calibration:
@@ -109,14 +110,14 @@ def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:
     return path
 
 
-def _load(folder: Path, named: str | None, usual: str, read: Callable[[Path], T], problems: list[str]) -> T | None:
+def _load(folder: Path, named: str | None, usual: str, read: Callable[[Path, list[str]], T], voice: Voice) -> T | None:
     path = folder / (named or usual)
     if not path.is_file():
         if named is not None:
-            problems.append(f"{path}, named by {FILE_NAME}, does not exist")
+            voice.problems.append(f"{path}, named by {FILE_NAME}, does not exist")
         return None
     try:
-        return read(path)
+        return read(path, voice.notes)
     except InputError as error:
-        problems.append(f"not used: {error}")
+        voice.problems.append(f"not used: {error}")
         return None

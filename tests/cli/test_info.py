@@ -109,6 +109,17 @@ def test_help_is_light() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_columns_that_nobody_reads_are_named(tmp_path: Path) -> None:
+    shutil.copytree(SAMPLE, tmp_path / "sample")
+    folder = tmp_path / "sample" / "sequences" / "00"
+    for name, column in (("imu.csv", "temperature"), ("gnss.csv", "hdop")):
+        first, *rows = (folder / name).read_text().splitlines()
+        (folder / name).write_text("\n".join([f"{first},{column}", *(f"{row},1.5" for row in rows)]))
+    notes = inspect(open_sequence(folder), is_quick=True)["notes"]
+    assert "imu.csv: columns left out: temperature" in notes
+    assert "gnss.csv: columns left out: hdop" in notes
+
+
 def test_a_healthy_and_a_broken_copy_at_the_terminal(tmp_path: Path) -> None:
     """Findings are results: they stand on stdout, with their way out, and the exit code stays 0."""
     copy = tmp_path / "sample"
