@@ -98,8 +98,8 @@ def exact_transformer(source: Any, target: Any, lat_lon: NDArray[Any], name: str
         raise UsageError(f"{name}: PROJ lacks the grid {' and '.join(grids)}{coarser}: {_how_to_get(grids)}, {way_out}")
     if best is None and not (has_heights(source) or has_heights(target)):
         raise UsageError(
-            f"{name}: PROJ knows no operation at {places[0, 0]:.2f}, {places[0, 1]:.2f} deg: it is a plane of another place; "
-            "choose one that covers it, as that of a UTM zone"
+            f"{name}: PROJ knows no operation at {places[0, 0]:.2f}, {places[0, 1]:.2f} deg: it is a plane of another place, "
+            "or easting does not come first; choose one that covers it, as that of a UTM zone"
         )
     if best is None:
         raise UsageError(
