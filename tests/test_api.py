@@ -169,6 +169,7 @@ def test_an_outcome_has_the_map_the_errors_and_figures(tmp_path: Path) -> None:
         bare.plot("map")
 
 
+@pytest.mark.usefixtures("forked_runs")
 def test_a_comparison_from_python_has_all_runs(tmp_path: Path) -> None:
     words = ("input.count=6", "map.write=false", "report.html=false")
     compared = lslam.compare([SAMPLE], ["icp", "icp-point"], out=tmp_path / "out", settings=words)
