@@ -112,10 +112,10 @@ TOWNS, SCANS = Towns(), TracedScans()
 def shared_towns(request: pytest.FixtureRequest) -> Iterator[None]:
     """Towns are built once, and a drive traces its scans once, for all tests but those of the simulator.
 
-    These build and trace each anew unless `SHARES_TOWNS` there.
+    A module's own `SHARES_TOWNS` says otherwise: what measures memory must not hold the scans that others may ask for.
     """
     with pytest.MonkeyPatch.context() as patch:
-        if request.path.parent.name != "simulation" or getattr(request.module, "SHARES_TOWNS", False):
+        if getattr(request.module, "SHARES_TOWNS", request.path.parent.name != "simulation"):
             patch.setattr("lslam.simulation.built_scenario._city", TOWNS.city)
             patch.setattr("lslam.simulation.scenarios.RayScene", TOWNS.scene)
             patch.setattr(SimulatedDrive, "scan", SCANS.once(SimulatedDrive.scan))

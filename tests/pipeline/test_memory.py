@@ -17,6 +17,7 @@ from lslam.odometry import create_odometry
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan_result import ScanResult
 
+SHARES_TOWNS = False
 # A stand-in for the promise (50 MB from scan 500 to scan 2,000) that takes seconds: a fifth of the scans, a fifth of
 # the room. By hand, over all 2,000 scans, 3 MB were measured; keeping the points of one scan in ten would break it.
 EARLY, LATE, ROOM_MB = 150, 450, 10.0
