@@ -18,6 +18,7 @@ from lslam.studies.worker import ScanStore, SequenceCache, memory_bound, size_of
 from lslam.types.scan import Scan
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
+SHARES_TOWNS = False  # what is asked is who traces a scan
 
 
 @pytest.fixture(scope="module")
