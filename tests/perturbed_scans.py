@@ -2,7 +2,8 @@
 
 `--scan-noise-mm A` moves every point of a simulated scan by a normal error of A mm along each axis; `--noise-seed K` draws
 another such error and, when no A is given, other noise of every sensor on the same drive.
-Drives that tests simulate in other processes, and rays that they trace themselves, stay as they are.
+Drives that tests simulate in other processes, and rays that they trace themselves, stay as they are: a test that compares
+one of these with one of this process is marked `unperturbed`, and left out.
 """
 
 from __future__ import annotations
@@ -28,11 +29,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Drives change for the whole session: what tests share is made before any of them asks."""
+    config.addinivalue_line("markers", "unperturbed: compares bytes with a drive of another process or with kept ones")
     noise_m, seed = config.getoption("scan_noise_mm") / 1000, config.getoption("noise_seed")
     if noise_m:
         move_points(noise_m, seed)
     elif seed:
         draw_other_noise(seed)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out what says of itself that a perturbation breaks it."""
+    if config.getoption("scan_noise_mm") or config.getoption("noise_seed"):
+        for item in items:
+            if item.get_closest_marker("unperturbed"):
+                item.add_marker(pytest.mark.skip(reason="drives are perturbed"))
 
 
 def move_points(noise_m: float, seed: int) -> None:

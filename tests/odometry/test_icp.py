@@ -199,6 +199,7 @@ def digest(count: int = 12) -> str:
     return out.hexdigest()
 
 
+@pytest.mark.unperturbed
 def test_the_same_drive_gives_the_same_bytes_twice_and_in_another_process() -> None:
     expected = digest()
     assert digest() == expected

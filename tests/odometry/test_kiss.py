@@ -74,23 +74,30 @@ def test_a_range_the_user_sets_reaches_the_package_and_no_other_does() -> None:
     np.testing.assert_allclose(adapter_poses(scans[:10], create(untouched)), raw_poses(scans[:10]), atol=1e-12)
 
 
-@pytest.mark.parametrize(("passed", "shape", "place"), [(0.0, 0.7, 0.5), (0.5, 0.8, 0.8)])
-def test_with_point_times_poses_belong_to_the_stamp_of_the_scan(passed: float, shape: float, place: float) -> None:
-    """Where its sweep begins, or in its middle, which is half as far from the end that the package means."""
-    scans, truth = block(False)
-    raw = raw_poses(scans)
+@pytest.mark.parametrize("passed", [0.0, 0.5])
+def test_with_point_times_poses_belong_to_the_stamp_of_the_scan(passed: float) -> None:
+    """Where its sweep begins, or in its middle: there they err as the package does where it means its poses, at the end.
+
+    The package's world, and its second pose, lie in the middle of a sweep, since it does not deskew the first two.
+    """
+    scans, _ = block(False)
+    drive = simulate("block", seed=0, count=len(scans), motion_compensated=False)
+    begin, sweep = 1e-9 * drive.stamps_ns, 0.1
+
+    def true_at(shares: Floats) -> Floats:
+        poses = drive.vehicle.poses(begin + sweep * shares)
+        return se3.relative(poses[0], poses)
+
+    raw, truth = raw_poses(scans), true_at(np.full(len(scans), passed))
     if passed > 0:
-        scans = tuple(replace(s, times=None if s.times is None else s.times - np.float32(0.1 * passed)) for s in scans)
-        drive = simulate("block", seed=0, count=len(scans), motion_compensated=False)
-        at_stamps = drive.vehicle.poses(1e-9 * drive.stamps_ns + 0.1 * passed)
-        truth = se3.relative(at_stamps[0], at_stamps)
+        scans = tuple(
+            replace(s, times=None if s.times is None else s.times - np.float32(sweep * passed)) for s in scans
+        )
     ours = adapter_poses(scans)
-
-    def off(poses: Floats) -> Floats:
-        return np.asarray(np.linalg.norm((poses - truth)[:, :3, 3], axis=1))
-
-    assert ate(ours, truth) < shape * ate(raw, truth)
-    assert np.median(off(ours)) < place * np.median(off(raw))
+    own, package = ours - truth, raw - true_at(np.where(np.arange(len(scans)) < 2, 0.5, 1.0))
+    apart, moved = (np.linalg.norm(poses[:, :3, 3], axis=1) for poses in (own - package, ours - raw))
+    # The motion from the stamp to the end is that of the package, whose steps err.
+    assert np.median(apart) < 0.15 * np.median(moved)
     # The first step is whole: neither missing nor doubled.
     step = np.linalg.norm(truth[1, :3, 3])
     assert np.linalg.norm(ours[1, :3, 3]) == pytest.approx(step, rel=0.1)

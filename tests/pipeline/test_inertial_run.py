@@ -262,9 +262,14 @@ def test_late_stamps_are_found_and_the_imu_still_helps() -> None:
     config = config_of()
     part = begin_inertial(stub, config)
     results = estimate(stub, create_odometry(config), motion=part.motion)
-    assert close_inertial(part, results)["time_offset_s"] == pytest.approx(-0.02, abs=0.002)
+    # A millisecond and more is the noise of so short a walk: the prior tells what is left of the lag.
+    assert close_inertial(part, results)["time_offset_s"] == pytest.approx(-0.02, abs=0.005)
+    late, on_time = (
+        float(np.median([r.prior_norm for r in found[1:]])) for found in (results, runs()[1].record.results)
+    )
+    assert late < 1.5 * on_time
     assert any("stamps moved" in note for note in part.notes)
-    assert rmse(results) < 0.8 * rmse(runs()[0].record.results)
+    assert rmse(results) < 0.2 * rmse(runs()[0].record.results)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.02])

@@ -30,12 +30,15 @@ def test_what_is_walked_is_free(seed: int) -> None:
 
 
 def test_a_walk_through_the_room_is_followed_with_voxels_of_its_size() -> None:
-    """Voxels of 0.8 m, which hold cupboards and not planes, err by several times as much."""
-    drive = simulate("room", seed=2, count=25, motion_compensated=True)
+    """Voxels of 0.8 m, which hold cupboards and not planes, err by several times as much.
+
+    In this room, whatever the noise: in others one walk of three slips by a decimetre.
+    """
+    drive = simulate("room", seed=3, count=25, motion_compensated=True)
     errors = []
     for settings in ([], ["registration.voxel_size=0.8", "preprocess.map_leaf=0.3", "preprocess.range_min=1.0"]):
         config = lslam.load_config(settings=[*settings, "map.write=false", "loops.use=false"])
         ate = lslam.run(drive, config).evaluation.ate["origin"].translation
         errors.append(ate.rmse)
     assert errors[0] < 0.02
-    assert errors[1] > 2 * errors[0]
+    assert errors[1] > 4 * errors[0]

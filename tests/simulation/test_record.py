@@ -213,6 +213,7 @@ def test_a_disk_too_small_is_said_before_the_first_scan(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.unperturbed
 def test_the_sample_is_what_the_command_in_its_readme_makes() -> None:
     """To a centimetre for all but a few points: another processor may round a ray or lose an echo differently."""
     said = json.loads((SAMPLE / "sequences" / "00" / "manifest.json").read_text(encoding="utf-8"))
