@@ -18,16 +18,22 @@ _ROWS = round(np.pi / CELL_RAD)
 _COLUMNS = 2 * _ROWS
 
 
-def filled_directions(points: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Numbers of the cells of directions, of about the same size, that hold some of the points (N, 3), m, seen from 0."""
+def directions(points: Floats) -> NDArray[np.int64]:
+    """(N,) numbers of the cells of directions, of about the same size, that points (N, 3), m, are seen in from 0."""
+    ranges = np.linalg.norm(points, axis=1)
+    row = np.minimum((np.arcsin(points[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
+    count = np.maximum(np.round(_COLUMNS * np.cos((row + 0.5) * CELL_RAD - np.pi / 2)), 1)
+    column = np.minimum((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * count, count - 1).astype(
+        np.int64
+    )
+    return np.asarray(row * _COLUMNS + column)
+
+
+def filled_directions(points: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Numbers of the cells of `directions` that hold some of the points (N, 3), m."""
     few = points[:: 1 + len(points) // POINTS, :3].astype(np.float64)
     ranges = np.linalg.norm(few, axis=1)
-    is_known = np.isfinite(ranges) & (ranges > 0)
-    few, ranges = few[is_known], ranges[is_known]
-    row = np.minimum((np.arcsin(few[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
-    count = np.maximum(np.round(_COLUMNS * np.cos((row + 0.5) * CELL_RAD - np.pi / 2)), 1)
-    column = np.minimum((np.arctan2(few[:, 1], few[:, 0]) / (2 * np.pi) + 0.5) * count, count - 1).astype(np.int64)
-    cells, filling = np.unique(row * _COLUMNS + column, return_counts=True)
+    cells, filling = np.unique(directions(few[np.isfinite(ranges) & (ranges > 0)]), return_counts=True)
     return np.asarray(cells[filling >= FILLING])
 
 

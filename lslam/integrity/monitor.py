@@ -164,7 +164,7 @@ class IntegrityMonitor(Stateful):
         pair.begin(first.source, thin(last.points, 1 + len(last.source) // LAID_POINTS))
         near_claim = pair.near(claimed)
         hypotheses = [near_claim]
-        is_odd = is_still(claimed) or self._usual.is_less(near_claim.result.agreement)
+        is_odd = is_still(claimed) or self._usual.is_less(near_claim.agreement)
         if not is_still(claimed) and (self._may_stand or self._speed < MOST_BRAKING * seconds):
             hypotheses.append(pair.at_rest())
         if self._motion is None:
@@ -173,17 +173,17 @@ class IntegrityMonitor(Stateful):
             change = float(np.linalg.norm(expected[:3, 3] - claimed[:3, 3])) / seconds**2
             if (is_odd or change > MOST_BRAKING) and not is_near(near_claim.motion, expected):
                 hypotheses.append(pair.near(expected))
-        if is_odd and (is_still(claimed) or self._usual.is_less(max(h.result.agreement for h in hypotheses))):
+        if is_odd and (is_still(claimed) or self._usual.is_less(max(h.agreement for h in hypotheses))):
             hypotheses.append(pair.far(claimed))
         best, rival = best_of(hypotheses, MORE)
         if best.sigma is None:
             return
         usual = self._usual.usual
-        self._usual.observe(best.result.agreement)
+        self._usual.observe(best.agreement)
         is_as_claimed = is_still(se3.relative(claimed, near_claim.motion))
-        as_claimed = (near_claim if is_as_claimed else pair.at(claimed)).result
+        as_claimed = near_claim if is_as_claimed else pair.at(claimed)
         check = MotionCheck(
-            first.position, last.position, seconds, claimed, best.motion, best.sigma, best.result.agreement,
+            first.position, last.position, seconds, claimed, best.motion, best.sigma, best.agreement,
             as_claimed.agreement, usual, self._is_broken, None if rival is None else rival.motion, emptied_share,
         )  # fmt: skip
         self.checks.append(check)

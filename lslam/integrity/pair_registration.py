@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.config.registration import RegistrationConfig
 from lslam.geometry import se3
+from lslam.integrity.directions import directions, filled_directions
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH, WIDE
@@ -36,15 +37,24 @@ SAME_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class MotionHypothesis:
-    """A motion at which a scan fits the planes of an earlier one, and which of its points (S,) lie on them."""
+    """A motion at which a scan fits the planes of an earlier one, and which of its points (S,) lie on them.
+
+    in_view : number of points in directions in which the earlier scan saw something
+    """
 
     result: RegistrationResult
     on_planes: NDArray[np.bool_]
+    in_view: int
 
     @property
     def motion(self) -> Floats:
         """(4, 4) pose of the later scan in the earlier one."""
         return self.result.T_world_lidar
+
+    @property
+    def agreement(self) -> float:
+        """Share that lies on the planes of the points in view, or of half of all: what turns out of view tells nothing."""
+        return self.result.inliers / max(self.in_view, 0.5 * len(self.on_planes), 1.0)
 
     @cached_property
     def sigma(self) -> Floats | None:
@@ -80,6 +90,8 @@ class PairRegistration:
         self._edge = LARGEST_M
         self._terms: list[Term] = []
         self._matches = Correspondences(0)
+        self._view: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._source: Floats = np.zeros((0, 3))
 
     def begin(self, first: Floats, last: PreparedPoints) -> None:
         """Take the points (N, 3), m, of the earlier scan, and those of the later one."""
@@ -89,6 +101,7 @@ class PairRegistration:
             level.size = self._edge * wider
             level.insert(first.astype(np.float32), np.eye(4))
         sigma = SETTINGS.sigma
+        self._view, self._source = filled_directions(first), last.source
         # What one start looked up the others need not.
         self._matches = Correspondences(len(last.source))
         self._terms = voxel_terms(
@@ -119,7 +132,10 @@ class PairRegistration:
     def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
         result = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
         away2 = self._matches.away2
-        return MotionHypothesis(result_of(result, start, len(away2)), (away2 >= 0) & (away2 < SETTINGS.kernel_min**2))
+        found = result_of(result, start, len(away2))
+        seen = directions(se3.apply(found.T_world_lidar, self._source))
+        on_planes = (away2 >= 0) & (away2 < SETTINGS.kernel_min**2)
+        return MotionHypothesis(found, on_planes, int(np.isin(seen, self._view).sum()))
 
 
 def best_of(hypotheses: Sequence[MotionHypothesis], more: float) -> tuple[MotionHypothesis, MotionHypothesis | None]:
