@@ -23,8 +23,8 @@ from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.types.gnss import Georeference
 
-# Length, width and height of the box, m.
-BOX = np.array([2.0, 1.5, 1.5])
+# Length, width and height of the box, m: well below a whole number of cells of 0.4 m, so that noise fills no further one.
+BOX = np.array([1.7, 1.3, 1.3])
 MONDAY, TUESDAY = Visit(), Visit(1, is_reversed=True, shift=40.0)
 
 
