@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 SPACING = 6.0
 # Keyframes that must agree on the start, so that one look-alike does not decide.
 AGREEING = 2
+# Of what a keyframe sees, this part must lie where the map has it, when no other of its drive agrees.
+MAJORITY = 0.5
 # Every so many-th source point serves to rank the guesses, and the kernel they are caught with, m.
 FEW, CATCH = 4, 2.5
 # m and deg by which two keyframes' answers may differ beside the drift of odometry between them.
@@ -75,6 +77,16 @@ class Start:
     votes: int
     tried: int
 
+    @property
+    def is_agreed(self) -> bool:
+        """Whether several keyframes say so."""
+        return self.votes >= AGREEING
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether most of what the keyframe sees is there."""
+        return self.vote.support > MAJORITY
+
 
 class PlaceFinder:
     """Finds the start of a drive in the map.
@@ -118,7 +130,7 @@ class PlaceFinder:
             self.reasons.append("nothing stands up there")
             return None
         support, rough = tried[0]
-        rivals = [s for s, T in tried[1:] if _is_elsewhere(rough, T)]
+        rivals = [s for s, T in tried[1:] if is_elsewhere(rough, T)]
         r, c = self.config.registration, self.config.loops
         if rivals and rivals[0] > c.max_ambiguity * support:
             self.reasons.append(f"another place fits {rivals[0] / support:.0%} as well")
@@ -228,6 +240,7 @@ class PlaceFinder:
         return Start(groups[0][-1], len(groups[0]), 0)
 
 
-def _is_elsewhere(T: Floats, other: Floats) -> bool:
+def is_elsewhere(T: Floats, other: Floats) -> bool:
+    """Whether two poses (4, 4) are of different places."""
     delta = se3.relative(T, other)
     return float(np.linalg.norm(delta[:3, 3])) > ELSEWHERE_M or float(so3.angle(delta[:3, :3])) > ELSEWHERE_RAD

@@ -15,7 +15,7 @@ from lslam.geometry import noise, se3
 from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.keyframes.store import KeyframeStore, PartOfStore
 from lslam.localization.sessions import Chain, Session, Vicinity, tie
-from lslam.localization.start import AGREEING
+from lslam.localization.start import is_elsewhere
 from lslam.loops.detector import LEAST_REACH
 from lslam.pipeline.manifest import Manifest
 from lslam.types.motion_check import MotionCheck
@@ -98,16 +98,54 @@ def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: 
         targets = [other.session for other in frame if other.session is not None]
         if part.session is None or not targets:
             continue
-        session, reason = tie(part.session, targets, config, should_stop, _vicinity(targets[-1], part.session))
-        start = None if session is None else session.start
-        if start is not None and start.votes < AGREEING:
-            start, reason = None, "it is too short for two of its keyframes to agree on a place"
-        if start is not None:
-            evidence = f"place search: {start.votes} of {start.tried} keyframes tried agree"
-            frame.append(replace(part, session=session, segment=replace(part.segment, tied_by=evidence)))
+        session, why = _tied(part.session, targets, config, should_stop)
+        if session is not None:
+            frame.append(replace(part, session=session, segment=replace(part.segment, tied_by=why)))
             return
-        reasons.append(reason)
+        reasons.append(why)
     frames.append([replace(part, segment=replace(part.segment, reason=part.segment.reason or "; ".join(reasons)))])
+
+
+def _tied(
+    session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool]
+) -> tuple[Session | None, str]:
+    """The session in the frame of the known ones, and what says so; None, and why not.
+
+    Where no second of its keyframes agrees, the last ones before it have to.
+    """
+    near = _vicinity(known[-1], session)
+    tied, reason = tie(session, known, config, should_stop, near)
+    if tied is None or tied.start is None:
+        return None, reason
+    start = tied.start
+    evidence = f"place search: {start.votes} of {start.tried} keyframes tried agree"
+    if start.is_agreed:
+        return tied, evidence
+    if start.is_seen and _is_seen_back(tied, known[-1], near.reach, config, should_stop):
+        return tied, f"{evidence}, and the last ones before it"
+    return (
+        None,
+        "it is too short for two of its keyframes to agree on a place, and those before it are not found there",
+    )
+
+
+def _is_seen_back(
+    session: Session, before: Session, reach: float, config: Config, should_stop: Callable[[], bool]
+) -> bool:
+    """Whether the last keyframes before a tied session find their place in that, too, and most of what they see there.
+
+    reach : m, about where the tie puts them
+    """
+    last = PartOfStore(before.store, range(len(before.keyframes))[-config.keyframes.submap_size :])
+    own = last.keyframes[0]
+    place = before.T_town_session @ own.T_world_lidar
+    back, _ = tie(
+        replace(before, store=last, keyframes=last.keyframes), [session], config, should_stop,
+        Vicinity(place[:3, 3], reach),
+    )  # fmt: skip
+    if back is None or back.start is None or not back.start.is_seen:
+        return False
+    return not is_elsewhere(place, back.T_town_session @ own.T_world_lidar)
 
 
 def _vicinity(before: Session, session: Session) -> Vicinity:

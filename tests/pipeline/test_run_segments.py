@@ -18,6 +18,7 @@ from lslam.errors import InterruptedRunError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline.watch import RunOutcome, Watch
+from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.trajectory import Trajectory
 
@@ -165,6 +166,31 @@ def test_a_covered_sensor_at_the_start_leaves_the_rest_in_one_frame(tmp_path: Pa
     assert columns(tmp_path / "out")["frame"] == ["1"] * 4 + ["0"] * 8
     assert outcome.evaluation is not None
     assert outcome.evaluation.ate["se3"].translation.max < 0.05  # type: ignore[union-attr]
+
+
+def walk(*positions: int, seed: int = 41) -> Kept:
+    """Scans of a walk through a town, by 16 beams."""
+    drive = simulate("walk", seed=seed, lidar="vlp16", count=60)
+    scans: list[Scan | str] = [replace(drive.scan(i), index=k) for k, i in enumerate(positions)]
+    truth = drive.ground_truth.select(list(positions))
+    return Kept(scans, truth, drive.calibration, motion_compensated=False, kept=positions)
+
+
+def test_a_walk_too_short_for_two_keyframes_is_tied_by_most_of_what_one_sees(tmp_path: Path) -> None:
+    outcome = lslam.run(walk(*range(13, 25), *range(45, 57)), config(), out=tmp_path / "out")
+    assert columns(tmp_path / "out")["segment"] == ["0"] * 12 + ["1"] * 12
+    assert set(columns(tmp_path / "out")["frame"]) == {"0"}
+    record = outcome.record
+    assert record.ground_truth is not None
+    assert error(record.trajectory, record.ground_truth, slice(None)) < 0.15
+
+
+def test_a_walk_of_another_town_is_not_tied(tmp_path: Path) -> None:
+    first, other = walk(*range(13, 25)), walk(*range(45, 57), seed=42)
+    joined = replace(first, scans=[*first.scans, *other.scans], ground_truth=None, kept=(*first.kept, *other.kept))
+    lslam.run(joined, config(), out=tmp_path / "out")
+    assert columns(tmp_path / "out")["segment"] == ["0"] * 12 + ["1"] * 12
+    assert len(set(columns(tmp_path / "out")["frame"])) == 2
 
 
 def test_a_segment_of_another_world_has_a_frame_of_its_own(tmp_path: Path) -> None:
