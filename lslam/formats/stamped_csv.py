@@ -69,15 +69,18 @@ def read_stamped_csv(
 
 
 def _order(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.intp] | None:
-    """Rows by their stamps, copies once; None where they are so, or would interleave, as behind a clock that was set back."""
+    """Rows by their stamps, copies once; None where they are so, or where a clock was set back: parts overlap or lie apart."""
     order = np.argsort(stamps, kind="stable")
     rows = np.column_stack([stamps - stamps.min(initial=0), values])[order]
     own = np.ones(len(rows), bool)
     own[1:] = ~np.isclose(rows[1:], rows[:-1], 0, 0, equal_nan=True).all(axis=1)
     order = order[own]
     steps = np.diff(stamps[order])
-    is_well = not len(steps) or bool((np.diff(stamps) > 0).all()) or steps.min() < 0.5 * np.median(steps)
-    return None if is_well else order
+    if not len(steps) or bool((np.diff(stamps) > 0).all()):
+        return None
+    usual, joined = np.median(steps), steps[np.diff(order) != 1]
+    was_set_back = steps.min() < 0.5 * usual or (len(joined) and np.median(joined) > 1.5 * usual)
+    return None if was_set_back else order
 
 
 def write_stamped_csv(
