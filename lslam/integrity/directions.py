@@ -19,8 +19,8 @@ _COLUMNS = 2 * _ROWS
 
 
 def directions(points: Floats) -> NDArray[np.int64]:
-    """(N,) numbers of the cells of directions, of about the same size, that points (N, 3), m, are seen in from 0."""
-    ranges = np.linalg.norm(points, axis=1)
+    """(N,) numbers of the cells of directions, of about the same size, in which points (N, 3), m, lie as seen from 0."""
+    ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
     row = np.minimum((np.arcsin(points[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
     count = np.maximum(np.round(_COLUMNS * np.cos((row + 0.5) * CELL_RAD - np.pi / 2)), 1)
     column = np.minimum((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * count, count - 1).astype(

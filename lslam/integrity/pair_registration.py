@@ -53,7 +53,7 @@ class MotionHypothesis:
 
     @property
     def agreement(self) -> float:
-        """Share that lies on the planes of the points in view, or of half of all: what turns out of view tells nothing."""
+        """Share of the points in view that lie on the planes; of half of all points, where fewer are in view."""
         return self.result.inliers / max(self.in_view, 0.5 * len(self.on_planes), 1.0)
 
     @cached_property
@@ -132,10 +132,10 @@ class PairRegistration:
     def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
         result = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
         away2 = self._matches.away2
-        found = result_of(result, start, len(away2))
-        seen = directions(se3.apply(found.T_world_lidar, self._source))
+        motion = result_of(result, start, len(away2))
+        cells = directions(se3.apply(motion.T_world_lidar, self._source))
         on_planes = (away2 >= 0) & (away2 < SETTINGS.kernel_min**2)
-        return MotionHypothesis(found, on_planes, int(np.isin(seen, self._view).sum()))
+        return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))
 
 
 def best_of(hypotheses: Sequence[MotionHypothesis], more: float) -> tuple[MotionHypothesis, MotionHypothesis | None]:

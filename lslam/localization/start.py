@@ -78,12 +78,12 @@ class Start:
     tried: int
 
     @property
-    def is_agreed(self) -> bool:
+    def has_agreement(self) -> bool:
         """Whether several keyframes say so."""
         return self.votes >= AGREEING
 
     @property
-    def is_seen(self) -> bool:
+    def has_majority(self) -> bool:
         """Whether most of what the keyframe sees is there."""
         return self.vote.support > MAJORITY
 

@@ -98,7 +98,7 @@ def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: 
         targets = [other.session for other in frame if other.session is not None]
         if part.session is None or not targets:
             continue
-        session, why = _tied(part.session, targets, config, should_stop)
+        session, why = _placement(part.session, targets, config, should_stop)
         if session is not None:
             frame.append(replace(part, session=session, segment=replace(part.segment, tied_by=why)))
             return
@@ -106,7 +106,7 @@ def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: 
     frames.append([replace(part, segment=replace(part.segment, reason=part.segment.reason or "; ".join(reasons)))])
 
 
-def _tied(
+def _placement(
     session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool]
 ) -> tuple[Session | None, str]:
     """The session in the frame of the known ones, and what says so; None, and why not.
@@ -114,22 +114,19 @@ def _tied(
     Where no second of its keyframes agrees, the last ones before it have to.
     """
     near = _vicinity(known[-1], session)
-    tied, reason = tie(session, known, config, should_stop, near)
-    if tied is None or tied.start is None:
+    placed, reason = tie(session, known, config, should_stop, near)
+    if placed is None or placed.start is None:
         return None, reason
-    start = tied.start
+    start = placed.start
     evidence = f"place search: {start.votes} of {start.tried} keyframes tried agree"
-    if start.is_agreed:
-        return tied, evidence
-    if start.is_seen and _is_seen_back(tied, known[-1], near.reach, config, should_stop):
-        return tied, f"{evidence}, and the last ones before it"
-    return (
-        None,
-        "it is too short for two of its keyframes to agree on a place, and those before it are not found there",
-    )
+    if start.has_agreement:
+        return placed, evidence
+    if start.has_majority and _is_found_from_before(placed, known[-1], near.reach, config, should_stop):
+        return placed, f"{evidence}, and the last ones before it"
+    return None, "it is too short for two of its keyframes to agree on a place, and those before it are not found there"
 
 
-def _is_seen_back(
+def _is_found_from_before(
     session: Session, before: Session, reach: float, config: Config, should_stop: Callable[[], bool]
 ) -> bool:
     """Whether the last keyframes before a tied session find their place in that, too, and most of what they see there.
@@ -143,7 +140,7 @@ def _is_seen_back(
         replace(before, store=last, keyframes=last.keyframes), [session], config, should_stop,
         Vicinity(place[:3, 3], reach),
     )  # fmt: skip
-    if back is None or back.start is None or not back.start.is_seen:
+    if back is None or back.start is None or not back.start.has_majority:
         return False
     return not is_elsewhere(place, back.T_town_session @ own.T_world_lidar)
 
