@@ -1,13 +1,17 @@
-"""How the libraries that only some people need are installed."""
+"""How the libraries that only some people need are installed and imported: one clear sentence instead of a traceback."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import shlex
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from lslam.errors import InputError
 from lslam.untrusted import parse_json
 
 # Of a checkout; where lslam is installed, the folder of packages.
@@ -43,3 +47,32 @@ def _requirement(extra: str) -> str:
     path = Path(url2pathname(urlsplit(url).path)) if url else _SOURCES
     is_there = path.exists() if url else (path / "pyproject.toml").is_file()
     return f"{path}[{extra}]" if is_there else named
+
+
+@contextlib.contextmanager
+def importing(library: str, way_out: str) -> Iterator[None]:
+    """Turn a failing import inside the block into an InputError that names the library and the way out.
+
+    >>> with importing("kiss-icp", "install it with: pip install kiss-icp"):
+    ...     import kiss_icp
+    """
+    try:
+        yield
+    except (ImportError, OSError) as error:
+        # A compiled module whose shared library is missing raises OSError, or ImportError with the loader's words.
+        raise InputError(f"{library} cannot be imported: {error}; {way_out}") from None
+
+
+@contextlib.contextmanager
+def importing_open3d() -> Iterator[None]:
+    """As `importing`, for Open3D: it needs libusb, libGL and libX11, which a bare machine lacks.
+
+    The libusb of the wheel `libusb-package` is loaded first: Open3D then finds it.
+    """
+    with contextlib.suppress(ImportError, OSError):
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    way_out = f"{install_hint('open3d')}; on a bare Linux also: apt install libgl1 libegl1 libx11-6 libgomp1"
+    with importing("Open3D", way_out):
+        yield

@@ -21,7 +21,7 @@ from hypothesis import settings
 from shared_towns import Towns, TracedScans
 
 from lslam.errors import InputError
-from lslam.foreign import importing_open3d
+from lslam.extras import importing_open3d
 from lslam.locks import one_at_a_time
 from lslam.simulation.scenarios import SimulatedDrive
 

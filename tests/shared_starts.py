@@ -12,8 +12,7 @@ from lslam.frontend import inertial_start
 from lslam.frontend.inertial_start import first_heard_ns, first_poses
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses
-from lslam.types.selection import Selection
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Selection, Sequence
 
 
 @pytest.fixture(scope="module")

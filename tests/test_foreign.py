@@ -10,7 +10,7 @@ import pytest
 
 from lslam.config import load_config
 from lslam.errors import InputError
-from lslam.foreign import importing
+from lslam.extras import importing
 from lslam.odometry import create_odometry
 
 

@@ -27,7 +27,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["foreign", "locks", "machine", "plugins", "printable", "remote", "stopping"],
+    ["locks", "machine", "plugins", "printable", "remote", "stopping"],
     ["extras"],
     ["errors", "untrusted", "version"],
 ]

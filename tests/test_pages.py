@@ -251,12 +251,17 @@ SECTIONS = ("preprocess", "registration", "recovery", "keyframes", "loops", "gra
 HELD = ("registration", "recovery", "loops", "graph", "odometry", "integrity")
 
 
+def file_of(section: Any) -> str:
+    """Of a section of the configuration, from the package: `config/input.py`."""
+    return type(section).__module__.removeprefix("lslam.").replace(".", "/") + ".py"
+
+
 def value_in_code(name: str, file: str) -> Any:
     if file.startswith("config/"):
         from lslam.config.config import Config
 
         section, key = name.split(".")
-        assert file == f"config/{section}.py"
+        assert file == file_of(getattr(Config(), section))
         return getattr(getattr(Config(), section), key)
     value: Any = import_module("lslam." + file.removesuffix(".py").replace("/", "."))
     for part in name.split("."):
@@ -312,9 +317,10 @@ def test_no_constant_is_missing_in_the_register() -> None:
     files |= {PACKAGE / file for file, _ in listed if not file.startswith("config/")}
     held = {(path.relative_to(PACKAGE).as_posix(), name) for path in files for name in constants_of(path)}
     for section in SECTIONS:
-        for key, field in type(getattr(Config(), section)).model_fields.items():
+        model = getattr(Config(), section)
+        for key, field in type(model).model_fields.items():
             if re.search(r"\b(int|float)\b", str(field.annotation)):
-                held.add((f"config/{section}.py", f"{section}.{key}"))
+                held.add((file_of(model), f"{section}.{key}"))
     assert sorted(held - listed) == []
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from lslam.config.backend import LoopsConfig
 from lslam.config.config import Config
-from lslam.config.loops import LoopsConfig
 from lslam.errors import InputError, UsageError
 from lslam.loops import create_descriptor
 from lslam.odometry import create_odometry, known_methods

@@ -17,14 +17,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.debug import DebugConfig
+from lslam.config.backend import DebugConfig
 from lslam.errors import InputError
 from lslam.evaluation.associate import associate
 from lslam.evaluation.frames import main_axis
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import noise, se3, so3
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

@@ -21,10 +21,10 @@ from lslam.graph.problem import PositionFix
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.preprocessing.ground import world_up_of
 from lslam.printable import counted
+from lslam.types.constraint import ControlPoint, ControlResidual
 from lslam.types.gnss import Georeference
-from lslam.types.keyframe import Keyframe
-from lslam.types.manual import ControlPoint, ControlResidual
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]

@@ -14,8 +14,8 @@ from lslam.geometry import geodesy, se3
 from lslam.graph.chi_square import quantile
 from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import plane_variances
+from lslam.types.constraint import ControlPoint
 from lslam.types.gnss import Georeference
-from lslam.types.manual import ControlPoint
 
 Floats = NDArray[np.float64]
 

@@ -18,9 +18,8 @@ from lslam.backend.fix_faults import (
     on_clock_of_scans,
     with_actual_sigmas,
 )
+from lslam.config.backend import GnssConfig, GraphConfig
 from lslam.config.config import Config
-from lslam.config.gnss import GnssConfig
-from lslam.config.graph import GraphConfig
 from lslam.errors import InputError
 from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.interpolate import poses_at
@@ -32,9 +31,9 @@ from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
 from lslam.preprocessing.ground import world_up_of
 from lslam.types.gnss import Georeference, GnssStream
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]

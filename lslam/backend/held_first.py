@@ -17,10 +17,9 @@ from lslam.graph.consistency import judge_loops
 from lslam.graph.odometry_constraints import odometry_constraints
 from lslam.graph.pose_graph import from_held
 from lslam.graph.problem import PoseGraph
-from lslam.types.constraint import Constraint, LoopCandidate
-from lslam.types.keyframe import Keyframe
-from lslam.types.manual import ControlPoint, KnownPair
+from lslam.types.constraint import Constraint, ControlPoint, KnownPair, LoopCandidate
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
 

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.graph.problem import FloorPlane, UpDirection
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import Z, levelling
 from lslam.stopping import checking
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

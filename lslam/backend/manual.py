@@ -15,11 +15,10 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.geometry.interpolate import poses_at
 from lslam.maps.georeference import to_wgs84
-from lslam.types.keyframe import Keyframe
-from lslam.types.manual import Instant, KnownPair, Manual, NamedPair
+from lslam.types.constraint import Instant, KnownPair, Manual, NamedPair
 from lslam.types.scan_result import ScanResult
-from lslam.types.selection import Selection
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Selection, Sequence
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 # Beyond the first and the last scan a control point's stamp is that of a pose only as far as seconds are rounded.

@@ -16,7 +16,7 @@ from lslam.formats.atomic import write_text
 from lslam.formats.stamp_texts import seconds_to_ns
 from lslam.formats.text_tables import separator_of, split_cells
 from lslam.geometry.crs_names import parse_crs
-from lslam.types.manual import ControlPoint, ControlResidual, Instant, NamedPair
+from lslam.types.constraint import ControlPoint, ControlResidual, Instant, NamedPair
 from lslam.untrusted import whole_number
 
 # What a run writes into the column is its own verdict, and says nothing here: its loops.csv can be edited and given back.

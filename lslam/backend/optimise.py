@@ -38,10 +38,9 @@ from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import up_of, world_up_of
 from lslam.stopping import checking
-from lslam.types.constraint import LoopCandidate, Turn
+from lslam.types.constraint import ControlPoint, LoopCandidate, Turn
 from lslam.types.gnss import Georeference
-from lslam.types.inertial_state import InertialChain
-from lslam.types.manual import ControlPoint
+from lslam.types.imu import InertialChain
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.stage_clock import KeyframeClocks

@@ -22,9 +22,8 @@ from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import EstimatedDrift, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.building import CorrectedMap, OsmMatches
-from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
+from lslam.types.constraint import Constraint, ControlPoint, ControlResidual, LoopCandidate, LoopStage, Verdict
 from lslam.types.gnss import Georeference
-from lslam.types.manual import ControlPoint, ControlResidual
 from lslam.types.run_record import LoopSurroundings, LoopView, RunRecord
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import KeyframeClocks

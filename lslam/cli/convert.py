@@ -123,9 +123,9 @@ def _open(source: str, given: dict[str, Any]) -> Sequence:
     from lslam.readers import open_sequence
 
     sequence = open_sequence(source, data_root=given["data_root"], **options.reading_of(given))
-    from lslam.config.preprocess import PreprocessConfig
+    from lslam.config.input import PreprocessConfig
     from lslam.frontend.point_times import with_point_times
-    from lslam.types.selection import select
+    from lslam.types.sequence import select
 
     sequence = with_point_times(sequence, PreprocessConfig(), is_stated_only=given["deskewed"] is None)
     return select(sequence, given["start"] or 0, given["count"], given["skip_frames"] or 1)

@@ -13,7 +13,7 @@ from lslam.evaluation.recipes import ALIGNMENTS, check_words, parse_delta
 from lslam.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:
-    from lslam.config.eval import EvalConfig
+    from lslam.config.outputs import EvalConfig
     from lslam.evaluation.results import Evaluation
     from lslam.evaluation.timing import Timing
     from lslam.types.sequence import Calibration
@@ -126,7 +126,7 @@ def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
     from pydantic import ValidationError
 
     from lslam.config import load_config
-    from lslam.config.eval import EvalConfig
+    from lslam.config.outputs import EvalConfig
 
     values = load_config(given["config_file"], given["settings"]).eval.model_dump() | flags
     for delta in values["delta"]:

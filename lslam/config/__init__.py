@@ -1,4 +1,4 @@
-"""Configuration: one frozen section per file, TOML in, resolved TOML out, unknown keys answered with the nearest name."""
+"""Configuration: one frozen model per section, TOML in, resolved TOML out, unknown keys answered with the nearest name."""
 
 from lslam.config.config import Config
 from lslam.config.load import load_config, to_described_toml, to_toml

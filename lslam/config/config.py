@@ -1,30 +1,33 @@
-"""The whole configuration."""
+"""The whole configuration, and the units of its keys."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from pydantic import model_validator
 
-from lslam.config.debug import DebugConfig
-from lslam.config.eval import EvalConfig
-from lslam.config.gnss import GnssConfig
-from lslam.config.graph import GraphConfig
-from lslam.config.imu import ImuConfig
-from lslam.config.input import InputConfig
-from lslam.config.keyframes import KeyframesConfig
-from lslam.config.lio_mapping import LioMappingConfig
-from lslam.config.lio_sam import LioSamConfig
-from lslam.config.loam import LoamConfig
-from lslam.config.localize import LocalizeConfig
-from lslam.config.loops import LoopsConfig
-from lslam.config.map import MapConfig
-from lslam.config.odometry import TIGHTLY_COUPLED, OdometryConfig
-from lslam.config.osm import OsmConfig
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.recovery import RecoveryConfig
-from lslam.config.registration import RegistrationConfig
-from lslam.config.report import ReportConfig
+from lslam.config.backend import (
+    DebugConfig,
+    GnssConfig,
+    GraphConfig,
+    KeyframesConfig,
+    LocalizeConfig,
+    LoopsConfig,
+    OsmConfig,
+)
+from lslam.config.input import InputConfig, PreprocessConfig
+from lslam.config.odometry import (
+    TIGHTLY_COUPLED,
+    ImuConfig,
+    LioMappingConfig,
+    LioSamConfig,
+    LoamConfig,
+    OdometryConfig,
+    RecoveryConfig,
+    RegistrationConfig,
+)
+from lslam.config.outputs import EvalConfig, MapConfig, ReportConfig
 from lslam.config.section import Section
 
 
@@ -65,3 +68,28 @@ class Config(Section):
             return given
         imu = given.get("imu", {})
         return {**given, "imu": {**(imu if isinstance(imu, dict) else imu.model_dump()), "use": True}}
+
+
+_UNIT = re.compile(r"((?:%|deg|rad|m2?|s)(?:/(?:100 m|m|s2?))?(?: per sqrt\((?:s|Hz)\))?); ")
+
+
+def unit_of(key: str) -> str:
+    """The unit of `section.key`; empty where it has none, or is no key.
+
+    >>> unit_of("map.voxel"), unit_of("graph.drift_deg_per_100m"), unit_of("input.skip_frames")
+    ('m', 'deg/100 m', '')
+    """
+    section, _, name = key.partition(".")
+    known = Config.model_fields.get(section)
+    fields = getattr(known.annotation, "model_fields", {}) if known else {}
+    found = _UNIT.match(fields[name].description or "") if name in fields else None
+    return found[1] if found else ""
+
+
+def with_unit(key: str, shown: str = "") -> str:
+    """A key, or what is shown in its place, as axes and columns name it.
+
+    >>> with_unit("map.voxel"), with_unit("map.voxel", "voxel"), with_unit("input.skip_frames")
+    ('map.voxel, m', 'voxel, m', 'input.skip_frames')
+    """
+    return ", ".join(filter(None, (shown or key, unit_of(key))))

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import OutputError, cause
-from lslam.extras import install_hint
-from lslam.foreign import importing
+from lslam.extras import importing, install_hint
 
 Shape = Literal["points", "lines", "polygons"]
 Value = int | float | str | datetime | None

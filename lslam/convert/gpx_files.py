@@ -7,8 +7,7 @@ from datetime import datetime
 from pathlib import Path
 
 from lslam.convert.kml_files import Place
-from lslam.extras import install_hint
-from lslam.foreign import importing
+from lslam.extras import importing, install_hint
 from lslam.formats.atomic import write_text
 from lslam.version import __version__
 

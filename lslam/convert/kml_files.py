@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
-from lslam.extras import install_hint
-from lslam.foreign import importing
+from lslam.extras import importing, install_hint
 from lslam.formats.atomic import write_text
 
 Place = tuple[float, float, float]

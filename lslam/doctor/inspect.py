@@ -7,7 +7,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.doctor.examine_bag import examine_bag
 from lslam.doctor.examine_gnss import examine_gnss
 from lslam.doctor.examine_imu import examine_imu

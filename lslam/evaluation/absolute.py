@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import UsageError, nearest
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
@@ -23,8 +23,7 @@ from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
 from lslam.geometry import se3, so3, umeyama
 from lslam.printable import fixed, metres, significant
-from lslam.types.comparison import Metric
-from lslam.types.table import Table
+from lslam.types.comparison import Metric, Table
 
 Floats = NDArray[np.float64]
 

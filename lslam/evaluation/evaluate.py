@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import InputError
 from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset

@@ -8,12 +8,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.metric import NO_ROTATIONS, Document, MatchedPoses, MetricRow, TrajectoryMetric
 from lslam.evaluation.results import Evaluation
 from lslam.printable import counted, significant
-from lslam.types.comparison import Metric
-from lslam.types.table import Table
+from lslam.types.comparison import Metric, Table
 
 Floats = NDArray[np.float64]
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)

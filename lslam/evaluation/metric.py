@@ -10,11 +10,10 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.results import Evaluation, Statistics
 from lslam.printable import significant
-from lslam.types.comparison import Metric
-from lslam.types.table import Table
+from lslam.types.comparison import Metric, Table
 
 Floats = NDArray[np.float64]
 Document = dict[str, Any]

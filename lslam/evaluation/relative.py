@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
     Document,
@@ -23,8 +23,7 @@ from lslam.evaluation.recipes import parse_delta
 from lslam.evaluation.results import Evaluation, RelativeError, describe
 from lslam.geometry import se3, so3
 from lslam.printable import metres
-from lslam.types.comparison import Metric
-from lslam.types.table import Table
+from lslam.types.comparison import Metric, Table
 
 Pairs = NDArray[np.int64]
 TOLERANCE = 0.1  # of the distance, for pairs that must be as far apart as asked

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 from lslam.evaluation.curves import curves_of, divergence, lost_above, median_over_seeds, optimum, over_seeds
 from lslam.evaluation.laws import FEWEST, fit_law, law_over
 from lslam.evaluation.verdicts_of_amounts import judge_acts_only_on, judge_law, judge_matters_little, judge_product
@@ -18,7 +18,7 @@ from lslam.evaluation.verdicts_of_places import (
     judge_holds_up_to,
     judge_largest_between,
 )
-from lslam.types.sensitivity import (
+from lslam.types.study import (
     Curve,
     CurveResult,
     FindingVerdict,
@@ -29,8 +29,8 @@ from lslam.types.sensitivity import (
     LawKind,
     Outcome,
     StudyResult,
+    StudyRow,
 )
-from lslam.types.study import StudyRow
 
 _OF_TIME = ("time_per_scan", "total_time")
 _LAWS = ("linear", "inverse", "product")

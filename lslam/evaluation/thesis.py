@@ -12,14 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.absolute import align
 from lslam.evaluation.metric import NO_ROTATIONS, MatchedPoses, MetricRow, TrajectoryMetric, two
 from lslam.evaluation.results import Evaluation, percent_of_length
 from lslam.geometry import so3
 from lslam.printable import fixed, metres, significant
-from lslam.types.comparison import Metric
-from lslam.types.table import Table
+from lslam.types.comparison import Metric, Table
 
 Floats = NDArray[np.float64]
 

@@ -6,10 +6,10 @@ from itertools import permutations
 
 import numpy as np
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 from lslam.evaluation.curves import NOT_REGISTRATION, contrast, over_seeds
 from lslam.evaluation.laws import FEWEST, law_over, rival
-from lslam.types.sensitivity import Bools, Curve, CurveResult, Floats, Judged, Law, Outcome
+from lslam.types.study import Bools, Curve, CurveResult, Floats, Judged, Law, Outcome
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them

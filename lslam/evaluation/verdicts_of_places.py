@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 from lslam.evaluation.curves import Rise, contrast, divergence, elbow, optimum, plateau, rise_at, rise_below
-from lslam.types.sensitivity import Curve, CurveResult, Floats, Judged, Optimum, Outcome
+from lslam.types.study import Curve, CurveResult, Floats, Judged, Optimum, Outcome
 
 BELOW: dict[Rise, str] = {
     "worse": "it is worse by more than the seeds scatter", "as good": "it is as good",

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
-from lslam.foreign import importing
+from lslam.extras import importing
 from lslam.formats.atomic import atomic_write
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.version import __version__

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.recovery import RecoveryConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RecoveryConfig
 from lslam.errors import InputError
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3

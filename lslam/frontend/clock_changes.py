@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.frontend.clock_agreement import FEWEST_SCANS, ClockWindow, compare_clocks, read_window
 from lslam.frontend.clock_choice import TURNS, ClockChoice
 from lslam.preprocessing.sweep_clock import SweepClock, is_same_motion

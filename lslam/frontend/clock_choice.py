@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.frontend.clock_agreement import SCANS, ClockWindow, compare_clocks, mean_score, read_window
 from lslam.preprocessing.clock_proposals import Proposal
 from lslam.preprocessing.sweep_clock import SweepClock, is_same_motion

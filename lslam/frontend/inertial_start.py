@@ -27,8 +27,7 @@ from lslam.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry import create_odometry
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
-from lslam.types.selection import Selection, select
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Selection, Sequence, select
 
 log = logging.getLogger("lslam")
 

@@ -11,11 +11,11 @@ from lslam.config import Config
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.select import KeyframeSelector
 from lslam.keyframes.store import KeyframeStore
-from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
+from lslam.types.trajectory import Keyframe
 
 # Scans that wait for their cloud at most, so that a slow disk does not fill the memory.
 WAITING = 3

@@ -18,7 +18,7 @@ from lslam.inertial.initialise import InertialStart
 from lslam.inertial.linked_motion import LinkedMotion
 from lslam.inertial.smoothing import SmootherMotion
 from lslam.inertial.window_motion import WindowMotion
-from lslam.types.inertial_state import SmootherNoise
+from lslam.types.imu import SmootherNoise
 
 
 def smoother_noise(noise: ImuNoise) -> SmootherNoise:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.config import Config
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.errors import InputError
 from lslam.frontend.clock_agreement import FEWEST_SCANS
 from lslam.frontend.clock_changes import later_choices
@@ -21,8 +21,7 @@ from lslam.preprocessing.merged_lidars import MergedLidars
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.preprocessing.views import Clocked
 from lslam.types.scan import Scan
-from lslam.types.selection import SequenceView, select
-from lslam.types.sequence import Sequence, StatedTimes
+from lslam.types.sequence import Sequence, SequenceView, StatedTimes, select
 
 log = logging.getLogger("lslam")
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InputError
 from lslam.frontend.checkpoints import OdometryCheckpoints
 from lslam.frontend.keyframing import Keyframing
@@ -30,8 +30,7 @@ from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.types.scan import FARTHEST_M, Scan, Span
 from lslam.types.scan_result import ScanResult
-from lslam.types.selection import Selection
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Selection, Sequence
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

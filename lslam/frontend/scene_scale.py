@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lslam.config import Config
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InputError
 from lslam.preprocessing.beams import ring_gap
 from lslam.types.sequence import Sequence

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.integrity.monitor import IntegrityMonitor

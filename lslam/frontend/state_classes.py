@@ -15,16 +15,18 @@ from lslam.odometry.plane_values import WindowValues
 from lslam.odometry.plane_window import Landmarks, PlaneWindow
 from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.preprocessing.prepare import PreparedPoints
-from lslam.types.constraint import Constraint, LoopCandidate
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu import ImuStream
-from lslam.types.imu_state import ImuDiagnostics, ImuState
-from lslam.types.inertial_state import InertialState, InertialStep
-from lslam.types.map_fix import MapFix
-from lslam.types.motion_check import MotionCheck
-from lslam.types.preintegration import MotionState, PreintegratedStep
-from lslam.types.scan_equations import ScanEquations
-from lslam.types.scan_result import ScanResult
+from lslam.types.constraint import Constraint, LoopCandidate, MapFix
+from lslam.types.imu import (
+    GravityDirection,
+    ImuDiagnostics,
+    ImuState,
+    ImuStream,
+    InertialState,
+    InertialStep,
+    MotionState,
+    PreintegratedStep,
+)
+from lslam.types.scan_result import MotionCheck, ScanEquations, ScanResult
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuDiagnostics, ImuNoise,

@@ -15,7 +15,7 @@ from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.sanity import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.solver import RegistrationResult
-from lslam.types.imu_state import ImuDiagnostics
+from lslam.types.imu import ImuDiagnostics
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
 from lslam.types.scan_result import ScanResult, Status

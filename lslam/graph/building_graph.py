@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se2, se3
 from lslam.graph import factors
 from lslam.graph.chi_square import quantile

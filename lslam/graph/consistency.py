@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PoseGraph

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.graph.preintegration import preintegrated
-from lslam.types.inertial_state import InertialChain
+from lslam.types.imu import InertialChain
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from lslam.formats.state_files import Records
 from lslam.geometry import noise, se3
 from lslam.graph.factors import well_conditioned
 from lslam.graph.preintegration import preintegrated
-from lslam.types.inertial_state import InertialState, InertialStep, SmootherNoise
+from lslam.types.imu import InertialState, InertialStep, SmootherNoise
 from lslam.types.state import State
 
 Floats = NDArray[np.float64]

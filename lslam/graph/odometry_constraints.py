@@ -9,13 +9,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.drift import drift_covariance
 from lslam.graph.factors import PLANAR
 from lslam.types.constraint import Constraint
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

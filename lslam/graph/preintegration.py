@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.types.inertial_state import InertialStep, SmootherNoise
+from lslam.types.imu import InertialStep, SmootherNoise
 
 Floats = NDArray[np.float64]
 

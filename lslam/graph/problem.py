@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.types.constraint import Constraint, LoopStage, Turn
-from lslam.types.inertial_state import InertialChain
+from lslam.types.imu import InertialChain
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3
 from lslam.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu_state import ImuState
+from lslam.types.imu import GravityDirection, ImuState
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.state import State, Stateful

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import noise
 from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.fusion import InertialMotion

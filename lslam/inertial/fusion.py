@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import se3
 from lslam.inertial.constant_velocity import ConstantVelocity, middle_of
 from lslam.inertial.gyroscope import Gyroscope
@@ -20,9 +20,7 @@ from lslam.kernels import kalman
 from lslam.kernels.rotation import apart, vector_between
 from lslam.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu import ImuStream
-from lslam.types.imu_state import ImuState
+from lslam.types.imu import GravityDirection, ImuState, ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.state import State, Stateful

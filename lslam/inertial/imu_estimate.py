@@ -17,8 +17,7 @@ from lslam.inertial.integrate import Increments, integrate
 from lslam.inertial.kalman import OUTLIER
 from lslam.kernels import kalman
 from lslam.kernels.rotation import vector_between
-from lslam.types.imu import ImuStream
-from lslam.types.imu_state import ImuState
+from lslam.types.imu import ImuState, ImuStream
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 
 # rad/s per sqrt(Hz), least noise density; rad/s per sqrt(s), random walk of the bias: that of Kalibr's
 # ADIS16448. Ten times more, and turns over more than some seconds were registration's again, with all its noise.

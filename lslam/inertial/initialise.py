@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.inertial.gyroscope import Gyroscope
 from lslam.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import se3
 from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.filter import FilterMotion
@@ -18,9 +18,8 @@ from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cut_noise, process_noise, transition
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.solver import RegistrationResult
-from lslam.types.imu import ImuStream
+from lslam.types.imu import ImuStream, MotionState, PreintegratedStep, SweepLink
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.preintegration import MotionState, PreintegratedStep, SweepLink
 from lslam.types.scan import Span
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.errors import GraphError
 from lslam.geometry import noise, se3
 from lslam.inertial.constant_velocity import middle_of
@@ -19,8 +19,7 @@ from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.integrate import Increments
 from lslam.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.solver import RegistrationResult
-from lslam.types.imu import ImuStream
-from lslam.types.inertial_state import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
+from lslam.types.imu import ImuStream, InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
 from lslam.types.state import State

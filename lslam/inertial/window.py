@@ -21,7 +21,7 @@ from lslam.inertial.navigation_state import GYRO, OWN, REST, NavigationState, cu
 from lslam.kernels import positive
 from lslam.kernels.rotation import vector_between
 from lslam.types.imu import ImuStream
-from lslam.types.scan_equations import ScanEquations
+from lslam.types.scan_result import ScanEquations
 
 Floats = NDArray[np.float64]
 

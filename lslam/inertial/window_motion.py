@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import noise, se3
 from lslam.inertial.constant_velocity import middle_of
 from lslam.inertial.filter import FilterMotion
@@ -20,7 +20,7 @@ from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Span
-from lslam.types.scan_equations import ScanEquations
+from lslam.types.scan_result import ScanEquations
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3
 from lslam.integrity.directions import MOST_EMPTIED
 from lslam.integrity.pair_registration import is_within
-from lslam.types.motion_check import SAME_M, SAME_RAD, USUAL, MotionCheck
+from lslam.types.scan_result import SAME_M, SAME_RAD, USUAL, MotionCheck
 
 Floats = NDArray[np.float64]
 

@@ -7,17 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3
 from lslam.integrity.directions import emptied, filled_directions
 from lslam.integrity.pair_registration import PairRegistration, best_of, is_near, is_within, median_range
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points, thin
 from lslam.registration.robust import UsualAgreement
-from lslam.types.motion_check import MotionCheck
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
+from lslam.types.scan_result import MotionCheck, ScanResult
 from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]

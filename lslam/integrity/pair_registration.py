@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3
 from lslam.integrity.directions import directions, filled_directions
 from lslam.preprocessing.prepare import PreparedPoints
@@ -19,7 +19,7 @@ from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
 from lslam.registration.residuals import PLANE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
-from lslam.types.motion_check import SAME_M, SAME_RAD, motion_apart
+from lslam.types.scan_result import SAME_M, SAME_RAD, motion_apart
 
 Floats = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.keyframes import KeyframesConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.backend import KeyframesConfig
+from lslam.config.input import PreprocessConfig
 from lslam.kernels import voxel
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import NO_TIMES, as_cloud, gate_points

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import submap
 from lslam.preprocessing.ground import Z, world_up_of

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.keyframes import KeyframesConfig
+from lslam.config.backend import KeyframesConfig
 from lslam.geometry import se3, so3
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
+from lslam.types.trajectory import Keyframe
 
 
 class KeyframeSelector(Stateful):

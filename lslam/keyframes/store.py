@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
 from lslam.formats.state_files import pack_npz, read_npz, write_npz
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 Points = NDArray[np.float32]
 

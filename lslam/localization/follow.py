@@ -21,7 +21,7 @@ from lslam.registration.attempt import NEAR_KERNEL
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-from lslam.types.map_fix import FixStatus, MapFix
+from lslam.types.constraint import FixStatus, MapFix
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.localization.prior_map import PriorMap
 from lslam.loops.bev_correlation import CELL, BevGrid, Image, Spectrum, blurred, correlate, spectrum

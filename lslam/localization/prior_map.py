@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InputError
 from lslam.geometry import se3
 from lslam.kernels.transform import transform

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import geodesy, noise, se3
 from lslam.graph.odometry_constraints import positive
 from lslam.kernels import voxel
@@ -24,8 +24,8 @@ from lslam.preprocessing.prepare import NO_TIMES
 from lslam.preprocessing.up import ahead_of
 from lslam.types.constraint import Constraint
 from lslam.types.gnss import Georeference
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 from lslam.plugins import factory, require
 
 if TYPE_CHECKING:
-    from lslam.config.loops import LoopsConfig
+    from lslam.config.backend import LoopsConfig
     from lslam.loops.descriptor import PlaceDescriptor
 
 GROUP = "lslam.descriptors"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 
 def resolve_ambiguity(

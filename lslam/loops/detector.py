@@ -13,8 +13,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InterruptedRunError
 from lslam.geometry import se3, so3
 from lslam.kernels.transform import transform
@@ -29,10 +29,9 @@ from lslam.loops.throttling import LoopThrottle
 from lslam.loops.verify import Verification, Verifier
 from lslam.loops.working_memory import WorkingMemory
 from lslam.preprocessing.ground import Z
-from lslam.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
-from lslam.types.keyframe import Keyframe
-from lslam.types.manual import KnownPair
+from lslam.types.constraint import Constraint, KnownPair, LoopCandidate, LoopStage, Verdict
 from lslam.types.stage_clock import KeyframeClocks, StageClock
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InterruptedRunError
 from lslam.kernels.transform import transform
 from lslam.keyframes.store import KeyframeStore
@@ -20,10 +20,9 @@ from lslam.loops.gating import OdometryUncertainty
 from lslam.loops.level_submap import make_level_submap
 from lslam.loops.verify import Verifier
 from lslam.preprocessing.ground import Z
-from lslam.types.constraint import LoopCandidate, LoopStage
-from lslam.types.keyframe import Keyframe
-from lslam.types.manual import KnownPair
+from lslam.types.constraint import KnownPair, LoopCandidate, LoopStage
 from lslam.types.stage_clock import KeyframeClocks
+from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import so3
 from lslam.kernels import gating
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from lslam.geometry import se3, so3
 from lslam.preprocessing.ground import Z
 from lslam.preprocessing.up import NEAR_Z
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

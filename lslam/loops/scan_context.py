@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
+from lslam.config.backend import LoopsConfig
 from lslam.kernels.polar_image import polar_image
 from lslam.loops.descriptor import PlaceMatch
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops.level_submap import LevelSubmap
 from lslam.loops.search import LARGE, SHARED, find_initial_guesses

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.foreign import importing_open3d
+from lslam.extras import importing_open3d
 from lslam.types.cloud import ArrayCloud
 
 NEIGHBOURS, DEVIATIONS = 20, 2.0

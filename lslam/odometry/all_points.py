@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt

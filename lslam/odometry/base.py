@@ -12,8 +12,7 @@ from lslam.preprocessing.features import Features
 from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
-from lslam.types.scan_equations import ScanEquations
-from lslam.types.scan_result import ScanResult
+from lslam.types.scan_result import ScanEquations, ScanResult
 from lslam.types.state import State
 
 

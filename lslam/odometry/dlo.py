@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lslam.config.config import Config
-from lslam.config.recovery import NO_RECOVERY
+from lslam.config.odometry import NO_RECOVERY
 from lslam.odometry.icp import Icp, registration_of
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints

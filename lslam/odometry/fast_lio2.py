@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.recovery import rest_alone
+from lslam.config.odometry import rest_alone
 from lslam.odometry.icp import Icp, registration_of
 from lslam.types.motion_prior import MotionPrior
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loam import LoamConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import LoamConfig, RegistrationConfig
 from lslam.geometry import se3
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, thinned

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.recovery import RecoveryConfig
+from lslam.config.odometry import RecoveryConfig
 from lslam.errors import UsageError
 from lslam.odometry.keyframe_submap import KeyframeSubmap
 from lslam.odometry.scan_outcome import recorded

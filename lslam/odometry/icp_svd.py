@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lslam.config.config import Config
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3, umeyama
 from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.preprocess import PreprocessConfig
-from lslam.foreign import importing
+from lslam.config.input import PreprocessConfig
+from lslam.extras import importing
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import gate_points
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.recovery import rest_alone
+from lslam.config.odometry import rest_alone
 from lslam.geometry import normal_equations
 from lslam.odometry.fast_lio2 import FastLio2
 from lslam.odometry.icp import registration_of
@@ -16,7 +16,7 @@ from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan_equations import ScanEquations
+from lslam.types.scan_result import ScanEquations
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from lslam.config.config import Config
-from lslam.config.recovery import rest_alone
+from lslam.config.odometry import rest_alone
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
 from lslam.odometry.loam import Loam

@@ -23,8 +23,8 @@ from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.acceptance import correction
 from lslam.registration.solver import RegistrationResult
+from lslam.types.imu import SweepLink
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.preintegration import SweepLink
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import StageClock

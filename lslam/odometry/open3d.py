@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
-from lslam.foreign import importing_open3d
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
+from lslam.extras import importing_open3d
 from lslam.geometry import se3
 from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import clean_points

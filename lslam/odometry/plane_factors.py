@@ -11,7 +11,7 @@ from lslam.geometry import so3
 from lslam.geometry.normal_equations import Normal
 from lslam.odometry import closest_point
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-from lslam.types.preintegration import PreintegratedStep
+from lslam.types.imu import PreintegratedStep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

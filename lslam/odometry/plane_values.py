@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.types.preintegration import MotionState
+from lslam.types.imu import MotionState
 
 Floats = NDArray[np.float64]
 

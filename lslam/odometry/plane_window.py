@@ -12,7 +12,7 @@ from lslam.geometry.normal_equations import Normal
 from lslam.kernels import positive
 from lslam.odometry.plane_factors import Sightings, WindowPrior, normal_equations, step_residual
 from lslam.odometry.plane_values import ORDER, PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-from lslam.types.preintegration import MotionState, PreintegratedStep
+from lslam.types.imu import MotionState, PreintegratedStep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

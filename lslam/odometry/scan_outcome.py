@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3
 from lslam.registration.acceptance import Acceptance, failed
 from lslam.registration.solver import RegistrationResult

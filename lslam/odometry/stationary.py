@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.acceptance import Acceptance

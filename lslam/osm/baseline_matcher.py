@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.outcome import Given
 from lslam.config import Config
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.building_graph import JointSolution, optimise_jointly

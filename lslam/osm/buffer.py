@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import InputError, LslamError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_buildings import buildings_of

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.formats.osm_data import OsmData
 from lslam.formats.osm_files import write_osm
 from lslam.geometry import se2

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.backend.georeferencing import Placement, on_earth
 from lslam.backend.outcome import BackEnd, Given, solve
 from lslam.config import Config
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import GraphError, InputError
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from lslam.backend.inputs import floor_planes
 from lslam.backend.levelling import UP
 from lslam.config import Config
-from lslam.config.graph import GraphConfig
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import GraphConfig, OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3, so3
 from lslam.graph.chi_square import quantile

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_files import GaveUpError

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.geometry import se2
 from lslam.osm.wall_match import WINDOW, WallMatch, match_walls
 from lslam.osm.walls import OsmMap, find_walls

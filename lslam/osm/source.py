@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import require_crs
 from lslam.config import Config
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
 from lslam.formats.osm_data import OsmData

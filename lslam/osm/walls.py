@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.kernels import ground, segments
 from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
 

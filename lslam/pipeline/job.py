@@ -38,10 +38,9 @@ from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_streams
 from lslam.stopping import asking
-from lslam.types.manual import Manual
+from lslam.types.constraint import Manual
 from lslam.types.scan import Span
-from lslam.types.selection import select
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, select
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")

@@ -32,12 +32,12 @@ from lslam.pipeline.prior_map_files import read_prior_map
 from lslam.pipeline.watch import Watch
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
-from lslam.types.keyframe import Keyframe
-from lslam.types.map_fix import MapFix
+from lslam.types.constraint import MapFix
 from lslam.types.run_record import RunRecord
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
+from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]

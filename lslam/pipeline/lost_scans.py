@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3
 from lslam.integrity.alerts import LARGE, Alert, alerts, stamp_faults
 from lslam.pipeline.manifest import Manifest
-from lslam.types.motion_check import MotionCheck, motion_apart
-from lslam.types.scan_result import ScanResult
+from lslam.types.scan_result import MotionCheck, ScanResult, motion_apart
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
-from lslam.config.map import MapConfig
+from lslam.config.outputs import MapConfig
 from lslam.errors import InputError, InterruptedRunError
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead

@@ -47,7 +47,7 @@ from lslam.pipeline.precompile import helped
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.pipeline.segments import checks_within, join_segments
 from lslam.types.constraint import Turn
-from lslam.types.inertial_state import InertialChain
+from lslam.types.imu import InertialChain
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.config import Config, to_toml
-from lslam.config.map import MapConfig
+from lslam.config.outputs import MapConfig
 from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.ply_files import write_ply
 from lslam.formats.trajectory_files import write_kitti, write_tum

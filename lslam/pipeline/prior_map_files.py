@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import ConfigError, InputError, UsageError
 from lslam.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
 from lslam.localization.prior_map import PriorMap, make_prior_map

@@ -54,8 +54,7 @@ from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference, OutputCrs
 from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
-from lslam.types.selection import select
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, select
 from lslam.types.trajectory import Trajectory
 from lslam.untrusted import MISFIT, parse_json
 

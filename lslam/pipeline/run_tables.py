@@ -15,7 +15,7 @@ from lslam.evaluation.timing import AFTER, SAVED
 from lslam.formats.atomic import write_text
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import LoopCandidate
-from lslam.types.imu_state import IMU_STATES
+from lslam.types.imu import IMU_STATES
 from lslam.types.scan_result import ScanResult
 
 LOOP_COLUMNS = (

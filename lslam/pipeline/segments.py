@@ -18,9 +18,8 @@ from lslam.localization.sessions import Chain, Session, Vicinity, tie
 from lslam.localization.start import is_elsewhere
 from lslam.loops.detector import LEAST_REACH
 from lslam.pipeline.manifest import Manifest
-from lslam.types.motion_check import MotionCheck
-from lslam.types.scan_result import ScanResult
-from lslam.types.segment import Segment
+from lslam.types.scan_result import MotionCheck, ScanResult
+from lslam.types.trajectory import Segment
 
 log = logging.getLogger("lslam")
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loam import LoamConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import LoamConfig
 from lslam.errors import InputError
 from lslam.geometry import so3
 from lslam.kernels import curvature

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.errors import InputError
 from lslam.preprocessing.views import with_rings
 from lslam.types.scan import NO_RING, Scan, Span
-from lslam.types.selection import SequenceView
-from lslam.types.sequence import Sequence, readable
+from lslam.types.sequence import Sequence, SequenceView, readable
 
 # More than any LiDAR has: the rings of the k-th one begin at k times this.
 RINGS_APART = 512

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loam import LoamConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import LoamConfig
 from lslam.errors import InputError
 from lslam.kernels import curvature, petals
 from lslam.preprocessing.features import (

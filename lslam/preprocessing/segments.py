@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.loam import LoamConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import LoamConfig
 from lslam.kernels import range_image
 from lslam.preprocessing.features import (
     MAY_BE_EDGE,

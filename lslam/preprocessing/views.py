@@ -14,8 +14,7 @@ from lslam.errors import InputError
 from lslam.preprocessing.rings import RingRule, decide_rings
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.types.scan import NO_RING, Scan
-from lslam.types.selection import SequenceView
-from lslam.types.sequence import Sequence, readable
+from lslam.types.sequence import Sequence, SequenceView, readable
 
 log = logging.getLogger("lslam")
 # Scans the rule is decided on: the first that can be read.

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.history import History
 from lslam.registration.robust import Annealing

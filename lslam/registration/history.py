@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.registration.rest import Rest
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult

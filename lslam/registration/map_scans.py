@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.recovery import RecoveryConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.errors import InputError
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points

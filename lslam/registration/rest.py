@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.ground import ground_of, up_of
 from lslam.registration.alignment import upright_directions

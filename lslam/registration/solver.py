@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.kernels import prior_residual
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
@@ -24,8 +24,8 @@ from lslam.registration.optimiser import (
 )
 from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
+from lslam.types.imu import MotionState
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.preintegration import MotionState
 
 Floats = NDArray[np.float64]
 

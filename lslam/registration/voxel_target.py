@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.preprocessing.beams import ring_gap
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.alignment import MapAlignment

@@ -15,8 +15,8 @@ from lslam.reports.crops import PIXELS, Crop, crop_images
 from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart
+from lslam.types.comparison import Table
 from lslam.types.run_record import LoopView, RunRecord
-from lslam.types.table import Table
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

@@ -15,8 +15,8 @@ from lslam.printable import counted
 from lslam.reports.plots import Figure
 from lslam.reports.svg import MOST_POINTS, Track, plane_chart
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
+from lslam.types.comparison import Table
 from lslam.types.run_record import RunRecord
-from lslam.types.table import Table
 
 Floats = NDArray[np.float64]
 

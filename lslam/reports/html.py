@@ -22,8 +22,8 @@ from lslam.reports.page_data import cloud_data, scan_data
 from lslam.reports.shell import RUN, render, template
 from lslam.reports.svg import Track
 from lslam.reports.text import imu_rows
+from lslam.types.comparison import Table
 from lslam.types.run_record import Crispness, RunRecord
-from lslam.types.table import Table
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

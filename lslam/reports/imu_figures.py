@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.reports import svg
 from lslam.reports.plots import Figure
-from lslam.types.imu_state import XYZ
+from lslam.types.imu import XYZ
 from lslam.types.run_record import RunRecord
 
 Floats = NDArray[np.float64]

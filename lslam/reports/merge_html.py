@@ -21,7 +21,7 @@ from lslam.reports.plots import Figure
 from lslam.reports.shell import RUN, render
 from lslam.reports.svg import Track, plane_chart
 from lslam.types.cloud import ArrayCloud
-from lslam.types.table import Table
+from lslam.types.comparison import Table
 
 Floats = NDArray[np.float64]
 MOST_POSES = 5000  # of a session that the script draws

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import OutputError, cause
-from lslam.extras import install_hint
-from lslam.foreign import importing
+from lslam.extras import importing, install_hint
 from lslam.types.cloud import ArrayCloud
 from lslam.types.trajectory import Trajectory
 

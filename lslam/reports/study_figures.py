@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.units import unit_of, with_unit
+from lslam.config.config import unit_of, with_unit
 from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
 from lslam.reports.picture_points import PicturePoint, picture_points
-from lslam.types.sensitivity import CurveResult, Floats, Law, StudyResult
-from lslam.types.study import StudyRow
+from lslam.types.study import CurveResult, Floats, Law, StudyResult, StudyRow
 
 # Of section 5.3, by studied parameter and figure.
 THESIS = {

@@ -15,8 +15,7 @@ from lslam.reports.grid_text import comma_separated
 from lslam.reports.shell import render
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_table import means_grid, study_recipes, study_tables
-from lslam.types.sensitivity import StudyResult
-from lslam.types.study import StudyRow
+from lslam.types.study import StudyResult, StudyRow
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.recipes import ALIGNMENTS

@@ -12,7 +12,7 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import InputError
 from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.timing import Timing, read_timing

@@ -7,8 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.config.finding import ExpectedFinding
-from lslam.config.study import StudyConfig, read_study
+from lslam.config.study import ExpectedFinding, StudyConfig, read_study
 from lslam.errors import InputError, RunFailedError
 from lslam.printable import toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
@@ -19,8 +18,7 @@ from lslam.studies.results import RESULTS
 from lslam.studies.results_csv import read_study_csv
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
-from lslam.types.sensitivity import StudyResult
-from lslam.types.study import StudyRow
+from lslam.types.study import StudyResult, StudyRow
 
 log = logging.getLogger("lslam")
 

@@ -34,8 +34,7 @@ from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
 from lslam.studies.states import State, write_state
 from lslam.types.scan import Scan
-from lslam.types.selection import SequenceView
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, SequenceView
 
 # Bytes of scans a process keeps at most, and its share of what was free when it began.
 _MOST, _SHARE = 2 * 10**9, 0.2

@@ -1,4 +1,4 @@
-"""A comparison of methods: plain values that tables, files and the page are written from."""
+"""A table of texts, and a comparison of methods: plain values that reports, files and the page are written from."""
 
 from __future__ import annotations
 
@@ -11,6 +11,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts under a header; the first column is the name. `recipe` says how the numbers came about."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    recipe: str
+
+
 Group = Literal["error", "time", "health"]
 USABLE = ("done", "degraded")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry.interpolate import poses_at
-from lslam.types.preintegration import SweepLink
+from lslam.types.imu import SweepLink
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 
 from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.cloud import ArrayCloud
-from lslam.types.constraint import LoopCandidate, Turn
+from lslam.types.constraint import LoopCandidate, MapFix, Turn
 from lslam.types.gnss import Georeference
-from lslam.types.imu import ImuStream
-from lslam.types.inertial_state import InertialChain
-from lslam.types.map_fix import MapFix
-from lslam.types.motion_check import MotionCheck
-from lslam.types.scan_result import ScanResult
+from lslam.types.imu import ImuStream, InertialChain
+from lslam.types.scan_result import MotionCheck, ScanResult
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

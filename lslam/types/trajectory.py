@@ -1,4 +1,4 @@
-"""A stamped sequence of poses."""
+"""Stamped poses of a run, its keyframes, and its segments."""
 
 from __future__ import annotations
 
@@ -52,3 +52,47 @@ class Trajectory:
             poses=self.poses[index],
             covariances=None if self.covariances is None else self.covariances[index],
         )
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A node of the pose graph; its cloud lies in the keyframe store.
+
+    number : 0, 1, 2, ... among the keyframes
+    scan : position of its scan among the scans of the run (not the scan's number in the recording)
+    T_world_lidar : (4, 4) odometry pose at the scan's stamp
+    covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2, or None
+    distance : m travelled since the start of the run
+    """
+
+    number: int
+    scan: int
+    stamp_ns: int
+    T_world_lidar: NDArray[np.float64]
+    covariance: NDArray[np.float64] | None = None
+    distance: float = 0.0
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Consecutive scans of one local map.
+
+    first, last : numbers of its scans in the recording; scans, registered : how many there are
+    frame : of the coordinates of its poses, 0 for those of the trajectory
+    tied_by : what ties it to the segments before it in its frame, in words; empty for the first of a frame
+    reason : why nothing does, empty where something does or nothing is needed
+    """
+
+    number: int
+    first: int
+    last: int
+    scans: int
+    registered: int
+    frame: int = 0
+    tied_by: str = ""
+    reason: str = ""
+
+    @property
+    def span(self) -> str:
+        """Its scans in words."""
+        return f"scan {self.first}" if self.first == self.last else f"scans {self.first} to {self.last}"

@@ -22,11 +22,10 @@ from lslam.geometry.umeyama import align
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gnss import GnssStream
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu_state import ImuDiagnostics
-from lslam.types.keyframe import Keyframe
+from lslam.types.imu import GravityDirection, ImuDiagnostics
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Calibration
+from lslam.types.trajectory import Keyframe
 
 # Two laps of 400 m, a scan each metre, a keyframe every other scan.
 Floats = NDArray[np.float64]

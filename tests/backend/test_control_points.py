@@ -14,10 +14,10 @@ from lslam.config import Config
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.maps.georeference import Projection, to_wgs84
+from lslam.types.constraint import ControlPoint, Instant
 from lslam.types.gnss import Georeference
-from lslam.types.keyframe import Keyframe
-from lslam.types.manual import ControlPoint, Instant
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 ORIGIN = np.array([49.0112, 8.4229, 115.0])
 TRUE = Georeference(ORIGIN, se3.make(so3.exp(np.array([0.0, 0.0, 0.7])), np.array([30.0, -12.0, 2.0])), 25832)

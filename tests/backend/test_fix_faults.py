@@ -16,9 +16,9 @@ from lslam.graph.fix_errors import NO_HEIGHT
 from lslam.graph.odometry_constraints import odometry_constraints
 from lslam.graph.problem import PoseGraph
 from lslam.types.gnss import GnssStream
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Calibration
+from lslam.types.trajectory import Keyframe
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 COUNT = 400

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from lslam.backend.inputs import floor_planes, up_directions, world_up
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu_state import ImuDiagnostics
-from lslam.types.keyframe import Keyframe
+from lslam.types.imu import GravityDirection, ImuDiagnostics
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 
 def ground(height: float, tilt: float = 0.0) -> np.ndarray:

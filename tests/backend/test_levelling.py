@@ -15,8 +15,7 @@ from lslam.config import Config, load_config
 from lslam.evaluation.evaluate import evaluate
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se3, so3
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu_state import ImuDiagnostics
+from lslam.types.imu import GravityDirection, ImuDiagnostics
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Trajectory

@@ -13,9 +13,8 @@ from lslam.geometry import se3
 from lslam.keyframes.store import KeyframeStore
 from lslam.reports.back_end import loop_figures
 from lslam.types.constraint import Constraint, LoopCandidate, Verdict
-from lslam.types.keyframe import Keyframe
 from lslam.types.run_record import RunRecord
-from lslam.types.trajectory import Trajectory
+from lslam.types.trajectory import Keyframe, Trajectory
 
 COUNT, DRIFT, WALL = 60, 0.05, 7.0
 SOLVED = BackEnd([], [], constraints=[Constraint(0, 1, np.eye(4), np.eye(6))])

@@ -18,7 +18,7 @@ import tables
 
 from lslam.studies.study_files import find_study, study_names
 from lslam.studies.sweep import report_folder
-from lslam.types.sensitivity import StudyResult
+from lslam.types.study import StudyResult
 
 
 def swept(study: str, seeds: list[int], folder: Path) -> list[StudyResult]:

@@ -16,18 +16,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.keyframes import KeyframesConfig
-from lslam.config.loops import LoopsConfig
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import KeyframesConfig, LoopsConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.cloud import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.find_loops import find_loops
 from lslam.loops.scan_context import PlaceIndex
 from lslam.simulation.scenarios import simulate
-from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

@@ -16,9 +16,8 @@ from time import thread_time
 import numpy as np
 from osm import SPACING, true_poses
 
-from lslam.config.keyframes import KeyframesConfig
-from lslam.config.osm import OsmConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.backend import KeyframesConfig, OsmConfig
+from lslam.config.input import PreprocessConfig
 from lslam.formats.osm_buildings import read_buildings
 from lslam.geometry import se2
 from lslam.keyframes.cloud import keyframe_cloud
@@ -28,8 +27,8 @@ from lslam.osm.prior import match_buildings, match_keyframe, warm_up
 from lslam.osm.walls import OsmMap
 from lslam.readers import open_sequence
 from lslam.types.building import KeyframeMatch
-from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
+from lslam.types.trajectory import Keyframe
 
 SIGMA = np.array([0.7, 0.7, np.radians(1.5)])
 LIMITS = {"wall extraction": 20.0, "global match": 50.0, "local match": 1.0}

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.frontend.point_times import with_point_times
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate

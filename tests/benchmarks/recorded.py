@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import estimate

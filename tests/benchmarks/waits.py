@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.maps.merge import MapMerger
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 
 
 def test_finding_reads_what_a_study_file_says() -> None:

@@ -7,8 +7,7 @@ import re
 import pytest
 from pages import page
 
-from lslam.config.config import Config
-from lslam.config.units import unit_of
+from lslam.config.config import Config, unit_of
 
 KEYS = {
     f"{section}.{key}": field.description or ""

@@ -27,8 +27,7 @@ from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import GnssModel
 from lslam.types.scan import Scan
-from lslam.types.selection import select
-from lslam.types.sequence import Calibration, Sequence
+from lslam.types.sequence import Calibration, Sequence, select
 
 NAMES = {"bag": "a.bag", "mcap": "a.mcap", "sqlite": "a"}
 

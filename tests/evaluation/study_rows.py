@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.types.sensitivity import FindingVerdict
-from lslam.types.study import StudyRow
+from lslam.types.study import FindingVerdict, StudyRow
 
 Formula = Callable[[float], float]
 

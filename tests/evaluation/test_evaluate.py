@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from evaluation_drives import disturb
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import InputError
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cli.calling import lslam
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import InputError
 from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory, write_tum

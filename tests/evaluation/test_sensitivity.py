@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from study_rows import rows_of
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 from lslam.evaluation.curves import curves_of, divergence, elbow, lost_above, optimum, registration_ms
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.types.study import StudyRow

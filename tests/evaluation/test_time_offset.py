@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cli.calling import lslam
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.time_offset import fit_offset
 from lslam.formats.trajectory_files import write_tum

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.errors import InputError
 from lslam.frontend.clock_changes import later_choices
 from lslam.frontend.clock_choice import ClockChoice
@@ -23,8 +23,7 @@ from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan import Scan
-from lslam.types.selection import SequenceView
-from lslam.types.sequence import StatedTimes
+from lslam.types.sequence import SequenceView, StatedTimes
 
 Change = Callable[[Scan], Scan]
 LIDAR = dataclasses.replace(LIDARS["vlp16"], columns=900)

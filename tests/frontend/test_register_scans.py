@@ -17,7 +17,7 @@ from lslam.odometry import create_odometry
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult, Status
-from lslam.types.selection import select
+from lslam.types.sequence import select
 
 
 def outcomes(*runs: tuple[Status, int]) -> list[ScanResult]:

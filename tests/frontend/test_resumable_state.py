@@ -25,7 +25,7 @@ from lslam.preprocessing.views import with_rings
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.imu_state import ImuDiagnostics
+from lslam.types.imu import ImuDiagnostics
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence

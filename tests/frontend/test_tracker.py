@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from graph_builders import STEP_SIGMAS, ate, graph_of, measured, truth
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.graph.drift import correct_drift, drift_factor, with_drift
 from lslam.graph.pose_graph import optimise, with_distances

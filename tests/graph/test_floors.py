@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.inputs import on_one_plane
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.graph.problem import FloorPlane
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from graph_builders import LOOP_SIGMAS, ate, graph_of, measured, truth
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.graph import factors
 from lslam.graph.pose_graph import optimise

@@ -9,7 +9,7 @@ import pytest
 from graph_builders import ate, measured
 from numpy.typing import NDArray
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.factors import fixed_part
 from lslam.graph.inertial_smoother import InertialSmoother
@@ -17,9 +17,9 @@ from lslam.graph.odometry_constraints import odometry_constraints
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph, PositionFix, UpDirection
 from lslam.types.constraint import Constraint
-from lslam.types.inertial_state import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
-from lslam.types.keyframe import Keyframe
+from lslam.types.imu import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

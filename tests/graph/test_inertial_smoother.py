@@ -14,7 +14,7 @@ from lslam.formats.state_files import read_state, write_state
 from lslam.frontend.state_classes import STATE_CLASSES
 from lslam.geometry import se3, so3
 from lslam.graph.inertial_smoother import InertialSmoother
-from lslam.types.inertial_state import InertialState, InertialStep, SmootherNoise
+from lslam.types.imu import InertialState, InertialStep, SmootherNoise
 
 Floats = NDArray[np.float64]
 

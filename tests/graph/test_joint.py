@@ -10,7 +10,7 @@ from graph_builders import STEP_SIGMAS, measured
 from numpy.typing import NDArray
 from test_building_graph import across
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se2, se3, so3
 from lslam.graph import building_graph, solve

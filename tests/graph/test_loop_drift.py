@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from lslam.backend.added_drift import with_drift
-from lslam.config.debug import DebugConfig
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import DebugConfig, GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se3, so3
 from lslam.graph import loop_drift

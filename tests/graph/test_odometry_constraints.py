@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from graph_builders import STEP_SIGMAS, measured, truth
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.odometry_constraints import corrected, fitness_covariance, fitness_score, growth, odometry_constraints
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 POSES = truth(60, 1)
 OWN = np.diag([1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from graph_builders import graph_of, truth
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se2, se3
 from lslam.graph import factors
 from lslam.graph.drift import drift_factor

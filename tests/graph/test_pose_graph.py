@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from graph_builders import LOOP_SIGMAS, ate, graph_of, measured, truth
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import se3, so3
 from lslam.graph.pose_graph import optimise

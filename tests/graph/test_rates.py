@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.graph.drift import MEMORY, linear_basis, rate_roots, walk_root
 
 CONFIG = GraphConfig(drift_percent=2.0, drift_deg_per_100m=0.25)

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.errors import GraphError
 from lslam.graph.solve import marginal_blocks, refine, solve, solve_incrementally
 

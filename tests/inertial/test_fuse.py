@@ -7,7 +7,7 @@ import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start

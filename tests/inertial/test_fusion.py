@@ -10,7 +10,7 @@ import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of, walk
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.inertial.fusion import InertialMotion

@@ -9,13 +9,12 @@ import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of, walk
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import se3, so3
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.initialise import FirstPoses, start
 from lslam.simulation.scenarios import SimulatedDrive
-from lslam.types.gravity import GravityDirection
-from lslam.types.imu import ImuStream
+from lslam.types.imu import GravityDirection, ImuStream
 from lslam.types.scan import Span
 
 Floats = NDArray[np.float64]

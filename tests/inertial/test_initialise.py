@@ -9,7 +9,7 @@ import pytest
 from imu_drives import ACCEL_BIAS, GYRO_BIAS, drone, extrinsics_of, late, stream_of, truth_of, walk
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.geometry import se3
 from lslam.inertial.imu_cleaning import ImuRefusedError, clean, gaps, gravity_unit
 from lslam.inertial.initialise import FirstPoses, InertialStart, start, told_poses

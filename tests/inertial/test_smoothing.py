@@ -6,7 +6,7 @@ import numpy as np
 from imu_drives import GYRO_BIAS, drone, extrinsics_of, stream_of, truth_of
 from numpy.typing import NDArray
 
-from lslam.config.imu import ImuConfig
+from lslam.config.odometry import ImuConfig
 from lslam.frontend.motion_models import smoother_noise
 from lslam.geometry import se3, so3
 from lslam.graph.inertial_smoother import InertialSmoother

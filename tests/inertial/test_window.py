@@ -23,7 +23,7 @@ from lslam.inertial.window import (
 )
 from lslam.kernels import positive
 from lslam.types.imu import ImuStream
-from lslam.types.scan_equations import ScanEquations
+from lslam.types.scan_result import ScanEquations
 
 Floats = NDArray[np.float64]
 

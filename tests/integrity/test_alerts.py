@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.integrity.alerts import IN_A_ROW, alerts, stamp_faults
-from lslam.types.motion_check import MotionCheck
+from lslam.types.scan_result import MotionCheck
 
 Floats = NDArray[np.float64]
 

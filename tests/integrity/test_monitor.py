@@ -18,10 +18,9 @@ from lslam.integrity.monitor import IntegrityMonitor, Seen
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_check import MotionCheck
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
+from lslam.types.scan_result import MotionCheck, ScanResult
 
 Floats = NDArray[np.float64]
 COUNT = 27

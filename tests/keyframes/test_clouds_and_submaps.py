@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lslam.config.keyframes import KeyframesConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.backend import KeyframesConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3
 from lslam.keyframes.cloud import GRAIN, keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import neighbours, submap
-from lslam.types.keyframe import Keyframe
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
+from lslam.types.trajectory import Keyframe
 
 AT_ONCE = MotionPrior.at_once(np.eye(4))
 CONFIG = KeyframesConfig(voxel=0.3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.config.keyframes import KeyframesConfig
+from lslam.config.backend import KeyframesConfig
 from lslam.geometry import se3
 from lslam.keyframes.select import KeyframeSelector
 from lslam.types.scan_result import ScanResult, Status

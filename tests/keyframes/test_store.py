@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError
 from lslam.keyframes.store import INDEX, KeyframeStore
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
 CLOUDS = st.lists(

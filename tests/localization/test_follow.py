@@ -14,7 +14,7 @@ from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import LocalView, PriorMap, make_prior_map
 from lslam.preprocessing.prepare import prepare_points
 from lslam.simulation.routes import Visit
-from lslam.types.map_fix import MapFix
+from lslam.types.constraint import MapFix
 
 FIRST_P = np.diag([0.05**2] * 3 + [np.deg2rad(0.5) ** 2] * 3)
 

@@ -9,7 +9,7 @@ import pytest
 from revisited import CONFIG, Revisited, error_of, revisit, town_map
 from turned_sensor import TURNS, turn, turned_pose, turned_store
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore
 from lslam.localization.place_search import PlaceSearch

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

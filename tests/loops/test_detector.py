@@ -12,8 +12,8 @@ import pytest
 from known_town import Points, keyframes_of, pose, round_the_square, seen, terrace, town
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.kernels import gating, gauss_newton, gaussians, polar_image, residuals, transform
 from lslam.keyframes.store import KeyframeStore

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from known_town import keyframes_of, pose, round_the_square, seen, town
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops.level import find_up, levelled
 from lslam.loops.level_submap import make_level_submap

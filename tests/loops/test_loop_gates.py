@@ -10,8 +10,8 @@ from known_town import keyframes_of, pose
 from numpy.typing import NDArray
 
 from lslam.config import load_config
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import ConfigError
 from lslam.geometry import se3, so3
 from lslam.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector

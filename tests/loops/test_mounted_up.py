@@ -7,13 +7,13 @@ import pytest
 from known_town import pose, seen, town
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.mounting import KEYFRAMES, mounted_up
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import Z
 from lslam.preprocessing.up import AXIS, find_up
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 # Of a sensor of 16 rings.
 HALF_FIELD = np.deg2rad(15.0)

@@ -7,8 +7,8 @@ import pytest
 from known_town import NOISE, box, pose, seen, terrace, town
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops import verify
 from lslam.loops.level_submap import LevelSubmap, make_level_submap

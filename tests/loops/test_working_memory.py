@@ -7,8 +7,8 @@ import pytest
 from known_town import Points, keyframes_of, round_the_square, seen, town
 from numpy.typing import NDArray
 
-from lslam.config.loops import LoopsConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.backend import LoopsConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.loops.descriptor import PlaceMatch
 from lslam.loops.detector import Detector
 from lslam.loops.working_memory import NEIGHBOURS, RETRIEVED, WorkingMemory

@@ -9,7 +9,7 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.relative import by_path, error_transforms
 from lslam.geometry import se3, so3

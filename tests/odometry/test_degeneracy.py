@@ -18,8 +18,7 @@ from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.studies.worker import ScanStore, SequenceCache
 from lslam.types.scan_result import ScanResult
-from lslam.types.selection import select
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, select
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,7 @@ from analytic_scenes import distance, random_pose
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.loam import LoamConfig
-from lslam.config.recovery import RecoveryConfig
+from lslam.config.odometry import LoamConfig, RecoveryConfig
 from lslam.geometry import se3
 from lslam.odometry.all_points import ALL_POINTS, FED
 from lslam.odometry.feature_policies import LessPlanar, feature_policies

@@ -32,8 +32,8 @@ from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.sensors import GnssModel
 from lslam.types.imu import ImuStream
-from lslam.types.keyframe import Keyframe
 from lslam.types.scan_result import ScanResult
+from lslam.types.trajectory import Keyframe
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "odometry.integrity=false", "imu.start_s=1")

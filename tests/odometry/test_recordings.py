@@ -20,8 +20,7 @@ from lslam.odometry import create_odometry
 from lslam.readers import open_sequence
 from lslam.registration.solver import RegistrationResult
 from lslam.types.scan import Scan
-from lslam.types.selection import select
-from lslam.types.sequence import Sequence
+from lslam.types.sequence import Sequence, select
 
 Floats = NDArray[np.float64]
 Recordings = Callable[[str], Path]

@@ -13,7 +13,7 @@ import make_golden
 import numpy as np
 import pytest
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.relative import by_index, by_path, error_transforms
 from lslam.evaluation.results import Evaluation

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from overpass_server import FakeOverpass, house, running
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import InputError
 from lslam.formats.osm_buildings import buildings_of
 from lslam.osm.bounds import Bounds

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.geometry import se2
 from lslam.osm.corrections import correct_buildings
 from lslam.osm.wall_match import match_walls

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from test_wall_drift import MAP, SEEN, WAY, odometry, sighted
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se2
 from lslam.graph.drift import LASTING, MEMORY, SIZES, linear_basis, rate_roots, walk_root
 from lslam.graph.factors import PLANAR

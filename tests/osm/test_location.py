@@ -9,7 +9,7 @@ import pytest
 from wall_scenes import box_at, plain, upright
 
 from lslam.config import Config, load_config
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3, so3
 from lslam.graph.problem import Solution
@@ -19,7 +19,7 @@ from lslam.osm.location import Located, finish, locate
 from lslam.osm.prior import match_keyframe
 from lslam.osm.walls import OsmMap
 from lslam.types.building import Building, Footprint, KeyframeMatch
-from lslam.types.keyframe import Keyframe
+from lslam.types.trajectory import Keyframe
 
 Outline = list[tuple[float, float]]
 ORIGIN = np.array([49.0, 8.4, 115.0])

@@ -15,9 +15,8 @@ from lslam.frontend.register_scans import estimate
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline import odometry_pass
-from lslam.types.keyframe import Keyframe
-from lslam.types.motion_check import MotionCheck
-from lslam.types.scan_result import ScanResult
+from lslam.types.scan_result import MotionCheck, ScanResult
+from lslam.types.trajectory import Keyframe
 
 # Half as many keyframes: what is common to the map shows as well; of single houses each needs all that saw it.
 SPARSE = ("keyframes.distance=4",)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from wall_scenes import box_at
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.kernels import segments, wall_matching
 from lslam.osm.prior import match_buildings, match_keyframe, shares, warm_up
 from lslam.osm.walls import OsmMap

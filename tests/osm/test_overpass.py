@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from overpass_server import FakeOverpass, running
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import InputError
 from lslam.osm.bounds import Bounds
 from lslam.osm.overpass import fetch_buildings, kept_reply, query

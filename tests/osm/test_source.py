@@ -11,7 +11,7 @@ import pytest
 from stub_sequences import Stub
 
 from lslam.config import Config
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.errors import InputError, UsageError
 from lslam.geometry import geodesy, se2
 from lslam.osm import source

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from graph_builders import ate, truth
 
-from lslam.config.graph import GraphConfig
+from lslam.config.backend import GraphConfig
 from lslam.geometry import se2, se3, so3
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PlanarPrior, PoseGraph

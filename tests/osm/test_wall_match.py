@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from test_walls import SAMPLE, submap
 from wall_scenes import Floats, box_at, turned
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.formats.osm_buildings import read_buildings
 from lslam.kernels import wall_matching
 from lslam.osm.wall_match import LIKENESS, WallMatch, find_heading, match_walls

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from wall_scenes import Floats, block, box_at, misfit, noisy, plain, turned, upright
 
-from lslam.config.osm import OsmConfig
+from lslam.config.backend import OsmConfig
 from lslam.formats.osm_buildings import read_buildings
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3

@@ -8,7 +8,7 @@ import io
 import numpy as np
 
 from lslam.pipeline.run_tables import imu_states_text
-from lslam.types.imu_state import IMU_STATES, ImuDiagnostics, ImuState
+from lslam.types.imu import IMU_STATES, ImuDiagnostics, ImuState
 from lslam.types.scan_result import ScanResult
 
 

@@ -31,7 +31,7 @@ from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.imu import ImuStream
 from lslam.types.scan_result import ScanResult
-from lslam.types.selection import select
+from lslam.types.sequence import select
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 COUNT = 60

@@ -26,11 +26,9 @@ from lslam.readers import open_sequence
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_check import MotionCheck
 from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.selection import select
-from lslam.types.sequence import Sequence
+from lslam.types.scan_result import MotionCheck, ScanResult
+from lslam.types.sequence import Sequence, select
 
 BEGIN = 30
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.loam import LoamConfig
+from lslam.config.odometry import LoamConfig
 
 Ring = np.ndarray[Any, np.dtype[np.float64]]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.preprocessing.prepare import gate_points
 from lslam.preprocessing.weather_filter import dense_points
 

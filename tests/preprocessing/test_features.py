@@ -12,8 +12,8 @@ from numpy_labels import reference_labels
 from scipy.spatial import cKDTree
 
 from lslam.config import load_config
-from lslam.config.loam import LoamConfig
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import LoamConfig
 from lslam.errors import ConfigError, InputError
 from lslam.geometry import so3
 from lslam.preprocessing.features import extract_features, walk_rings

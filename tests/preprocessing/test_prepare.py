@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.errors import InputError
 from lslam.kernels import voxel
 from lslam.preprocessing.prepare import COARSEST_SOURCE, PreparedPoints, gate_points, prepare_points

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.loam import LoamConfig
+from lslam.config.odometry import LoamConfig
 from lslam.errors import InputError
 from lslam.kernels import range_image
 from lslam.preprocessing.features import extract_features

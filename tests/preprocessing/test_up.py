@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from turned_sensor import TURNS, turn, turned_points
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import so3
 from lslam.preprocessing.ground import Z, above_ground, ground_of, up_of
 from lslam.preprocessing.segments import lego_features

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam import Registration
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3
 from lslam.kernels import voxel
 from lslam.preprocessing.prepare import NO_TIMES, prepare_points

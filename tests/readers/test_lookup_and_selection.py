@@ -13,7 +13,7 @@ from sequence_builders import kitti_root, raw_drive
 from lslam.errors import InputError, UsageError
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
-from lslam.types.selection import select
+from lslam.types.sequence import select
 
 
 @pytest.mark.parametrize("name", ["seq07", "07", "7", "kitti/07"])

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from stub_sequences import Stub
 from test_bag_clouds import CUSTOM, POINT
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.convert import bag_messages
 from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
@@ -28,8 +28,7 @@ from lslam.preprocessing.merged_lidars import RINGS_APART, FurtherLidar, MergedL
 from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
 from lslam.types.scan import Scan
-from lslam.types.selection import select
-from lslam.types.sequence import Sequence, StatedTimes
+from lslam.types.sequence import Sequence, StatedTimes, select
 
 T_FRONT_REAR = se3.exp(np.array([-1.6, 0.4, -0.2, 0.0, 0.05, 2.9]))
 TREE = {("base", "front"): se3.exp(np.array([1.0, 0, 2, 0, 0.1, 0])),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from perturbed_scans import with_other_noise
 from recovery_drives import driven
 
-from lslam.config.recovery import RecoveryConfig
+from lslam.config.odometry import RecoveryConfig
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from analytic_scenes import pose_at, room
 
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap

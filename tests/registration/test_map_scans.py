@@ -7,7 +7,7 @@ import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import UsageError
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.map_scans import LastKeyframes

@@ -10,7 +10,7 @@ from analytic_scenes import bushes, is_near, random_pose, seen_from
 from analytic_scenes import room as lit_room
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.kernels import facts as at

@@ -10,7 +10,7 @@ from recovery_drives import driven
 
 from lslam.config import load_config
 from lslam.config.config import Config
-from lslam.config.recovery import NO_RECOVERY, RecoveryConfig, rest_alone
+from lslam.config.odometry import NO_RECOVERY, RecoveryConfig, rest_alone
 from lslam.geometry import se3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.policies import AtRest, CoarseToFine, policies_of

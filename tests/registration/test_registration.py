@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints

@@ -12,8 +12,8 @@ from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, r
 from numpy.typing import NDArray
 
 from lslam.config.config import Config
-from lslam.config.preprocess import PreprocessConfig
-from lslam.config.registration import RegistrationConfig, Residual
+from lslam.config.input import PreprocessConfig
+from lslam.config.odometry import RegistrationConfig, Residual
 from lslam.geometry import se3
 from lslam.odometry.icp import registration_of
 from lslam.odometry.uncertainty import PoseUncertainty

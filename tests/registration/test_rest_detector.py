@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.preprocess import PreprocessConfig
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration

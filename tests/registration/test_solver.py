@@ -18,7 +18,7 @@ from analytic_scenes import (
 )
 from numpy.typing import NDArray
 
-from lslam.config.registration import RegistrationConfig
+from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.alignment import upright_directions

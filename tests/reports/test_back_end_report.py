@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.geometry import se3
 from lslam.reports.back_end import back_end_figures, back_end_rows, loop_figures

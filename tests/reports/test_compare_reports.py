@@ -15,7 +15,7 @@ import pytest
 from comparisons import comparison, drawing, row, walls
 from test_html import parse
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
 from lslam.reports.crops import Crop, choose_crops, crop_images

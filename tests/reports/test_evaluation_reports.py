@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.errors import OutputError, UsageError
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation

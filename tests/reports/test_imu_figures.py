@@ -12,8 +12,7 @@ from conftest import MakeRecord
 from lslam.reports import imu_figures as module
 from lslam.reports import svg
 from lslam.reports.imu_figures import imu_figures
-from lslam.types.imu import ImuStream
-from lslam.types.imu_state import ImuDiagnostics, ImuState
+from lslam.types.imu import ImuDiagnostics, ImuState, ImuStream
 
 
 def state(k: int, is_calibrated: bool) -> ImuState:

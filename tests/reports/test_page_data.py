@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.reports.colours import palette

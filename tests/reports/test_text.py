@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.config.eval import EvalConfig
+from lslam.config.outputs import EvalConfig
 from lslam.evaluation.evaluate import evaluate
 from lslam.reports.facts import describe, run_facts, stage_matrix
 from lslam.reports.html import render_report

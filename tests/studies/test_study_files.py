@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from lslam.config.finding import Kind
+from lslam.config.study import Kind
 from lslam.errors import UsageError
 from lslam.studies.expanded_study import ExpandedStudy
 from lslam.studies.output import OutputOptions

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.config.finding import ExpectedFinding
+from lslam.config.study import ExpectedFinding
 from lslam.studies.results_csv import read_study_csv, write_study_csv
 from lslam.studies.sweep import report_folder, write_study_report
 from lslam.types.study import StudyRow

@@ -1,11 +1,11 @@
-"""Section `map`: the merged map."""
+"""Sections `map`, `eval` and `report`: what a run writes, and how it is scored."""
 
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from lslam.config.section import Section
 
@@ -62,3 +62,33 @@ def require_box(name: str, box: tuple[float, ...] | None) -> None:
     """Raise ValueError unless every minimum of a box lies below its maximum."""
     if box is not None and not all(low < high for low, high in zip(box[::2], box[1::2], strict=True)):
         raise ValueError(f"{name} = {list(box)} must be pairs of a smaller and a larger number")
+
+
+Align = Literal["none", "origin", "se3", "sim3", "posyaw"]
+
+
+class EvalConfig(Section):
+    """Recipes of the numbers; every number is printed beside its recipe."""
+
+    align: tuple[Align, ...] = Field(("se3", "origin"), min_length=1, description="ATE alignments")
+    delta: tuple[str, ...] = Field(
+        ("1scan/consecutive", "10m/all"),
+        description="RPE: number, unit scan|m|s, / pair rule consecutive|all",
+    )
+    max_diff: float = Field(0.01, gt=0, description="s; largest stamp difference of a matched pair")
+    time_offset: float | Literal["auto"] = Field(0.0, description="s; added to the estimate's stamps, or auto")
+    metrics: tuple[str, ...] = Field(
+        (), description="shown beside ATE, RPE and KITTI drift: thesis for those of the theses"
+    )
+
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _listed(cls, words: Any) -> Any:
+        """One word is a list of one."""
+        return (words,) if isinstance(words, str) else words
+
+
+class ReportConfig(Section):
+    """The HTML report."""
+
+    html: bool = Field(True, description="write report.html")
