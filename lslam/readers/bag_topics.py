@@ -21,7 +21,7 @@ from lslam.formats.pointcloud2 import livox_id
 from lslam.formats.stamp_texts import seconds_text
 from lslam.readers.bag_halves import find_halves
 from lslam.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
-from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, say_jitter, stands_still
+from lslam.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, runs, say_jitter, stands_still
 from lslam.readers.ground_truth import Voice
 
 CLOUDS = ("PointCloud2", "CustomMsg")
@@ -249,8 +249,7 @@ def _told_again(stamps: Stamps, late: Stamps, step: float) -> NDArray[np.bool_]:
     """Which messages, late by `late` ns, are behind a clock that was set back: they do not fill a hole, they interleave."""
     again = np.zeros(len(stamps), bool)
     ahead = stamps[late == 0]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (late > 0).astype(np.int8), [0]])))
-    for begin, end in edges.reshape(-1, 2):
+    for begin, end in runs(late > 0):
         lo, hi = stamps[begin:end].min(), stamps[begin:end].max()
         there = int(np.searchsorted(ahead, hi, "right") - np.searchsorted(ahead, lo))
         own = int(end - begin)

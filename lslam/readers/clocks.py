@@ -58,8 +58,8 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
     impossible for a clock whose messages are recorded late and never early. Regular headers remain regular: the interval
     across a step is a whole number of periods. A witness that runs at another speed does not count.
     """
-    if _in_turns(headers, witness.stamps_ns):
-        late_ns = np.zeros_like(late_ns)
+    is_set_back = _in_turns(headers, witness.stamps_ns) or _set_back(headers, witness.stamps_ns, late_ns)
+    late_ns = np.where(is_set_back, 0, late_ns)
     keep = np.flatnonzero(late_ns == 0)
     h, w = headers[keep], witness.stamps_ns[keep]
     period, speed = _period_and_speed(h, w)
@@ -193,6 +193,25 @@ def _in_turns(h: Stamps, w: Stamps) -> bool:
     period, _ = _period_and_speed(h, w)
     is_irregular = np.abs(np.diff(np.sort(h)).astype(np.float64) - period) > _UNEVEN * period
     return bool(np.mean(is_irregular) > _MANY and _recording_spread(w, period) < 0.5 * period)
+
+
+def runs(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(K, 2) where each run of true values begins and, behind its last, ends."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))).reshape(-1, 2)
+
+
+def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> NDArray[np.bool_]:
+    """(N,) which late messages came in their turn, of a clock that was set back: those behind are as far from the witness."""
+    back = np.zeros(len(h), np.bool_)
+    if not late_ns.any():
+        return back
+    ahead, period = h - w, _period_and_speed(h, w)[0]
+    limit = max(0.5 * period, _recording_spread(w, period))
+    for begin, end in runs(late_ns > 0):
+        before, after = ahead[max(begin - _LEVEL_SAMPLES, 0) : begin], ahead[end : end + _LEVEL_SAMPLES]
+        own = ahead[begin:end].max()
+        back[begin:end] = own < before.max() - limit and len(after) > 0 and after.max() < own + limit
+    return back
 
 
 def _in_parts(h: Stamps) -> bool:

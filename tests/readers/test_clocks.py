@@ -42,6 +42,9 @@ FAULTS: dict[str, tuple[Callable[[], Stamps], str]] = {
     "steps back": (lambda: TRUE - S37 * (K >= 8), "step by -36.900 s at message 8,"),
     "steps on": (lambda: TRUE + S37 * (K >= 8), "step by +37.100 s at message 8,"),
     "steps back by less than before": (lambda: TRUE - 5 * STEP_NS * (K >= 8), "step by -0.400 s at message 8,"),
+    "steps back by little more than an interval": (
+        lambda: TRUE - 128 * 10**6 * (K >= 8), "step by -0.028 s at message 8,"
+    ),
     "steps on by half a second": (lambda: TRUE + 5 * STEP_NS * (K >= 8), "step by +0.600 s at message 8,"),
     "steps on and back": (lambda: TRUE + S37 * ((K >= 8) & (K < 20)), "step by +37.100 s at message 8 and at 1 more,"),
     "is wrong once": (lambda: TRUE - S37 * (K == 12), "step by -36.900 s at message 12 and at 1 more,"),
