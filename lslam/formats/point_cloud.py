@@ -62,6 +62,11 @@ class TimeColumn:
     unit: str = ""
     is_doubtful: bool = False
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether all points have one value: nobody filled the field in."""
+        return len(self.values) > 1 and bool((self.values == self.values[0]).all())
+
 
 @dataclass(frozen=True)
 class PointCloud:
@@ -105,17 +110,28 @@ def organised(rows: int, cols: int) -> dict[str, NDArray[Any]]:
     return {ORGANISED: np.asarray(np.divmod(np.arange(rows * cols), cols)[0 if rows <= cols else 1], np.uint32)}
 
 
+def beyond(count: int, more: int) -> dict[str, NDArray[Any]]:
+    """What names points behind those that a header counts, as a column that nobody reads."""
+    return {f"{more} points behind the {count} of the header": np.zeros(0)} if more > 0 else {}
+
+
 def packed_columns(
-    path: Path, kind: str, names: Sequence[str], dtype: np.dtype[Any], count: int, data: memoryview, at: int = 0
-) -> dict[str, NDArray[Any]]:
-    """One array per field, numbered in `dtype`, of `count` points from byte `at` on. Raises InputError when data end early."""
+    path: Path, kind: str, names: Sequence[str], dtype: np.dtype[Any], count: int, data: memoryview, at: int = 0, *,
+    is_last: bool = True,
+) -> dict[str, NDArray[Any]]:  # fmt: skip
+    """One array per field, numbered in `dtype`, of `count` points from byte `at` on. Raises InputError when data end early.
+
+    is_last : nothing else follows; zeros that fill a file up are no points
+    """
     record = dtype.itemsize
     room = max(len(data) - at, 0)
     if room < count * record:
         whole = room // record
         raise InputError(f"{path}: {kind} header says {count} points of {record} bytes, the file holds {whole}")
     table = np.ndarray((count,), dtype, data, at if count else 0)
-    return {name: table[str(k)] for k, name in enumerate(names)}
+    rest = np.frombuffer(data, np.uint8)[at + count * record :]
+    more = beyond(count, len(rest) // max(record, 1)) if is_last and rest.any() else {}
+    return {name: table[str(k)] for k, name in enumerate(names)} | more
 
 
 def text_columns(

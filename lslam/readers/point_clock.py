@@ -20,6 +20,8 @@ from lslam.types.sequence import readable
 
 # Sweeps of a sensor differ by less than this factor in length; what is wider holds times that are wrong.
 _WIDER = 1.6
+# One that is longer than usual by more may hold two clocks, where its points say so.
+_LONGER = 1.1
 # A full scan whose times span less of a sweep has no times.
 _FLAT = 0.02
 # More points than this share behind a gap are no stray ones: the clock was set while the sensor turned.
@@ -94,7 +96,7 @@ class PointClock:
         usable = is_usable(cloud, values)
         values, over = _unwrapped(values, usable, width)
         good = densest(values, usable, width)
-        step = _step(values, usable, good, width)
+        step = _step(values, usable, good, rule.sweep)
         if step is not None:
             values, good = step
         if 2 * np.count_nonzero(good) <= np.count_nonzero(usable) or not self._is_sound(values[good], len(cloud)):
@@ -122,6 +124,8 @@ class PointClock:
         low, high = values.min(), values.max()
         span = float(high) - float(low)
         if not span <= _WIDER * rule.sweep or (span < _FLAT * rule.sweep and 2 * count > rule.points):
+            return False
+        if _is_set_back(values, rule.sweep):
             return False
         return rule.is_absolute or bool(low >= -rule.reach and high <= rule.reach)
 
@@ -171,6 +175,10 @@ def open_clock(
         notes.append(
             f"fields of the points: {', '.join(fields)}" + (f"; not read: {', '.join(unread)}" if unread else "")
         )
+    times = [column for sample in samples for column in sample.cloud.clocks]
+    if rule is None and times and all(column.is_constant for column in times):
+        names = dict.fromkeys(column.name for column in times)
+        notes.append(f"no point times: {', '.join(names)} holds one value for all points of a scan")
     return clock
 
 
@@ -190,22 +198,43 @@ def _unwrapped(values: NDArray[Any], usable: NDArray[np.bool_], width: float) ->
 
 
 def _step(
-    values: NDArray[Any], usable: NDArray[np.bool_], good: NDArray[np.bool_], width: float
+    values: NDArray[Any], usable: NDArray[np.bool_], good: NDArray[np.bool_], sweep: float
 ) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
     """Values with those behind a step of the clock moved to follow on the others, and which are good then; None without a step.
 
-    good : the larger part. The part that begins in the order of the points comes first.
+    good : the largest part; sweep : usual length of one
     """
+    width = _WIDER * sweep
     rest = densest(values, usable & ~good, width)
-    if np.count_nonzero(rest) <= _STEP_SHARE * np.count_nonzero(usable):
+    both = good | rest if np.count_nonzero(rest) > _STEP_SHARE * np.count_nonzero(usable) else good
+    some = values[both]
+    parts = _parts(some)
+    if parts is None or (np.ptp(some) <= width and not _is_set_back(some, sweep)):
         return None
-    both = good | rest
-    is_rest = rest[both]
-    changes = np.count_nonzero(np.diff(is_rest.astype(np.int8)))
-    earlier, later = (rest, good) if is_rest[0] else (good, rest)
-    lengths = [float(np.ptp(values[part])) for part in (earlier, later)]
-    if sum(lengths) > width or changes > _OFTEN * len(is_rest):
+    earlier, later = parts
+    if float(np.ptp(some[earlier])) + float(np.ptp(some[later])) > width:
         return None
+    some[later] += some[earlier].max() - some[later].min()
     moved = values.copy()
-    moved[later] += values[earlier].max() - values[later].min()
+    moved[both] = some
     return moved, both
+
+
+def _is_set_back(values: NDArray[Any], sweep: float) -> bool:
+    """Whether times (N,) are too many for a sweep because those of the points that come first are the later ones."""
+    parts = _parts(values) if np.ptp(values) > _LONGER * sweep else None
+    if parts is None or not all(values[part][0] < values[part][-1] for part in parts):
+        return False
+    return bool(values[parts[0]].min() > values[parts[1]].max())
+
+
+def _parts(values: NDArray[Any]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """The times (N,) on either side of the largest hole, those first that come first; None where few are on one side."""
+    if len(values) < 2:
+        return None
+    ordered = np.sort(values)
+    is_high = values > ordered[np.argmax(np.diff(ordered))]
+    high, changes = np.count_nonzero(is_high), np.count_nonzero(np.diff(is_high))
+    if min(high, len(values) - high) <= _STEP_SHARE * len(values) or changes > _OFTEN * len(values):
+        return None
+    return (is_high, ~is_high) if is_high[0] else (~is_high, is_high)

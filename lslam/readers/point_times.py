@@ -79,7 +79,8 @@ class _TimeReading(NamedTuple):
 def learn_rule(
     samples: Sequence[Sample], rate_hz: float, unit: str | None = None, reference: str | None = None
 ) -> TimeRule | None:
-    """Find the time field of a recording, its unit and reference, on several of its scans; None where no cloud has such a field.
+    """Find the time field of a recording, its unit and reference, on several of its scans; None where no cloud has such a field,
+    or one that holds one value alone.
 
     unit : s, ms, us or ns; reference : `start` or `end` of the scan, or `absolute`; None finds out
 
@@ -99,7 +100,7 @@ def learn_rule(
             try:
                 readings.append(_read(clock, sample, rate_hz, unit, reference))
             except InputError as error:
-                refusal = refusal or (None if clock.is_doubtful else error)
+                refusal = refusal or (None if clock.is_doubtful or clock.is_constant else error)
         if readings and 2 * len(readings) >= len(having):
             points = float(np.median([sample.step * len(sample) for _, sample in having]))
             return _agree(name, readings, points, rate_hz, unit, reference)

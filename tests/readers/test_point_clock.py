@@ -147,7 +147,7 @@ def test_points_with_a_wrong_time_are_left_out_and_that_is_said(tmp_path: Path, 
     check_sound(sequence, range(first))
 
 
-@pytest.mark.parametrize("step_s", [37.0, -37.0, 0.4, -0.4])
+@pytest.mark.parametrize("step_s", [37.0, -37.0, 0.4, -0.4, 0.128, -0.128, 0.07])
 @pytest.mark.parametrize("order", ["fired", "ring after ring"])
 def test_a_clock_that_is_set_within_a_scan_is_read_on(tmp_path: Path, step_s: float, order: str) -> None:
     """For two thirds of scan 8 and all later ones the clock is another: header stamps are taken for right here."""
@@ -165,6 +165,21 @@ def test_a_clock_that_is_set_within_a_scan_is_read_on(tmp_path: Path, step_s: fl
     np.testing.assert_allclose(scan.times, expected, atol=1e-4)
     assert scan.fault == "the clock of the points was set within the sweep and is read on as before"
     assert abs(scan.stamp_ns - START_NS - 8 * STEP_NS) < 1000
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_packets_lost_within_a_scan_are_no_step_of_the_clock(tmp_path: Path, order: int) -> None:
+    """A driver that counts packets makes such a scan longer, whether the last points come last or first."""
+
+    def rows(k: int) -> Rows:
+        table = sweep("<f8", begin=begin_s(k))
+        table["time"] += 0.03 * ((k == 8) & (SECONDS > 0.033))
+        return table[::order].copy()
+
+    scan = recording(tmp_path, rows).scan(8)
+    assert scan.fault == ""
+    assert scan.times is not None
+    np.testing.assert_allclose(scan.times, (SECONDS + 0.03 * (SECONDS > 0.033))[::order], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["time", "timestamp"])
@@ -219,6 +234,17 @@ BREAKS: dict[str, tuple[Change, str, bool]] = {
         lambda t: _renamed(t, "time", "t"), "has no field 'time', unlike the others: per-point times from field 't'", True,
     ),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["zero", "stamp of the scan"])
+def test_a_field_that_nobody_filled_in_is_none(tmp_path: Path, kind: str) -> None:
+    """The order of the points may tell their times then, as without the field."""
+    sequence = recording(tmp_path, lambda k: _with(sweep("<f8"), time=0 if kind == "zero" else begin_s(k)))
+    assert not sequence.problems
+    assert "fields of the points: x, y, z, ring; not read: time" in sequence.notes
+    assert "no point times: time holds one value for all points of a scan" in sequence.notes
+    assert sequence.scan(3).times is None
+    np.testing.assert_array_equal(sequence.stamps_ns, START_NS + STEP_NS * np.arange(COUNT))
 
 
 def _renamed(rows: Rows, old: str, new: str) -> Rows:
