@@ -6,6 +6,7 @@ import struct
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -111,8 +112,8 @@ def is_static(topic: BagTopic) -> bool:
     return topic.name.rsplit("/", 1)[-1] == "tf_static"
 
 
-def read_transforms(bag: Bag, topic: BagTopic, problems: list[str]) -> Transforms:
-    """`T_parent_child` (N, 4, 4) by (parent, child), all that a TFMessage topic says of a pair, as it was recorded."""
+def read_transforms(bag: Bag, topic: BagTopic, problems: list[str], most: int | None = None) -> Transforms:
+    """`T_parent_child` (N, 4, 4) by (parent, child), what messages of a TFMessage topic, or the first so many, say of it."""
     found: dict[tuple[str, str], list[list[float]]] = {}
 
     def note(data: bytes) -> None:
@@ -121,7 +122,7 @@ def read_transforms(bag: Bag, topic: BagTopic, problems: list[str]) -> Transform
             row = _numbers(topic, t.transform.translation, t.transform.rotation)
             found.setdefault(pair, []).append(row)
 
-    for _ in bag.each(topic, note, problems):
+    for _ in islice(bag.each(topic, note, problems), most):
         pass
     return {pair: _poses(np.array(rows, np.float64)) for pair, rows in found.items()}
 

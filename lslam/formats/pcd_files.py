@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError, input_errors
-from lslam.formats.point_cloud import AXES, organised, packed_columns, text_columns
+from lslam.formats.point_cloud import AXES, beyond, organised, packed_columns, text_columns
 from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
@@ -135,6 +135,7 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
     while lines and not lines[-1].strip():
         lines.pop()
     unread: set[int] = set()
+    more = beyond(header.points, len(lines) - header.points)
     try:
         if len(lines) < header.points:
             raise ValueError(f"header says {header.points} points, the file holds {len(lines)} lines of them")
@@ -143,13 +144,13 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
         mixed = _rows_with_raw_bytes(header, bytes(body))
         if mixed is None:
             raise InputError(f"{path}: PCD ascii data (counted from the first point) cannot be read: {error}") from None
-        table, unread = mixed
+        (table, unread), more = mixed, {}
     if table.shape != (header.points, width):
         raise InputError(f"{path}: PCD ascii lines hold {table.shape[1]} numbers where FIELDS and COUNT say {width}")
     starts = accumulate((math.prod(kind.shape) for kind in header.kinds[:-1]), initial=0)
     fields = zip(header.names, starts, strict=True)
     labels = [f"{name} (bytes in place of digits)" if k in unread else name for name, k in fields]
-    return text_columns(table, labels, header.kinds)
+    return text_columns(table, labels, header.kinds) | more
 
 
 def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[NDArray[np.float64], set[int]] | None:

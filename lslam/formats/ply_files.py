@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, input_errors
 from lslam.formats.atomic import atomic_write
-from lslam.formats.point_cloud import packed_columns, text_columns
+from lslam.formats.point_cloud import beyond, packed_columns, text_columns
 from lslam.untrusted import whole_number
 
 _TYPES = {
@@ -44,10 +44,11 @@ def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
             raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
         if element.name == "vertex":
             if encoding == "ascii" and element.count:
-                return _ascii_columns(path, element, body, skipped)
+                return _ascii_columns(path, element, body, skipped, element is elements[-1])
             names = [name for name, _ in element.properties]
             dtype = np.dtype([(str(k), order + code) for k, code in enumerate(codes)])
-            return packed_columns(path, "PLY", names, dtype, element.count, body, skipped)
+            is_last = element is elements[-1]
+            return packed_columns(path, "PLY", names, dtype, element.count, body, skipped, is_last=is_last)
         record = sum(np.dtype(code).itemsize for code in codes if code != "list")
         skipped += element.count * (record if encoding != "ascii" else 1)
     raise InputError(f"{path}: PLY header has no element 'vertex'")
@@ -124,8 +125,11 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     return encoding, elements, position
 
 
-def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int) -> dict[str, NDArray[Any]]:
-    lines = [line for line in bytes(body).split(b"\n") if line.strip()][skipped : skipped + element.count]
+def _ascii_columns(
+    path: Path, element: _Element, body: memoryview, skipped: int, is_last: bool
+) -> dict[str, NDArray[Any]]:
+    every = [line for line in bytes(body).split(b"\n") if line.strip()][skipped:]
+    lines = every[: element.count]
     if len(lines) < element.count:
         raise InputError(f"{path}: PLY header says {element.count} points, the file holds {len(lines)}")
     try:
@@ -137,4 +141,5 @@ def _ascii_columns(path: Path, element: _Element, body: memoryview, skipped: int
             f"{path}: PLY ascii lines hold {table.shape[1]} numbers for {len(element.properties)} properties"
         )
     names, codes = zip(*element.properties, strict=True)
-    return text_columns(table, names, [np.dtype(code) for code in codes])
+    columns = text_columns(table, names, [np.dtype(code) for code in codes])
+    return columns | (beyond(element.count, len(every) - element.count) if is_last else {})

@@ -20,6 +20,8 @@ Floats = NDArray[np.float64]
 
 # What moves by less over a whole recording is rigid: the rounding of a driver, the play of a joint.
 _STILL = 1e-3  # m, rad
+# Messages of /tf that are held against /tf_static.
+_LOOKED_AT = 100
 
 
 @dataclass
@@ -35,12 +37,17 @@ class Links:
     is_tf_used: bool = False
 
     def __post_init__(self) -> None:
-        """Read /tf_static; a pair that it tells of differently is named."""
+        """Read /tf_static; a pair of which it, or the beginning of /tf, says another thing is named."""
         for pair, poses in self._read(True).items():
             self.static[pair] = poses[-1]
             if not _is_still(poses):
                 self.voice.problems.append(
                     f"/tf_static says more than one thing of {pair[0]} -> {pair[1]}, {_spread_text(poses)}: the last one counts"
+                )
+        for pair, poses in self._read(False, _LOOKED_AT).items() if self.static else ():
+            if pair in self.static and not _is_still(both := np.concatenate([self.static[pair][None], poses])):
+                self.voice.problems.append(
+                    f"/tf says another thing of {pair[0]} -> {pair[1]} than /tf_static, {_spread_text(both)}: /tf_static counts"
                 )
 
     def find(self, a: str, b: str) -> tuple[Floats, str] | None:
@@ -82,11 +89,12 @@ class Links:
         same = {pair: poses[0] for pair, poses in self._of_tf.items() if len(poses) > 1 and _is_still(poses)}
         return {**same, **self.static}
 
-    def _read(self, wants_static: bool) -> Transforms:
+    def _read(self, wants_static: bool, most: int | None = None) -> Transforms:
+        problems = self.voice.problems if most is None else []
         found: dict[tuple[str, str], list[Floats]] = {}
         for topic in self.bag.of_type("TFMessage"):
             if is_static(topic) == wants_static:
-                for pair, poses in read_transforms(self.bag, topic, self.voice.problems).items():
+                for pair, poses in read_transforms(self.bag, topic, problems, most).items():
                     found.setdefault(pair, []).append(poses)
         return {pair: np.concatenate(pieces) for pair, pieces in found.items()}
 

@@ -294,3 +294,28 @@ def test_a_full_disk_leaves_the_old_file_and_no_part(tmp_path: Path, monkeypatch
         write_points(path, points[:1])
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["map.ply"]
+
+
+@pytest.mark.parametrize("kind", ["binary.pcd", "ascii.pcd", "binary.ply", "ascii.ply"])
+@pytest.mark.parametrize("end", ["points", "zeros", "faces"])
+def test_points_that_a_header_does_not_count_are_named(kind: str, end: str, tmp_path: Path) -> None:
+    """Zeros that fill a file up, or another element, are none."""
+    encoding, suffix = kind.split(".")
+    path = tmp_path / f"a.{suffix}"
+    points, _ = cloud(20)
+    counted = 20 - 5 * (end == "points")
+    body = points.tobytes() if encoding == "binary" else b"".join(b"%r %r %r\n" % tuple(p) for p in points.tolist())
+    if suffix == "pcd":
+        head = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {counted}\nHEIGHT 1\nDATA {encoding}\n"
+    else:
+        faces = "element face 5\nproperty list uchar int vertex_indices\n" if end == "faces" else ""
+        axes = "".join(f"property float {axis}\n" for axis in "xyz")
+        form = "ascii" if encoding == "ascii" else "binary_little_endian"
+        head = f"ply\nformat {form} 1.0\nelement vertex {counted}\n{axes}{faces}end_header\n"
+    more = {"points": b"", "zeros": bytes(4096), "faces": 5 * struct.pack("<B3i", 3, 0, 1, 2)}[end]
+    if encoding == "ascii":
+        more = b"3 0 1 2\n" * 5 * (end == "faces")
+    path.write_bytes(head.encode() + body + (more if suffix == "ply" or end == "zeros" else b""))
+    back = read_points(path)
+    np.testing.assert_allclose(back.points, points[:counted], rtol=1e-6)
+    assert back.unread == (("5 points behind the 15 of the header",) if end == "points" else ())

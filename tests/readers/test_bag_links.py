@@ -70,6 +70,11 @@ def test_tf_fills_in_what_tf_static_leaves_open_and_does_not_overrule_it(tmp_pat
     np.testing.assert_allclose(sequence.calibration.T_lidar_imu, T_LIDAR_IMU, atol=1e-12)
     assert isinstance(sequence, BagSequence)
     assert "/tf" not in sequence.uses
+    (problem,) = sequence.problems
+    assert (
+        problem
+        == "/tf says another thing of base -> lidar than /tf_static, 0.900 m and 3.4 deg apart: /tf_static counts"
+    )
 
 
 @pytest.mark.parametrize(
