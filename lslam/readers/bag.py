@@ -151,9 +151,12 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
     voice = Voice([f"format {KIND}: {why}", *compensation_note(info), *bag.notes], list(bag.losses))
     lidars: list[_Lidar] = []
     for topic in choose_clouds(bag, info.lidar_topic, voice):
-        voice.notes.append(f"scans from {topic.name} ({topic.type}, {len(topic)} messages)")
         check_parts(bag, topic)
-        lidars += _lidars_of(bag, topic, info, voice, bool(lidars))
+        at = len(voice.notes)
+        some = _lidars_of(bag, topic, info, voice, bool(lidars))
+        frames = ", ".join(index.name for index, _, _ in some)
+        voice.notes.insert(at, f"scans from {topic.name} ({topic.type}, {len(topic)} messages), frame {frames}")
+        lidars += some
     (leading, sequence, opened), frame = lidars[0], lidars[0][0].frame
     own = opened if info.imu_topic is None else None
     imu = load_companion(bag, IMU, info.imu_topic, voice) if own is None or own.imu is None else None

@@ -102,6 +102,8 @@ def test_by_default_one_of_two_lidars_on_a_topic_is_read_and_the_other_is_named(
     assert rear.stamps_ns[0] == START_NS + 50_000_000
     np.testing.assert_array_equal(rear.scan(0).points, sweeps(1, seed=50)[0].points)
     assert not rear.problems
+    for opened, frame in ((sequence, "front"), (rear, "rear")):
+        assert "scans from /points (sensor_msgs/msg/PointCloud2, 11 messages), frame " + frame in opened.notes
     with pytest.raises(
         UsageError, match=r"no message of /points is of 'top'; .*\n  --lidar-frame front  \(6 messages\)\n  --l"
     ):
