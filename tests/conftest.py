@@ -13,6 +13,7 @@ from multiprocessing import get_context
 from multiprocessing.forkserver import ensure_running
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import blas_kernels  # noqa: F401
 import pytest
@@ -22,10 +23,12 @@ from shared_towns import Towns, TracedScans
 
 from lslam.errors import InputError
 from lslam.extras import importing_open3d
-from lslam.locks import one_at_a_time
 from lslam.simulation.scenarios import SimulatedDrive
 
-pytest_plugins = ["perturbed_scans", "shared_starts", "tiers"]
+if TYPE_CHECKING:
+    from made_once import MadeOnce
+
+pytest_plugins = ["made_once", "perturbed_scans", "shared_starts", "tiers"]
 compile_once()
 
 # How long an example takes is the machine's affair.
@@ -83,24 +86,15 @@ SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """`recordings(name)` unpacks one recording and gives the folder it lies in; the test skips where there is none.
-
-    What one worker has unpacked the others read.
-    """
-    base = tmp_path_factory.getbasetemp()
-    target = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "recordings"
+def recordings(made_once: MadeOnce) -> Callable[[str], Path]:
+    """`recordings(name)` unpacks one recording and gives the folder it lies in; the test skips where there is none."""
 
     def unpack(name: str) -> Path:
         if not (SHARED / "unpack.py").is_file() or not any(SHARED.glob(f"{name}.*")):
             pytest.skip(f"recording {name} is not on this machine")
-        with one_at_a_time(target / f"{name}.lock", f"unpacks {name}"):
-            if not (done := target / f"{name}.done").exists():
-                subprocess.run(
-                    [sys.executable, str(SHARED / "unpack.py"), str(target), name], check=True, capture_output=True
-                )
-                done.touch()
-        return target
+        call = [sys.executable, str(SHARED / "unpack.py"), str(made_once.folder), name]
+        made_once(name, lambda: subprocess.run(call, check=True, capture_output=True))
+        return made_once.folder
 
     return unpack
 

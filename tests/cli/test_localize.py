@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
-from revisits import Floats, frame_from_town, record_visits, run, town_poses
+from made_once import MadeOnce
+from revisits import Floats, frame_from_town, place_visits, town_poses
 
 from lslam.formats.point_files import read_cloud, write_cloud
 from lslam.formats.trajectory_files import read_trajectory
@@ -20,11 +21,10 @@ GRID = np.array([512_000.0, 5_427_000.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drives(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Path:
     """`monday` with its run in `map`, and `tuesday`."""
     root = tmp_path_factory.mktemp("drives")
-    record_visits(root)
-    run(root / "monday", root / "map")
+    place_visits(root, made_once, {"monday": "map"})
     return root
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
+from made_once import MadeOnce
 from numpy.typing import NDArray
+from revisits import place_visits, town_poses, visit_drive
 
 from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
@@ -18,14 +20,12 @@ from lslam.geometry.umeyama import align
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.record import record
-from lslam.simulation.routes import Visit
-from lslam.simulation.scenarios import SimulatedDrive, simulate
+from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.types.gnss import Georeference
 
 # Length, width and height of the box, m: well below a whole number of cells of 0.4 m, so that noise fills no further one.
 BOX = np.array([1.7, 1.3, 1.3])
-MONDAY, TUESDAY = Visit(), Visit(1, is_reversed=True, shift=40.0)
 
 
 def beside_the_road(drive: SimulatedDrive) -> NDArray[np.float64]:
@@ -45,20 +45,17 @@ def with_box(drive: SimulatedDrive, foot: NDArray[np.float64]) -> SimulatedDrive
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drives(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Path:
     """`monday` with its run `old`; `tuesday` as it was and `boxed`, located in it."""
     root = tmp_path_factory.mktemp("drives")
-    monday = simulate("block", seed=7, count=96, visit=MONDAY)
-    foot = beside_the_road(monday)
-    record(monday, root / "monday")
-    record(simulate("block", seed=7, count=60, visit=TUESDAY), root / "tuesday")
-    record(with_box(simulate("block", seed=7, count=60, visit=TUESDAY), foot), root / "boxed")
-    assert lslam("run", root / "monday", "--out", root / "old", "-q").returncode == 0
+    place_visits(root, made_once, {"monday": "old"})
+    foot = beside_the_road(visit_drive("monday"))
+    record(with_box(visit_drive("tuesday"), foot), root / "boxed")
     for name in ("tuesday", "boxed"):
         done = lslam("localize", root / name, "--map", root / "old", "--out", root / f"{name}-run", "-q")
         assert done.returncode == 0, done.stderr
     est = read_trajectory(root / "old" / "trajectory.tum", "tum").positions
-    T, _, _ = align(monday.city_poses[:, :3, 3], est)
+    T, _, _ = align(town_poses(root, "monday")[:, :3, 3], est)
     np.save(root / "foot.npy", se3.apply(T, foot[None])[0])
     return root
 
@@ -183,10 +180,10 @@ def test_drives_that_only_the_earth_ties_are_compared_too(drives: Path, tmp_path
     """Each is placed by its own surveyed points, in coordinates of its own origin."""
     assert lslam("run", drives / "boxed", "--out", tmp_path / "alone", "-q", "--set", "map.write=false").returncode == 0
     on_earth = Projection(Georeference(np.array([49.0112, 8.4229, 115.0]), np.eye(4), 25832))
-    for run, visit in ((drives / "old", MONDAY), (tmp_path / "alone", TUESDAY)):
-        places = on_earth.apply(simulate("block", seed=7, count=60, visit=visit).city_poses[:, :3, 3])
+    for run, name in ((drives / "old", "monday"), (tmp_path / "alone", "tuesday")):
+        places = on_earth.apply(town_poses(drives, name)[:, :3, 3])
         rows = [
-            f"{k},{places[k, 0]:.4f},{places[k, 1]:.4f},{places[k, 2]:.4f},0.02,EPSG:25832" for k in (0, 20, 40, 59)
+            f"{k},{places[k, 0]:.4f},{places[k, 1]:.4f},{places[k, 2]:.4f},0.02,EPSG:25832" for k in (0, 20, 40, 49)
         ]
         (tmp_path / "points.csv").write_text("\n".join(["scan,x,y,z,sigma,crs", *rows]) + "\n")
         words = ("--control", tmp_path / "points.csv", "--no-map", "--out", tmp_path / f"{run.name}-placed", "-q")
@@ -201,7 +198,6 @@ def test_drives_that_only_the_earth_ties_are_compared_too(drives: Path, tmp_path
     tree = json.loads((tmp_path / "out" / "changes.geojson").read_text())
     (ring,) = tree["features"][0]["geometry"]["coordinates"]
     lon, lat = np.mean(ring[:-1], axis=0)
-    drive = simulate("block", seed=7, count=96, visit=MONDAY)
-    true = on_earth.apply(beside_the_road(drive)[None])
+    true = on_earth.apply(beside_the_road(visit_drive("monday"))[None])
     (box,) = to_wgs84(true, 25832)
     assert np.hypot((lat - box[0]) * 111_200, (lon - box[1]) * 72_900) < 0.6

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
-from revisits import frame_from_town, record_visits, run, town_poses
+from made_once import MadeOnce
+from revisits import frame_from_town, place_visits, run, town_poses
 
 from lslam.config import load_config
 from lslam.errors import InterruptedRunError
@@ -29,12 +30,10 @@ SAME = ("sessions/monday-run.tum", "sessions/tuesday-run.tum", "loops.csv", "gra
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Path:
     """Runs of `monday`, of `tuesday`, and of another town."""
     root = tmp_path_factory.mktemp("runs")
-    record_visits(root)
-    for name in ("monday", "tuesday"):
-        run(root / name, root / f"{name}-run")
+    place_visits(root, made_once, {"monday": "monday-run", "tuesday": "tuesday-run"})
     done = lslam("run", SAMPLE, "--count", 40, "--out", root / "elsewhere", "-q", "--set", "map.write=false")
     assert done.returncode == 0, done.stderr
     return root
