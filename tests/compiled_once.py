@@ -7,6 +7,7 @@ from typing import Any
 
 from lslam.kernels import jit  # noqa: F401  # which tells numba where its cache is
 from lslam.locks import lock
+from lslam.pipeline import precompile
 
 # isort: split
 from numba.core.caching import FunctionCache
@@ -29,3 +30,5 @@ def compile_once() -> None:
             return compile_here(kernel, signature)
 
     Dispatcher.compile = compiled
+    # The process that would help a run to compile takes longer to start than most kernels, and does it beside the other workers.
+    precompile.available_cores = lambda: 1  # type: ignore[attr-defined]

@@ -65,6 +65,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
     In one order all of them would rewrite the same assertions at the same time: 25 s of a core, by each.
     """
+    from tiers import is_passed_over
+
     worker = getattr(session.config, "workerinput", None)
     if worker is None:
         return
@@ -73,6 +75,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     # A room's own conftest.py is a module of the same name as this one, which pytest puts in its place when it comes there.
     here = Path(__file__).parent
     modules = [path for path in modules if path.parent == here or not (path.parent / "conftest.py").exists()]
+    modules = [path for path in modules if not is_passed_over(path, session.config)]
     begin = int(worker["workerid"].removeprefix("gw")) * len(modules) // worker["workercount"]
     for path in modules[begin:] + modules[:begin]:
         sys.path.insert(0, str(path.parent))

@@ -10,6 +10,7 @@ import resource
 import time
 from collections import Counter
 from collections.abc import Generator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,23 @@ def is_there(function: str) -> bool:
     """Whether its file has such a function."""
     path, _, name = function.partition("::")
     return (ROOT / path).is_file() and f"\ndef {name}(" in (ROOT / path).read_text()
+
+
+@cache
+def slow_files() -> frozenset[Path]:
+    """Files that have a slow test."""
+    files = {ROOT / function.partition("::")[0] for function in read_table()}
+    return frozenset(files | {path for path in (ROOT / "tests").rglob("test_*.py") if "mark.slow" in path.read_text()})
+
+
+def is_passed_over(path: Path, config: pytest.Config) -> bool:
+    """Whether a file need not be imported: nothing in it is slow, and nothing else is asked for."""
+    is_test = path.name.startswith("test_") and path.suffix == ".py"
+    return config.option.markexpr == "slow" and is_test and path not in slow_files()
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    return True if is_passed_over(collection_path, config) else None
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
