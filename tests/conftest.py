@@ -132,13 +132,15 @@ def open3d() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def forked_runs() -> Iterator[None]:
-    """The processes of studies are forked by a server that has imported what a run needs, and run no kernel.
+    """The processes of studies are forked by a server that has imported what a run needs, and loaded its kernels.
 
-    To import it anew takes a process longer than a short run. That they are spawned is test_runner's.
+    To do it anew takes a process longer than a short run. That they are spawned is test_runner's.
     """
     context = get_context("forkserver")
-    context.set_forkserver_preload(["lslam.pipeline.run", "lslam.studies.worker"])
-    ensure_running()
+    context.set_forkserver_preload(["warmed_server"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
+        ensure_running()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lslam.studies.runner.get_context", lambda _: context)
         yield
