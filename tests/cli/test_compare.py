@@ -155,7 +155,7 @@ def test_usage_errors_come_before_any_run(
 
 def test_an_interruption_keeps_what_is_finished_for_resume(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    call = ["compare", "block", "--methods", "icp", "--seeds", "0,1", "--count", "100", "--out", str(out)]
+    call = ["compare", "block", "--methods", "icp", "--seeds", "0,1", "--count", "40", "--out", str(out)]
     child = subprocess.Popen(
         [*COMMAND, *call], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment(),
         start_new_session=True,

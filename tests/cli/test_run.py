@@ -54,6 +54,7 @@ def test_writes_exactly_the_promised_files(first: tuple[Done, Path]) -> None:
     assert {p.name for p in out.iterdir()} == ALL
     facts = manifest(out)
     assert (facts["status"], facts["problems"], facts["counts"]["ok"]) == ("done", [], 95)
+    assert facts["integrity"]["conclusive"] > 10
     assert facts["peak_memory_mb"] < 1000
     assert facts["frames"]["pose_time"] == "scan_start"
     assert str(out) in facts["command"]
@@ -168,6 +169,8 @@ def test_kiss_icp_runs_with_bounded_error(tmp_path: Path) -> None:
     document = strict_json(done.stdout)
     assert document["evaluation"]["ate"]["se3"]["rmse"] < 1.0
     assert document["manifest"]["method"] == "kiss-icp"
+    assert not any("may be lost" in problem for problem in document["manifest"]["problems"])
+    assert document["manifest"]["integrity"]["conclusive"] > 10
     assert {p.name for p in (tmp_path / "out").iterdir()} == ALL, "it has no covariances, but the graph does"
 
 

@@ -116,7 +116,7 @@ def test_every_direction_is_observed_in_towns(scenario: str) -> None:
 
 @pytest.mark.parametrize(("scenario", "lidar"), [("street", "vlp16"), ("urban", None)])
 def test_every_direction_is_observed_in_towns_by_loam_scan_to_scan(scenario: str, lidar: str | None) -> None:
-    whole = simulate(scenario, seed=1, count=29, lidar=lidar, motion_compensated=True)
+    whole = simulate(scenario, seed=0, count=29, lidar=lidar, motion_compensated=True)
     results = by_features(select(whole, skip_frames=2), "loam-odom")
     assert len(results) == 15
     assert not any(len(r.degenerate) for r in results)

@@ -312,7 +312,7 @@ def test_a_sequence_without_an_imu_is_missing_input() -> None:
         run(with_imu(None), config_of("input.count=5"))
 
 
-@pytest.mark.parametrize("lost", [[0], [1], [0, 1, 2]])
+@pytest.mark.parametrize("lost", [[1], [0, 1, 2]])
 def test_a_start_with_scans_that_cannot_be_read_is_aligned_all_the_same(lost: list[int]) -> None:
     stub = with_imu(imu_of(walk()))
     for k in lost:

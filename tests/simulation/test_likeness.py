@@ -81,8 +81,10 @@ def shares(scan: Scan) -> Floats:
     bearing = np.floor((np.degrees(np.arctan2(p[:, 1], p[:, 0])) + 180) / 10)
     cell = (bearing * 10 + np.floor(np.hypot(p[:, 0], p[:, 1]) / 5)).astype(int)
     low = np.full(cell.max() + 1, -1.73)
-    for k in np.unique(cell):
-        z = float(np.quantile(p[cell == k, 2], 0.05))
+    order = np.argsort(cell, kind="stable")
+    cells, first = np.unique(cell[order], return_index=True)
+    for k, heights in zip(cells, np.split(p[order, 2], first[1:]), strict=True):
+        z = float(np.quantile(heights, 0.05))
         if abs(z + 1.73) < 0.8:
             low[k] = z
     above = p[:, 2] - low[cell] >= 0.25
