@@ -12,8 +12,8 @@ from typing import Any
 from lslam.errors import InputError
 from lslam.formats.state_files import Records, read_state, write_state
 from lslam.frontend.keyframing import Keyframing
-from lslam.frontend.segments import SegmentTracker
 from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.frontend.windows import WindowTracker
 from lslam.odometry.base import Resumable
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
@@ -135,7 +135,7 @@ class OdometryCheckpoints:
         """What earlier runs spent on the results that were taken over, s."""
         return self._seconds
 
-    def begin(self, tracker: SegmentTracker, keyframing: Keyframing) -> list[ScanResult]:
+    def begin(self, tracker: WindowTracker, keyframing: Keyframing) -> list[ScanResult]:
         """Put the tracker and the keyframes where the newest checkpoint left them; the results until there."""
         self._began = time.monotonic()
         latest = self._latest
@@ -161,17 +161,17 @@ class OdometryCheckpoints:
         log.info("going on after %d scans", len(results))
         return results
 
-    def offer(self, results: list[ScanResult], tracker: SegmentTracker, keyframing: Keyframing) -> None:
+    def offer(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing) -> None:
         """Write a checkpoint when one is due."""
         if self._checkpoints.schedule.is_due and isinstance(tracker.odometry, Resumable):
             self._write(results, tracker, keyframing, is_over=False)
 
-    def close(self, results: list[ScanResult], tracker: SegmentTracker, keyframing: Keyframing, is_over: bool) -> None:
+    def close(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
         """Write the last one: odometry is over, or somebody asked to stop."""
         if (is_over and not self.is_over) or (not is_over and isinstance(tracker.odometry, Resumable)):
             self._write(results, tracker, keyframing, is_over)
 
-    def _write(self, results: list[ScanResult], tracker: SegmentTracker, keyframing: Keyframing, is_over: bool) -> None:
+    def _write(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
         if all(result.status == "skipped" for result in results):
             return  # bad input: nothing to go on with
         if not is_over and (keyframing.is_waiting or not tracker.is_settled):

@@ -20,6 +20,7 @@ from lslam.frontend.checkpoints import OdometryCheckpoints
 from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.segments import Begin, SegmentTracker, Tracked
 from lslam.frontend.tracker import Loaded, Tracker
+from lslam.frontend.windows import WindowTracker
 from lslam.geometry import se3
 from lslam.geometry.interpolate import poses_at
 from lslam.inertial.constant_velocity import MotionModel
@@ -55,6 +56,7 @@ def estimate(
     keyframing: Keyframing | None = None,
     checkpoints: OdometryCheckpoints | None = None,
     monitor: IntegrityMonitor | None = None,
+    noise_m: float = RegistrationConfig().sigma,
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` only.
 
@@ -62,19 +64,22 @@ def estimate(
     segment where the map is lost, as in `SegmentTracker`. With `stationary`, scans of a stationary sensor are not registered.
     `motion` predicts the scans, constant velocity when None.
     `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
-    earlier run left off and keep what this one does. `monitor` checks the pose of every scan.
+    earlier run left off and keep what this one does. `monitor` checks the pose of every scan. `noise_m` is that of a point, below
+    which a bend within sweeps is none, as in `WindowTracker`.
     """
-    tracker = SegmentTracker(Tracker(odometry, stationary, motion), begin, initial_scans, monitor)
+    tracker = SegmentTracker(Tracker(odometry, stationary, motion), begin, initial_scans)
+    windows = WindowTracker(tracker, monitor, noise_m)
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
-        results = checkpoints.begin(tracker, keyframing)
+        results = checkpoints.begin(windows, keyframing)
     middle = tracker.middle
     ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
     # Scans that are still open at the end of the recording have their word there.
-    for loaded in chain(ahead, (None,)):
+    for loaded in windows.scans(chain(ahead, (None,))):
         decided = tracker.finish() if loaded is None else tracker.decide(loaded, tracker.present.track(loaded))
+        decided = windows.decide(decided)
         for tracked in decided:
-            if results and tracker.has_middles:
+            if results and tracker.has_middles and not tracked.is_two_sided:
                 results[-1] = between_middles(results[-1], middle, tracked)
             results.append(_observed(tracked, len(results), keyframing, monitor))
             middle = tracked.middle
@@ -82,9 +87,9 @@ def estimate(
         if decided and should_stop():
             break
         if checkpoints is not None and keyframing is not None:
-            checkpoints.offer(results, tracker, keyframing)
+            checkpoints.offer(results, windows, keyframing)
     if checkpoints is not None and keyframing is not None:
-        checkpoints.close(results, tracker, keyframing, len(results) == len(sequence))
+        checkpoints.close(results, windows, keyframing, len(results) == len(sequence))
     return results
 
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from lslam.config.odometry import RegistrationConfig
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.inertial.constant_velocity import ConstantVelocity
-from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.registration.robust import UsualAgreement
 from lslam.types.motion_prior import MotionPrior
@@ -25,12 +24,16 @@ Begin = Callable[[Floats], Tracker]
 
 @dataclass(frozen=True)
 class Tracked:
-    """A scan with its result; sweep, middle : of the tracker, as of this scan."""
+    """A scan with its result; sweep, middle : of the tracker, as of this scan.
+
+    is_two_sided : later scans told the motion within the sweep as well
+    """
 
     loaded: Loaded
     result: ScanResult
     sweep: MotionPrior
     middle: tuple[int, Floats]
+    is_two_sided: bool = False
 
 
 class SegmentTracker:
@@ -42,17 +45,10 @@ class SegmentTracker:
     a row than initialise a map, the scans since are a new segment. Scans that agree far less than those before do not count.
 
     begin : None for a method that has one map only; initial_scans : that initialise a map
-    monitor : checks the poses that were found
     """
 
-    def __init__(
-        self,
-        tracker: Tracker,
-        begin: Begin | None = None,
-        initial_scans: int = 5,
-        monitor: IntegrityMonitor | None = None,
-    ) -> None:
-        self._tracker, self._begin, self._initial_scans, self.monitor = tracker, begin, initial_scans, monitor
+    def __init__(self, tracker: Tracker, begin: Begin | None = None, initial_scans: int = 5) -> None:
+        self._tracker, self._begin, self._initial_scans = tracker, begin, initial_scans
         self._segment = 0
         # What scans agreed with their maps: by less than a share of that, scans of nothing agree as well.
         self._usual = UsualAgreement(RegistrationConfig().min_agreement)
@@ -117,15 +113,12 @@ class SegmentTracker:
 
     def state(self) -> State:
         """What `restore` needs to go on from here."""
-        monitor = None if self.monitor is None else self.monitor.state()
-        return {**self._tracker.state(), "segment": self._segment, "usual": self._usual.usual, "monitor": monitor}
+        return {**self._tracker.state(), "segment": self._segment, "usual": self._usual.usual}
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         self._tracker.restore(state)
         self._segment, self._usual.usual = int(state["segment"]), float(state["usual"])
-        if self.monitor is not None:
-            self.monitor.restore(state["monitor"])
 
     def _new_segment(self) -> list[Tracked]:
         assert self._other is not None

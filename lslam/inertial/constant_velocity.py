@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
+from lslam.inertial.course import COVARIANCE, Course
 from lslam.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import GravityDirection, ImuState
@@ -109,6 +111,8 @@ class ConstantVelocity(Stateful, MotionModel):
         self._seen: Floats | None = None
         # The newest prediction and its stamp, ns: several ask for the same one.
         self._predicted: tuple[int, Floats] | None = None
+        # Tells the motion of the sweeps that it knows instead.
+        self.course: Course | None = None
 
     def predict(self, stamp_ns: int) -> Floats:
         """(4, 4) T_world_lidar expected at `stamp_ns`; that of the first scan before it."""
@@ -122,15 +126,23 @@ class ConstantVelocity(Stateful, MotionModel):
     @property
     def is_known(self) -> bool:
         """Whether there is a velocity yet."""
-        return self._step_s > 0
+        return self._step_s > 0 or self.course is not None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
-        return self.steady(self.predict(stamp_ns), span)
+        knots = knots_over(span)
+        poses = None if self.course is None else self.course.at(stamp_ns, knots)
+        if poses is None:
+            return self.steady(self.predict(stamp_ns), span)
+        told = MotionPrior(knots, poses, change=COVARIANCE)
+        # The world begins where the first scan is expected.
+        return (
+            told if self._instant_ns is not None else replace(told, poses=self._pose @ se3.relative(told.pose, poses))
+        )
 
     def steady(self, pose: Floats, span: Span) -> MotionPrior:
         """As `sweep`, through the `pose` (4, 4) at the stamp."""
-        if span.seconds <= 0 or not self.is_known:
+        if span.seconds <= 0 or self._step_s <= 0:
             return MotionPrior.at_once(pose)
         return _steady(pose, self._twist / self._step_s, knots_over(span))
 
@@ -139,6 +151,8 @@ class ConstantVelocity(Stateful, MotionModel):
 
         Continuing the change of velocity as well was tried: it amplifies jitter more than it follows bends.
         """
+        if prior.change is not None:
+            return prior
         middle, instant_ns = middle_of(prior, stamp_ns, pose)
         step = 0.0 if self._instant_ns is None else (instant_ns - self._instant_ns) * 1e-9
         if len(prior.times) < 2 or step <= 0:

@@ -24,6 +24,7 @@ class Method(Protocol):
     A method with an attribute `needs_rings` that is true gets scans whose `rings` are filled in (`input.rings`).
     `prepare` knows nothing of earlier scans, so the front end runs it for the next scan while `register` works on this one.
     One with `ignores_prior` that is true predicts by itself: an IMU is of no use to it but where a scan fails.
+    One with `follows_course` that is true can register a sweep again along a course that later scans told as well.
     A method that deskews has an attribute `deskew` that says how, in words.
     """
 

@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import replace
-
 from lslam.config.config import Config
-from lslam.odometry.elastic import SweepPoints, register_elastic
 from lslam.odometry.elastic_constraints import LastSweep
 from lslam.odometry.icp import Icp, registration_of
-from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, result_of
-from lslam.registration.voxel_target import MIN_SOURCE_POINTS
+from lslam.registration.solver import RegistrationResult
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -42,22 +35,9 @@ class CtIcp(Icp):
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
     ) -> RegistrationResult:
         """Both poses of the sweep."""
-        is_one_pose = prepared.source_times is None or len(prior.times) < 2
-        if is_one_pose or len(self.registration.map) == 0 or len(prepared.source) < MIN_SOURCE_POINTS:
+        if not self.is_elastic(prepared, prior):
             return super().register(scan, prepared, prior, is_near)
-        began, registration = time.perf_counter(), self.registration
-        attempt, c = registration.attempt(prepared, prior.pose, is_near), registration.config
-        constraints = self._last.constraints(scan.stamp_ns, prior)
-        points = SweepPoints(prepared, registration.map.levels, c.sigma, c.blob_weight)
-        width = max(attempt.annealing.start, c.kernel_min)
-        annealing = Annealing(width, c.kernel_min, c.kernel_decay, c.max_iterations)
-        elastic = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)
-        result = attempt.judged(result_of(elastic.found, prior.pose, len(prepared.source)))
-        sweep = elastic.sweep.prior if result.ok else None
-        return replace(
-            result, points=deskew(prepared, sweep or prior), detail=(prior, elastic), sweep=sweep, map_age=self.map_age,
-            stages={"register": time.perf_counter() - began},
-        )  # fmt: skip
+        return self.register_sweep(prepared, self._last.constraints(scan.stamp_ns, prior), prior, is_near)
 
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
         """Enter the scan into the local map, and its sweep as the last one."""

@@ -48,7 +48,13 @@ class DeskewUncertainty(Stateful):
         """
         step_s = 0.0 if self._stamp_ns is None else 1e-9 * (stamp_ns - self._stamp_ns)
         if is_registered and self._span_s > 0 and step_s > 0:
-            self._learn(se3.relative(self._pose, pose), step_s)
+            expected = se3.log(self._within) * step_s / self._span_s
+            if prior.change is None:
+                off = se3.log(se3.relative(se3.exp(expected), se3.relative(self._pose, pose)))
+            else:
+                # Twice as much is between two velocities as between one and the way to the next sweep, which both tell.
+                off = (se3.log(se3.relative(prior.poses[0], prior.poses[-1])) * step_s / prior.span_s - expected) / 2
+            self._learn(off, step_s)
         # The first sweep was deskewed by the second scan's registration: their residual is zero by construction.
         self._span_s = prior.span_s if is_registered and self._stamp_ns is not None else 0.0
         self._lead_s = float(prior.times[0] + prior.times[-1])
@@ -63,12 +69,11 @@ class DeskewUncertainty(Stateful):
         share = self.scans / (self.scans + DIRECTIONS)
         return noise.rotated(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
 
-    def _learn(self, moved: Floats, step_s: float) -> None:
-        """From the motion (4, 4) found over `step_s` seconds since the last scan."""
-        expected = se3.exp(se3.log(self._within) * step_s / self._span_s)
+    def _learn(self, change: Floats, step_s: float) -> None:
+        """From the change (6,) of the motion over `step_s` seconds since the last scan."""
         share, lead = min(self._span_s / step_s, 1.0), min(self._lead_s / step_s, 1.0)
         # The ratio to the prediction error a dt^2 - a L dt / 2 of the error a (L dt / 4 - L^2 / 12 + (T^2 - L^2) / 24).
         part = lead * (3.0 - lead) / (12.0 - 6.0 * lead) + (share**2 - lead**2) / (24.0 - 12.0 * lead)
-        off = part * se3.log(se3.relative(expected, moved))
+        off = part * change
         self.scans = min(self.scans + 1, MEMORY)
         self._mean = self._mean + (np.outer(off, off) - self._mean) / self.scans

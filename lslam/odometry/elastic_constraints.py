@@ -51,6 +51,13 @@ class ElasticConstraints:
     skew: Floats
     skewed: Floats
 
+    @classmethod
+    def of_course(cls, prior: MotionPrior) -> ElasticConstraints:
+        """Of a sweep whose motion later scans told as well: the map that they made has no skew."""
+        assert prior.change is not None
+        fixed = np.eye(6) / LEAST_SKEW**2
+        return cls(ElasticSweep.of(prior), NOTHING, _inverse(prior.change), 0.0, np.zeros(6), fixed)
+
     def add_to(self, A: Floats, b: Floats, sweep: ElasticSweep) -> None:
         """Add all to the normal equations (18, 18), (18,) of begin, end and skew, in place.
 
@@ -94,7 +101,7 @@ class LastSweep(Stateful):
         location, since = NOTHING, 0.0
         if self._ends is not None and P is not None and abs(begin_ns - self._ends_ns[1]) < length / 2:
             location, since = _inverse(MISS**2 * Q + P[6:, 6:]), 1.0
-            if not prior.is_felt:
+            if not prior.is_bent:
                 twist = se3.log(se3.relative(*self._ends)) / length
                 begin, end = (self._ends[1] @ se3.exp((ns - self._ends_ns[1]) * twist) for ns in (begin_ns, end_ns))
                 expected = ElasticSweep(se3.normalise(begin), se3.normalise(end), prior.times)

@@ -30,7 +30,7 @@ class ElasticSweep:
     def of(cls, prior: MotionPrior) -> ElasticSweep:
         """Through both ends of the prior, with its bend where that was felt."""
         straight = cls(prior.poses[0], prior.poses[-1], prior.times)
-        if not prior.is_felt:
+        if not prior.is_bent:
             return straight
         return cls(straight.begin, straight.end, prior.times, se3.relative(straight.poses, prior.poses))
 

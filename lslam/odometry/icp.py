@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.config.odometry import RecoveryConfig
 from lslam.errors import UsageError
+from lslam.odometry.elastic import SweepPoints, register_elastic
+from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.keyframe_submap import KeyframeSubmap
 from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty
@@ -20,8 +22,9 @@ from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.map_scans import make_map_scans
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
-from lslam.registration.solver import RegistrationResult
-from lslam.registration.voxel_target import VoxelTarget
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult, result_of
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS, VoxelTarget
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -76,7 +79,9 @@ class Icp(Stateful):
     def register(
         self, scan: Scan, prepared: PreparedPoints, prior: MotionPrior, is_near: bool = False
     ) -> RegistrationResult:
-        """Align with the local map."""
+        """Align with the local map, elastically where later scans told the motion as well."""
+        if prior.change is not None and self.is_elastic(prepared, prior):
+            return self.register_sweep(prepared, ElasticConstraints.of_course(prior), prior, is_near)
         began = time.perf_counter()
         points = deskew(prepared, prior)
         deskewed = time.perf_counter()
@@ -85,6 +90,34 @@ class Icp(Stateful):
         if points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
         return replace(result, map_age=self.map_age, stages=stages)
+
+    def is_elastic(self, prepared: PreparedPoints, prior: MotionPrior) -> bool:
+        """Whether both ends of a sweep can be told: by points with times, on a map, when the speed is known."""
+        is_one_pose = prepared.source_times is None or len(prior.times) < 2
+        return not is_one_pose and len(self.registration.map) > 0 and len(prepared.source) >= MIN_SOURCE_POINTS
+
+    def register_sweep(
+        self, prepared: PreparedPoints, constraints: ElasticConstraints, prior: MotionPrior, is_near: bool
+    ) -> RegistrationResult:
+        """Both poses of the sweep."""
+        began, registration = time.perf_counter(), self.registration
+        attempt, c = registration.attempt(prepared, prior.pose, is_near), registration.config
+        points = SweepPoints(prepared, registration.map.levels, c.sigma, c.blob_weight)
+        width = max(attempt.annealing.start, c.kernel_min)
+        annealing = Annealing(width, c.kernel_min, c.kernel_decay, c.max_iterations)
+        elastic = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)
+        result = attempt.judged(result_of(elastic.found, prior.pose, len(prepared.source)))
+        sweep = replace(elastic.sweep.prior, change=prior.change) if result.ok else None
+        return replace(
+            result, points=deskew(prepared, sweep or prior), detail=(prior, elastic), sweep=sweep, map_age=self.map_age,
+            stages={"register": time.perf_counter() - began},
+        )  # fmt: skip
+
+    @property
+    def follows_course(self) -> bool:
+        """Whether sweeps are registered elastically along the course: point to plane, on a map of many scans."""
+        c = self.registration.config
+        return self.registration.preprocess.deskew and c.target == "map" and c.residual in (None, "plane")
 
     @property
     def map_age(self) -> float:

@@ -92,6 +92,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
             sequence, job.odometry, threads=config.input.workers, begin=_begin_segment(job, inertial),
             initial_scans=config.registration.start_scans, stationary=stationary, motion=motion,
             should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing, checkpoints=checkpoints, monitor=monitor,
+            noise_m=config.registration.sigma,
         )  # fmt: skip
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:

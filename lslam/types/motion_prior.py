@@ -21,6 +21,7 @@ class MotionPrior:
         the motion model has none
     link : what joins the scan to the one before in a smoother; None where the motion model is for none
     is_felt : an IMU measured the motion within the sweep
+    change : (6, 6) covariance of the motion from begin to end, world axes, which later scans told as well; None elsewhere
     """
 
     times: NDArray[np.float64]
@@ -28,6 +29,7 @@ class MotionPrior:
     covariance: NDArray[np.float64] | None = None
     link: SweepLink | None = None
     is_felt: bool = False
+    change: NDArray[np.float64] | None = None
 
     @classmethod
     def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:
@@ -42,6 +44,11 @@ class MotionPrior:
             return first
         at: NDArray[np.float64] = poses_at(self.times_ns, self.poses, np.zeros(1, np.int64))[0]
         return at
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the motion within the sweep is more than a line through both ends."""
+        return self.is_felt or self.change is not None
 
     @property
     def times_ns(self) -> NDArray[np.int64]:

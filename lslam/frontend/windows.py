@@ -1,0 +1,164 @@
+"""Windows of scans, tracked again along the course that they tell where constant velocity displaces their points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.frontend.segments import SegmentTracker, Tracked
+from lslam.frontend.tracker import Loaded
+from lslam.geometry import se3
+from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.inertial.course import NEIGHBOURS, Course
+from lslam.integrity.monitor import IntegrityMonitor
+from lslam.odometry.base import Odometry, Resumable
+from lslam.types.state import State
+
+Floats = NDArray[np.float64]
+
+# Scans: two seconds, which are held in memory.
+WINDOW = 20
+# Times that a window is tracked again: its first course is told by scans that constant velocity deskewed.
+PASSES = 2
+# Of the points of a scan, and of the knots of its sweep, that tell by how much a course displaces its points.
+EVERY_POINT, EVERY_KNOT = 97, 4
+
+
+class WindowTracker:
+    """Decides scans window by window where their method follows a course and their sweeps take time, and others as they come.
+
+    A window is tracked with constant velocity first. Where its points are displaced by more than their noise, it is tracked
+    again from where it began, twice, along the course through the middles of its sweeps. A run goes on from where a window began.
+
+    monitor : sees the scans that are decided; noise_m : of a point
+    """
+
+    def __init__(self, tracker: SegmentTracker, monitor: IntegrityMonitor | None, noise_m: float) -> None:
+        self._tracker, self._monitor, self._noise_m = tracker, monitor, noise_m
+        self.is_windowed = (
+            bool(getattr(tracker.odometry, "follows_course", False))
+            and isinstance(tracker.odometry, Resumable)
+            and isinstance(tracker.present.motion, ConstantVelocity)
+        )
+        self._scans: list[Loaded | None] = []
+        # Of `_scans`, those that are to be tracked once more.
+        self._again: list[Loaded | None] = []
+        self._decided: list[Tracked] = []
+        self._passes = 0
+        # Seconds that the passes before took, by the scans of the window and their stages.
+        self._spent: list[dict[str, float]] = []
+        self._begun: State = {}
+        # Instants, ns, and poses of the last middles before the window.
+        self._before: list[tuple[int, Floats]] = []
+
+    @property
+    def odometry(self) -> Odometry:
+        """The method with the map of the present segment."""
+        return self._tracker.odometry
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether `state` is complete."""
+        return bool(self._scans) or self._tracker.is_settled
+
+    def scans(self, ahead: Iterable[Loaded | None]) -> Iterator[Loaded | None]:
+        """The scans to track next: those to come, None at the end, and between them a window once more."""
+        for loaded in ahead:
+            if not self._scans and self._is_begin(loaded):
+                self._begun = deepcopy(self._tracker.state())
+                self._scans.append(loaded)
+            elif self._scans:
+                self._scans.append(loaded)
+            yield loaded
+            while self._again:
+                yield self._again.pop(0)
+
+    def decide(self, decided: list[Tracked]) -> list[Tracked]:
+        """The scans whose window is over, after the tracker has decided these."""
+        if not self._scans:
+            return decided
+        self._decided += decided
+        is_end = self._scans[-1] is None
+        is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
+        if self._again or not (is_full or is_end):
+            return []
+        if self._passes < PASSES and (self._passes > 0 or self._is_bent()):
+            return self._track_again()
+        out = [
+            replace(t, is_two_sided=self._passes > 0, result=replace(t.result, stages=_sum(t.result.stages, before)))
+            for t, before in zip(self._decided, self._spent or [{}] * len(self._decided), strict=True)
+        ]
+        self._set_course(None)
+        self._before = self._middles()[-NEIGHBOURS:]
+        self._scans, self._decided, self._spent, self._passes = [], [], [], 0
+        return out
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        state = self._begun if self._scans else self._tracker.state()
+        return {**state, "before": self._before, "monitor": None if self._monitor is None else self._monitor.state()}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        self._tracker.restore(state)
+        self._before = list(state["before"])
+        if self._monitor is not None:
+            self._monitor.restore(state["monitor"])
+
+    def _is_begin(self, loaded: Loaded | None) -> bool:
+        """Whether a window begins with the scan."""
+        scan = None if loaded is None else loaded.scan
+        return self.is_windowed and scan is not None and scan.span.seconds > 0 and self._tracker.is_settled
+
+    def _middles(self) -> list[tuple[int, Floats]]:
+        """Instants and poses of the middles of registered sweeps, up to the end of the window."""
+        now = [t.middle for t in self._decided if t.result.status == "ok" and not t.result.is_repeated]
+        return [*self._before, *now]
+
+    def _course(self) -> Course:
+        instants, poses = zip(*self._middles(), strict=True)
+        return Course(np.array(instants, np.int64), np.stack(poses))
+
+    def _track_again(self) -> list[Tracked]:
+        spent = self._spent or [{}] * len(self._decided)
+        self._spent = [_sum(t.result.stages, before) for t, before in zip(self._decided, spent, strict=True)]
+        course = self._course()
+        self._tracker.restore(deepcopy(self._begun))
+        self._set_course(course)
+        self._again, self._decided = list(self._scans), []
+        self._passes += 1
+        return []
+
+    def _set_course(self, course: Course | None) -> None:
+        motion = self._tracker.present.motion
+        assert isinstance(motion, ConstantVelocity)
+        motion.course = course
+
+    def _is_bent(self) -> bool:
+        """Whether the window's course, in one segment, displaces the points of most sweeps by more than their noise."""
+        if len({t.result.segment for t in self._decided}) > 1 or len(self._middles()) < 2 * NEIGHBOURS:
+            return False
+        course = self._course()
+        squares = [square for t in self._decided if (square := _displacement2(t, course)) is not None]
+        return len(squares) > 0 and float(np.median(squares)) > self._noise_m**2
+
+
+def _displacement2(tracked: Tracked, course: Course) -> float | None:
+    """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is unknown."""
+    scan, sweep = tracked.loaded.scan, tracked.sweep
+    told = course.at(tracked.result.stamp_ns, sweep.times)
+    if scan is None or told is None:
+        return None
+    middle = len(told) // 2
+    within, course_within = (se3.relative(poses[middle], poses)[::EVERY_KNOT] for poses in (sweep.poses, told))
+    points = scan.points[::EVERY_POINT].astype(np.float64)
+    off = [se3.apply(change, points) - points for change in se3.relative(within, course_within)]
+    return float(np.mean(np.sum(np.square(off), axis=-1)))
+
+
+def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
+    return {name: a.get(name, 0.0) + b.get(name, 0.0) for name in a | b}
