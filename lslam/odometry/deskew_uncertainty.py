@@ -52,8 +52,7 @@ class DeskewUncertainty(Stateful):
             if prior.change is None:
                 off = se3.log(se3.relative(se3.exp(expected), se3.relative(self._pose, pose)))
             else:
-                # Twice as much is between two velocities as between one and the way to the next sweep, which both tell.
-                off = (se3.log(se3.relative(prior.poses[0], prior.poses[-1])) * step_s / prior.span_s - expected) / 2
+                off = se3.log(se3.relative(prior.poses[0], prior.poses[-1])) * step_s / prior.span_s - expected
             self._learn(off, step_s)
         # The first sweep was deskewed by the second scan's registration: their residual is zero by construction.
         self._span_s = prior.span_s if is_registered and self._stamp_ns is not None else 0.0
