@@ -24,8 +24,6 @@ Floats = NDArray[np.float64]
 WINDOW = 20
 # Times that a window is tracked again: its first course is told by scans that constant velocity deskewed.
 PASSES = 2
-# Of the points of a scan, and of the knots of its sweep, that tell by how much a course displaces its points.
-EVERY_POINT, EVERY_KNOT = 97, 4
 
 
 class WindowTracker:
@@ -149,15 +147,15 @@ class WindowTracker:
 
 def _displacement2(tracked: Tracked, course: Course) -> float | None:
     """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is unknown."""
-    scan, sweep = tracked.loaded.scan, tracked.sweep
-    told = course.at(tracked.result.stamp_ns, sweep.times)
-    if scan is None or told is None:
+    told = course.at(tracked.result.stamp_ns, tracked.sweep.times)
+    if told is None:
         return None
-    middle = len(told) // 2
-    within, course_within = (se3.relative(poses[middle], poses)[::EVERY_KNOT] for poses in (sweep.poses, told))
-    points = scan.points[::EVERY_POINT].astype(np.float64)
-    off = [se3.apply(change, points) - points for change in se3.relative(within, course_within)]
-    return float(np.mean(np.sum(np.square(off), axis=-1)))
+    middle, source = len(told) // 2, tracked.loaded.prepared.source
+    within, course_within = (se3.relative(poses[middle], poses) for poses in (tracked.sweep.poses, told))
+    change = (se3.relative(within, course_within) - np.eye(4))[:, :3]
+    points = np.column_stack([source, np.ones(len(source))])
+    moments = np.einsum("na,nb->ab", points, points) / max(len(points), 1)
+    return float(np.einsum("kia,ab,kib->k", change, moments, change).mean())
 
 
 def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:

@@ -39,22 +39,7 @@ class Course:
 
 def natural_spline(nodes: Floats, values: Floats, times: Floats) -> Floats:
     """(K, C) cubic spline at `times` (K,) through `values` (N, C) at increasing `nodes` (N,), N > 2; beyond them straight."""
-    step = np.diff(nodes)
-    slope = np.diff(values, axis=0) / step[:, None]
-    # Second derivatives (N, C), none at both ends: elimination, and substitution in the opposite direction.
-    bend, diagonal = np.zeros_like(values), np.ones(len(nodes))
-    for i in range(1, len(step)):
-        factor = step[i - 1] / diagonal[i - 1] if i > 1 else 0.0
-        diagonal[i] = 2 * (step[i - 1] + step[i]) - factor * step[i - 1]
-        bend[i] = 6 * (slope[i] - slope[i - 1]) - factor * bend[i - 1]
-    for i in range(len(step) - 1, 0, -1):
-        bend[i] = (bend[i] - step[i] * bend[i + 1]) / diagonal[i]
-    inside = np.clip(times, nodes[0], nodes[-1])
-    left = np.clip(np.searchsorted(nodes, inside, side="right") - 1, 0, len(step) - 1)
-    h, a = step[left, None], (inside - nodes[left])[:, None]
-    b = h - a
-    line = (values[left] * b + values[left + 1] * a) / h
-    curve = (bend[left] * (b**3 / h - h * b) + bend[left + 1] * (a**3 / h - h * a)) / 6
-    first, last = slope[0] - step[0] * bend[1] / 6, slope[-1] + step[-1] * bend[-2] / 6
-    before, after = np.minimum(times - nodes[0], 0.0)[:, None], np.maximum(times - nodes[-1], 0.0)[:, None]
-    return np.asarray(line + curve + before * first + after * last)
+    from scipy.interpolate import CubicSpline
+
+    spline, inside = CubicSpline(nodes, values, bc_type="natural"), np.clip(times, nodes[0], nodes[-1])
+    return np.asarray(spline(inside) + (times - inside)[:, None] * spline(inside, 1))
