@@ -74,10 +74,7 @@ def estimate(
         results = checkpoints.begin(windows, keyframing)
     middle = tracker.middle
     ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
-    # Scans that are still open at the end of the recording have their word there.
-    for loaded in windows.scans(chain(ahead, (None,))):
-        decided = tracker.finish() if loaded is None else tracker.decide(loaded, tracker.present.track(loaded))
-        decided = windows.decide(decided)
+    for decided in windows.decided(chain(ahead, (None,))):
         for tracked in decided:
             if results and tracker.has_middles and not tracked.is_two_sided:
                 results[-1] = between_middles(results[-1], middle, tracked)

@@ -119,6 +119,7 @@ class SegmentTracker:
         """Go on where `state` was taken."""
         self._tracker.restore(state)
         self._segment, self._usual.usual = int(state["segment"]), float(state["usual"])
+        self._other, self._open = None, []
 
     def _new_segment(self) -> list[Tracked]:
         assert self._other is not None

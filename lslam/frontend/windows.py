@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from dataclasses import replace
@@ -22,15 +23,14 @@ Floats = NDArray[np.float64]
 
 # Scans: two seconds, which are held in memory.
 WINDOW = 20
-# Times that a window is tracked again: its first course is told by scans that constant velocity deskewed.
-PASSES = 2
 
 
 class WindowTracker:
-    """Decides scans window by window where their method follows a course and their sweeps take time, and others as they come.
+    """Tracks scans window by window where their method follows a course and their sweeps take time, and others as they come.
 
     A window is tracked with constant velocity first. Where its points are displaced by more than their noise, it is tracked
-    again from where it began, twice, along the course through the middles of its sweeps. A run goes on from where a window began.
+    again from where it began, along the course through the middles of its sweeps, as long as more points agree. A run goes on
+    from where a window began.
 
     monitor : sees the scans that are decided; noise_m : of a point
     """
@@ -42,13 +42,9 @@ class WindowTracker:
             and isinstance(tracker.odometry, Resumable)
             and isinstance(tracker.present.motion, ConstantVelocity)
         )
+        # Of the open window, None: the end of the recording.
         self._scans: list[Loaded | None] = []
-        # Of `_scans`, those that are to be tracked once more.
-        self._again: list[Loaded | None] = []
         self._decided: list[Tracked] = []
-        self._passes = 0
-        # Seconds that the passes before took, by the scans of the window and their stages.
-        self._spent: list[dict[str, float]] = []
         self._begun: State = {}
         # Instants, ns, and poses of the last middles before the window.
         self._before: list[tuple[int, Floats]] = []
@@ -63,37 +59,18 @@ class WindowTracker:
         """Whether `state` is complete."""
         return bool(self._scans) or self._tracker.is_settled
 
-    def scans(self, ahead: Iterable[Loaded | None]) -> Iterator[Loaded | None]:
-        """The scans to track next: those to come, None at the end, and between them a window once more."""
+    def decided(self, ahead: Iterable[Loaded | None]) -> Iterator[list[Tracked]]:
+        """With each of the scans to come, None at the end, those that are decided: one, none, or all of a window."""
         for loaded in ahead:
-            if not self._scans and self._is_begin(loaded):
+            if not self._scans and not self._is_begin(loaded):
+                yield self._track(loaded)
+                continue
+            if not self._scans:
                 self._begun = deepcopy(self._tracker.state())
-                self._scans.append(loaded)
-            elif self._scans:
-                self._scans.append(loaded)
-            yield loaded
-            while self._again:
-                yield self._again.pop(0)
-
-    def decide(self, decided: list[Tracked]) -> list[Tracked]:
-        """The scans whose window is over, after the tracker has decided these."""
-        if not self._scans:
-            return decided
-        self._decided += decided
-        is_end = self._scans[-1] is None
-        is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
-        if self._again or not (is_full or is_end):
-            return []
-        if self._passes < PASSES and (self._passes > 0 or self._is_bent()):
-            return self._track_again()
-        out = [
-            replace(t, is_two_sided=self._passes > 0, result=replace(t.result, stages=_sum(t.result.stages, before)))
-            for t, before in zip(self._decided, self._spent or [{}] * len(self._decided), strict=True)
-        ]
-        self._set_course(None)
-        self._before = self._middles()[-NEIGHBOURS:]
-        self._scans, self._decided, self._spent, self._passes = [], [], [], 0
-        return out
+            self._scans.append(loaded)
+            self._decided += self._track(loaded)
+            is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
+            yield self._close() if is_full or loaded is None else []
 
     def state(self) -> State:
         """What `restore` needs to go on from here."""
@@ -112,6 +89,34 @@ class WindowTracker:
         scan = None if loaded is None else loaded.scan
         return self.is_windowed and scan is not None and scan.span.seconds > 0 and self._tracker.is_settled
 
+    def _track(self, loaded: Loaded | None) -> list[Tracked]:
+        # Scans that are still open at the end of the recording have their word there.
+        if loaded is None:
+            return self._tracker.finish()
+        return self._tracker.decide(loaded, self._tracker.present.track(loaded))
+
+    def _close(self) -> list[Tracked]:
+        """The scans of the window, along their course where it bends and more of their points agree along it."""
+        is_bent, first = self._is_bent(), self._agreeing()
+        before, gain = first, math.inf
+        # As long as more points agree than may do by chance: the first course is told by scans that constant velocity deskewed.
+        while is_bent and gain > math.sqrt(before):
+            before = self._agreeing()
+            self._track_again(self._course())
+            gain = self._agreeing() - before
+            is_decided = self._tracker.is_settled or self._scans[-1] is None
+            is_bent = is_decided and self._is_whole() and self._agreeing() > first
+            if not is_bent:
+                self._track_again(None)
+        self._set_course(None)
+        out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
+        self._before = self._middles()[-NEIGHBOURS:]
+        self._scans, self._decided = [], []
+        return out
+
+    def _agreeing(self) -> int:
+        return sum(tracked.result.inliers for tracked in self._decided)
+
     def _middles(self) -> list[tuple[int, Floats]]:
         """Instants and poses of the middles of registered sweeps, up to the end of the window."""
         now = [t.middle for t in self._decided if t.result.status == "ok" and not t.result.is_repeated]
@@ -121,24 +126,26 @@ class WindowTracker:
         instants, poses = zip(*self._middles(), strict=True)
         return Course(np.array(instants, np.int64), np.stack(poses))
 
-    def _track_again(self) -> list[Tracked]:
-        spent = self._spent or [{}] * len(self._decided)
-        self._spent = [_sum(t.result.stages, before) for t, before in zip(self._decided, spent, strict=True)]
-        course = self._course()
+    def _track_again(self, course: Course | None) -> None:
+        spent = [tracked.result.stages for tracked in self._decided]
         self._tracker.restore(deepcopy(self._begun))
         self._set_course(course)
-        self._again, self._decided = list(self._scans), []
-        self._passes += 1
-        return []
+        self._decided = [tracked for loaded in self._scans for tracked in self._track(loaded)]
+        for k, (tracked, before) in enumerate(zip(self._decided, spent, strict=False)):
+            stages = _sum(tracked.result.stages, before)
+            self._decided[k] = replace(tracked, result=replace(tracked.result, stages=stages))
 
     def _set_course(self, course: Course | None) -> None:
         motion = self._tracker.present.motion
         assert isinstance(motion, ConstantVelocity)
         motion.course = course
 
+    def _is_whole(self) -> bool:
+        return len({tracked.result.segment for tracked in self._decided}) == 1
+
     def _is_bent(self) -> bool:
         """Whether the window's course, in one segment, displaces the points of most sweeps by more than their noise."""
-        if len({t.result.segment for t in self._decided}) > 1 or len(self._middles()) < 2 * NEIGHBOURS:
+        if not self._is_whole() or len(self._middles()) < 2 * NEIGHBOURS:
             return False
         course = self._course()
         squares = [square for t in self._decided if (square := _displacement2(t, course)) is not None]

@@ -11,9 +11,9 @@ Floats = NDArray[np.float64]
 
 # Middles on each side of a sweep. From one to the next its influence on a natural spline falls by 3.7.
 NEIGHBOURS = 3
-# m and rad, sigma of the motion from begin to end of a sweep.
-MOTION_SIGMA = np.repeat([0.003, 0.001], 3)
-COVARIANCE = np.diag(MOTION_SIGMA**2)
+# Of the motion from begin to end of a sweep.
+MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
+COVARIANCE = np.diag(np.repeat([MOTION_SIGMA_M, MOTION_SIGMA_RAD], 3) ** 2)
 
 
 class Course:
