@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
+from lslam.odometry.base import Traits
 from lslam.readers import open_sequence
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -117,7 +118,7 @@ class StampedAtTheEnd(StampedInTheMiddle):
     LATER_NS = 100_000_000
 
 
-class Standstill:
+class Standstill(Traits):
     """An odometry that registers nothing and says it did: the sentinel every accuracy gate must catch."""
 
     def prepare(self, scan: Scan) -> None:

@@ -17,11 +17,20 @@ from lslam.pipeline.check import check_config
 from lslam.readers import open_sequence
 
 MODULE = """
+from lslam.odometry.base import Traits
 from lslam.readers import scan_folder
 
 
+class Method(Traits):
+    needs_rings = True
+
+
 def method(config):
-    return "a method"
+    return Method()
+
+
+def bare(config):
+    return object()
 
 
 def descriptor(config):
@@ -38,6 +47,7 @@ def open_folder(path, overrides, rest):
 ENTRIES = """
 [lslam.methods]
 theirs = theirs:method
+bare = theirs:bare
 broken = theirs:nothing
 
 [lslam.descriptors]
@@ -71,7 +81,14 @@ def test_their_methods_and_descriptors_are_found(theirs: Path) -> None:
     check_config(wanted)
     assert known_methods()["theirs"] == "from theirs:method"
     assert "theirs" not in sys.modules
-    assert [create_odometry(wanted), create_descriptor(wanted.loops)] == ["a method", "a descriptor"]
+    assert create_descriptor(wanted.loops) == "a descriptor"
+    odometry = create_odometry(wanted)
+    assert (odometry.needs_rings, odometry.ignores_prior) == (True, False)
+
+
+def test_a_method_that_does_not_declare_what_it_needs_is_refused(theirs: Path) -> None:
+    with pytest.raises(UsageError, match="needs_rings"):
+        create_odometry(config(odometry={"method": "bare"}))
 
 
 def test_they_do_not_take_the_place_of_ours(theirs: Path) -> None:

@@ -38,7 +38,7 @@ class WindowTracker:
     def __init__(self, tracker: SegmentTracker, monitor: IntegrityMonitor | None, noise_m: float) -> None:
         self._tracker, self._monitor, self._noise_m = tracker, monitor, noise_m
         self.is_windowed = (
-            bool(getattr(tracker.odometry, "follows_course", False))
+            tracker.odometry.follows_course
             and isinstance(tracker.odometry, Resumable)
             and isinstance(tracker.present.motion, ConstantVelocity)
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
+from lslam.errors import UsageError
 from lslam.plugins import factory, known, require
 
 if TYPE_CHECKING:
@@ -111,5 +112,16 @@ def require_method(name: str) -> None:
 
 
 def create_odometry(config: Config) -> Odometry:
-    """The method `odometry.method` names. Raises UsageError with the nearest name when there is none."""
-    return cast("Odometry", factory(GROUP, METHODS, config.odometry.method, "method")(config))
+    """The method `odometry.method` names.
+
+    Raises UsageError with the nearest name when there is none, and when another package's lacks what methods declare.
+    """
+    from lslam.odometry.base import Traits
+
+    name = config.odometry.method
+    odometry = cast("Odometry", factory(GROUP, METHODS, name, "method")(config))
+    if lacking := [trait for trait in Traits.__annotations__ if not hasattr(odometry, trait)]:
+        raise UsageError(
+            f"method {name!r} declares no {', '.join(lacking)}: its class must inherit lslam.odometry.base.Traits"
+        )
+    return odometry

@@ -16,17 +16,31 @@ from lslam.types.scan_result import ScanEquations, ScanResult
 from lslam.types.state import State
 
 
+class Traits:
+    """What a method declares of itself; the usual values, which it inherits."""
+
+    # How it deskews, in words; empty: not at all.
+    deskew: str = ""
+    # It gets scans whose `rings` are filled in (`input.rings`).
+    needs_rings: bool = False
+    # It predicts by itself: an IMU is of no use to it but where a scan fails.
+    ignores_prior: bool = False
+    # It can register a sweep again along a course that later scans told as well.
+    follows_course: bool = False
+
+
 class Method(Protocol):
-    """What all methods have in common.
+    """What all methods have in common, the attributes of `Traits` among it.
 
     Scan + motion prior -> pose, scan after scan.
 
-    A method with an attribute `needs_rings` that is true gets scans whose `rings` are filled in (`input.rings`).
     `prepare` knows nothing of earlier scans, so the front end runs it for the next scan while `register` works on this one.
-    One with `ignores_prior` that is true predicts by itself: an IMU is of no use to it but where a scan fails.
-    One with `follows_course` that is true can register a sweep again along a course that later scans told as well.
-    A method that deskews has an attribute `deskew` that says how, in words.
     """
+
+    deskew: str
+    needs_rings: bool
+    ignores_prior: bool
+    follows_course: bool
 
     def prepare(self, scan: Scan) -> Any:
         """Whatever can be made of one scan by itself."""

@@ -12,6 +12,7 @@ from lslam.errors import InputError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.interpolate import poses_at
 from lslam.inertial.constant_velocity import MotionModel
+from lslam.odometry.base import Traits
 from lslam.preprocessing.deskew import knots_over
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan, Span
@@ -72,7 +73,7 @@ class GivenMotion(Stateful, MotionModel):
         """Nothing to learn."""
 
 
-class GivenPoses(Stateful):
+class GivenPoses(Traits, Stateful):
     """Scan by scan the pose of a trajectory, which has to be of the LiDAR: `pipeline.job.bind` sees to it."""
 
     deskew = "by the motion of the given trajectory"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.config.odometry import RecoveryConfig
 from lslam.errors import UsageError
+from lslam.odometry.base import Traits
 from lslam.odometry.elastic import SweepPoints, register_elastic
 from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.keyframe_submap import KeyframeSubmap
@@ -60,7 +61,7 @@ def registration_of(
     return Registration(c, config.preprocess, recovery or config.recovery, target)
 
 
-class Icp(Stateful):
+class Icp(Traits, Stateful):
     """Adapter from scans and motion priors to `Registration`."""
 
     is_searching = True
@@ -70,6 +71,9 @@ class Icp(Stateful):
     def __init__(self, registration: Registration) -> None:
         self.registration = registration
         self._uncertainty = self._fresh_uncertainty()
+        c = registration.config
+        # Point to plane, on a map of many scans.
+        self.follows_course = registration.preprocess.deskew and c.target == "map" and c.residual in (None, "plane")
 
     def prepare(self, scan: Scan) -> PreparedPoints:
         """Range gate and down-sampling."""
@@ -112,12 +116,6 @@ class Icp(Stateful):
             result, points=deskew(prepared, sweep or prior), detail=(prior, elastic), sweep=sweep, map_age=self.map_age,
             stages={"register": time.perf_counter() - began},
         )  # fmt: skip
-
-    @property
-    def follows_course(self) -> bool:
-        """Whether sweeps are registered elastically along the course: point to plane, on a map of many scans."""
-        c = self.registration.config
-        return self.registration.preprocess.deskew and c.target == "map" and c.residual in (None, "plane")
 
     @property
     def map_age(self) -> float:

@@ -14,6 +14,7 @@ from lslam.config.config import Config
 from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3, umeyama
+from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.optimiser import STEP_M, STEP_RAD
@@ -44,7 +45,7 @@ def create(config: Config) -> IcpSvd:
     return IcpSvd(config.preprocess, config.registration)
 
 
-class IcpSvd(Stateful):
+class IcpSvd(Traits, Stateful):
     """Nearest neighbours, trimmed, then the transform that fits them best, until it no longer changes.
 
     Of `registration` it takes `inlier_ratio`, `inlier_distance`, `max_iterations` and the limits beyond which a result is

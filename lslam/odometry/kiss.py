@@ -12,6 +12,7 @@ from lslam.config.config import Config
 from lslam.config.input import PreprocessConfig
 from lslam.extras import importing
 from lslam.geometry import se3
+from lslam.odometry.base import Traits
 from lslam.preprocessing.prepare import gate_points
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.motion_prior import MotionPrior
@@ -28,7 +29,7 @@ def create(config: Config) -> Kiss:
     return Kiss(config.preprocess, has_user_range="range_max" in config.preprocess.model_fields_set)
 
 
-class Kiss:
+class Kiss(Traits):
     """kiss-icp as its authors run it: it predicts, deskews and down-samples by itself and ignores the motion prior.
 
     kiss-icp's pose belongs to the scan's end when it deskews: it is carried back to the scan's stamp. Compensated scans

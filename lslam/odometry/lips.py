@@ -13,6 +13,7 @@ from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.geometry import noise, normal_equations, se3
 from lslam.kernels.transform import transform
+from lslam.odometry.base import Traits
 from lslam.odometry.plane_association import associate
 from lslam.odometry.plane_factors import sighting_residuals
 from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
@@ -44,7 +45,7 @@ def create(config: Config) -> Lips:
     return Lips(config)
 
 
-class Lips(Stateful):
+class Lips(Traits, Stateful):
     """Planes of each scan are associated with landmarks, and the window of states and planes is optimised."""
 
     is_searching = False

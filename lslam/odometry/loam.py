@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from lslam.config.config import Config
+from lslam.odometry.base import Traits
 from lslam.odometry.feature_policies import feature_policies
 from lslam.odometry.feature_steps import joint_step
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
@@ -36,7 +37,7 @@ def create(config: Config) -> Loam:
     return Loam(config, VARIANTS[config.odometry.method])
 
 
-class Loam(Stateful):
+class Loam(Traits, Stateful):
     """Adapter from scans and motion priors to `Registration`."""
 
     needs_rings = True

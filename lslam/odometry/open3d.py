@@ -14,6 +14,7 @@ from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
 from lslam.extras import importing_open3d
 from lslam.geometry import se3
+from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import clean_points
 from lslam.registration.solver import RegistrationResult
@@ -43,7 +44,7 @@ def create(config: Config) -> Open3dGicp:
     return Open3dGicp(config.preprocess, config.registration)
 
 
-class Open3dGicp:
+class Open3dGicp(Traits):
     """Open3D's generalised ICP (Segal 2009) with its own defaults. It keeps no map: its drift adds up scan by scan."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig) -> None:

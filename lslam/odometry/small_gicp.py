@@ -13,6 +13,7 @@ from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
 from lslam.extras import importing, install_hint
 from lslam.geometry import se3, so3
+from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import clean_points
 from lslam.registration.solver import RegistrationResult
@@ -36,7 +37,7 @@ def create(config: Config) -> SmallGicp:
     return SmallGicp(config.preprocess, config.registration, config.input.workers)
 
 
-class SmallGicp:
+class SmallGicp(Traits):
     """GICP, scan to keyframe map. Not ours: with several threads its sums may differ in the last digits."""
 
     def __init__(self, preprocess: PreprocessConfig, limits: RegistrationConfig, threads: int = 2) -> None:

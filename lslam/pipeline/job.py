@@ -139,7 +139,7 @@ def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequ
     times do not fit.
     """
     sequence = with_point_times(sequence, config.preprocess)
-    if getattr(odometry, "needs_rings", False):
+    if odometry.needs_rings:
         sequence = with_rings(sequence, config.input.rings)
     return select(sequence, config.input.start, config.input.count, config.input.skip_frames)
 
@@ -158,7 +158,7 @@ def announce(job: PreparedRun) -> None:
     job.manifest.problems += map(str, [*units, *examine_jumps(job.truth)])
     for problem in [*sequence.problems, *job.manifest.problems]:
         log.warning("%s", problem)
-    deskew, is_distorted = describe_deskew(sequence, config, sweep is not None, getattr(job.odometry, "deskew", ""))
+    deskew, is_distorted = describe_deskew(sequence, config, sweep is not None, job.odometry.deskew)
     job.manifest.deskew = deskew
     job.manifest.pose_time = (sweep or Span()).instant
     if not config.imu.use and (unused := [f"imu.{key}" for key in config.imu.changed()]):

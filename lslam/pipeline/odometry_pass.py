@@ -236,7 +236,7 @@ def _begin_imu(job: PreparedRun) -> Inertial:
         if path is not None and known is None:
             path.parent.mkdir(exist_ok=True)
             save_start(path, inertial)
-    if getattr(job.odometry, "ignores_prior", False):
+    if job.odometry.ignores_prior:
         inertial.problems.append(f"{config.odometry.method} predicts by itself: the IMU only bridges scans that fail")
     return inertial
 

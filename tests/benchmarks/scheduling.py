@@ -53,7 +53,7 @@ class Sleeping:
         seconds, self.seconds = self.seconds, 0.0  # once a run, which reads its first scans several times
         time.sleep(seconds)
         return Scan(GRID, int(self.stamps_ns[index]), index)
-class Still:
+class Still(Traits):
     def prepare(self, scan):
         return None
     def register(self, scan, prepared, prior):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
+from lslam.odometry.base import Traits
 from lslam.odometry.sanity import measurable, plausible
 from lslam.types.scan import FARTHEST_M, Scan
 from lslam.types.scan_result import ScanResult
@@ -76,7 +77,7 @@ def test_motions_that_a_vehicle_can_make_are_accepted(x: float, stamp_ns: int) -
     assert plausible(at(1e6), np.eye(4), None).status == "ok", "nobody knows where a run begins"
 
 
-class Jumping:
+class Jumping(Traits):
     """A method that claims one metre a scan, and 100 m more from one scan on."""
 
     def __init__(self, when: int) -> None:

@@ -13,6 +13,7 @@ from lslam.config import Config
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.geometry import se3, so3
 from lslam.odometry import create_odometry
+from lslam.odometry.base import Traits
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -37,7 +38,7 @@ def yaw_ramp(step: Floats, seconds: float) -> Floats:
 
 
 @dataclass
-class Lost:
+class Lost(Traits):
     """A method that registers well and claims `corruption` of each step from scan `begin` to `end`, as a foreign one might.
 
     known : what was registered of the same scans before; filled with what was not
