@@ -22,6 +22,7 @@ from traced import Traced
 
 from lslam.geometry import se3
 from lslam.inertial import imu_cleaning, saturation
+from lslam.inertial.course import Course
 from lslam.inertial.filter import FilterMotion
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import elastic_constraints, lips, loam_livox, plane_association, plane_factors, plane_segmentation
@@ -132,6 +133,9 @@ ABLATIONS = {
             "LEAST_SKEW 1e-3": ((elastic_constraints, "LEAST_SKEW", 1e-3),),
         },
         imu=None,
+    ),
+    "course": Ablation(
+        ("icp", "ct-icp"), ("walk", "street", "motorway"), {"course": ((Course, "at", lambda self, *args: None),)}, imu=None,
     ),
     "lips": Ablation(
         ("lips",), ("walk", "urban"),
