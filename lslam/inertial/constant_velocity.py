@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.inertial.course import COVARIANCE, Course
+from lslam.inertial.course import Course, motion_covariance
 from lslam.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import GravityDirection, ImuState
@@ -134,7 +134,7 @@ class ConstantVelocity(Stateful, MotionModel):
         poses = None if self.course is None else self.course.at(stamp_ns, knots)
         if poses is None:
             return self.steady(self.predict(stamp_ns), span)
-        told = MotionPrior(knots, poses, change=COVARIANCE)
+        told = MotionPrior(knots, poses, change=motion_covariance())
         # The world begins where the first scan is expected.
         return (
             told if self._instant_ns is not None else replace(told, poses=self._pose @ se3.relative(told.pose, poses))

@@ -13,7 +13,6 @@ Floats = NDArray[np.float64]
 NEIGHBOURS = 3
 # Of the motion from begin to end of a sweep.
 MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
-COVARIANCE = np.diag(np.repeat([MOTION_SIGMA_M, MOTION_SIGMA_RAD], 3) ** 2)
 
 
 class Course:
@@ -35,6 +34,11 @@ class Course:
         nodes = 1e-9 * (self.instants_ns[around] - stamp_ns)
         twists = se3.log(se3.relative(self.poses[k], self.poses[around]))
         return se3.normalise(self.poses[k] @ se3.exp(natural_spline(np.asarray(nodes), twists, times)))
+
+
+def motion_covariance() -> Floats:
+    """(6, 6) of the motion from begin to end of a sweep, m2 and rad2."""
+    return np.diag(np.repeat([MOTION_SIGMA_M, MOTION_SIGMA_RAD], 3) ** 2)
 
 
 def natural_spline(nodes: Floats, values: Floats, times: Floats) -> Floats:
