@@ -44,8 +44,10 @@ def test_a_study_killed_on_the_way_goes_on_and_every_run_is_there_once(tmp_path:
     steps = list(range(1, 5))
     file, out = tmp_path / "steps.toml", tmp_path / "out"
     file.write_text(STUDY.replace("[1, 2, 3, 4]", str(steps)))
-    words = [*COMMAND, "sweep", str(file), "--out", str(out), "--jobs", "1"]
-    with subprocess.Popen(words, env=environment(), stderr=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    words = ["sweep", str(file), "--out", str(out), "--jobs", "1"]
+    with subprocess.Popen(
+        [*COMMAND, *words], env=environment(), stderr=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
         end = time.monotonic() + 150
         while len(rows_of(out)) < 2 and time.monotonic() < end and process.poll() is None:
             time.sleep(0.01)
@@ -53,7 +55,7 @@ def test_a_study_killed_on_the_way_goes_on_and_every_run_is_there_once(tmp_path:
     before = rows_of(out)
     assert 2 <= len(before) < len(steps), "killed in the middle"
     states = {path: path.stat().st_mtime_ns for path in (out / "runs" / "block").glob("*.json")}
-    done = subprocess.run([*words, "--resume"], env=environment(), capture_output=True, text=True, check=False)
+    done = lslam(*words, "--resume")
     assert done.returncode == 0, done.stderr
     after = rows_of(out)
     assert [row.parameters["input.skip_frames"] for row in after] == steps
