@@ -27,6 +27,11 @@ def park(seed: int = 0, *settings: str) -> SimulatedDrive:
     return simulate("carpark", seed=seed, settings=settings, lidar=PERFECT, motion_compensated=True)
 
 
+@cache
+def at_speed(speed: int) -> SimulatedDrive:
+    return simulate("carpark", settings=[f"speed={speed}"])
+
+
 def speeds(drive: SimulatedDrive) -> Floats:
     """Over the ground at 20 Hz, m/s."""
     assert drive.ground_truth is not None
@@ -86,7 +91,7 @@ def test_it_stands_drives_off_turns_and_comes_back_in_151_metres() -> None:
 
 @pytest.mark.parametrize("speed", [2, 5, 12, 30])
 def test_every_speed_is_reached_from_rest_and_given_up_for_the_turn(speed: int) -> None:
-    drive = simulate("carpark", settings=[f"speed={speed}"])
+    drive = at_speed(speed)
     v = speeds(drive)
     assert v[0] < 0.05
     assert v.max() == pytest.approx(speed, rel=0.02)
@@ -118,7 +123,7 @@ def test_parks_that_would_not_fit_into_memory_are_refused() -> None:
 
 
 def test_a_longer_park_begins_as_a_shorter_one() -> None:
-    short, long = park(), simulate("carpark", settings=["speed=12"])
+    short, long = park(), at_speed(12)
     assert long.city.terrain.tilt == short.city.terrain.tilt
     assert len(long.city.footprints) > len(short.city.footprints) > 2
     for a, b in zip(short.city.footprints, long.city.footprints, strict=False):
