@@ -246,6 +246,20 @@ MARKS = {
     "HAND",
     "LIVE",
     "FACTORS",
+    "NO_RING",
+    "MOUNTING",
+    "GRAVITY",
+    "PLACE_NOISE",
+    "TURN_NOISE",
+    "MAY_BE_EDGE",
+    "MAY_BE_FLAT",
+    "MAY_BE_PLANE",
+    "EDGE",
+    "LESS_EDGE",
+    "NEITHER",
+    "LESS_PLANE",
+    "PLANE",
+    "NO_LINE",
 }
 SECTIONS = ("preprocess", "registration", "recovery", "keyframes", "loops", "graph")
 HELD = ("registration", "recovery", "loops", "graph", "odometry", "integrity")

@@ -17,13 +17,11 @@ from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuDiagnostics
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan, Span
+from lslam.types.scan import LEVER_M, Scan, Span
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.stage_clock import StageClock
 from lslam.types.state import State
 
-# Lever arm of rotations: half the points of a scan are nearer.
-LEVER_M = 10.0
 # Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
 # between the prior and the first.
 SAME = 0.3

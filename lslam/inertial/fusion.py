@@ -22,14 +22,11 @@ from lslam.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import GravityDirection, ImuState, ImuStream
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Span
+from lslam.types.scan import LEVER_M, Span
 from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 log = logging.getLogger("lslam")
-
-# m, lever arm of rotation errors: half the points of a scan are nearer.
-LEVER_M = 10.0
 
 
 class InertialMotion(Stateful):

@@ -19,13 +19,13 @@ from lslam.inertial.window import Window, moment_of, off_by
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import ImuStream
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Span
+from lslam.types.scan import LEVER_M, Span
 from lslam.types.scan_result import ScanEquations
 
 Floats = NDArray[np.float64]
 
-# m, of a point 10 m away: a scan whose pose moved farther from where its points were linearised is linearised again.
-STALE_M, LEVER_M = 0.005, 10.0
+# m, of a point at `LEVER_M`: a scan whose pose moved farther from where its points were linearised is linearised again.
+STALE_M = 0.005
 
 
 class WindowMotion(FilterMotion):

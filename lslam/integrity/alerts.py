@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.integrity.directions import MOST_EMPTIED
-from lslam.integrity.pair_registration import is_within
-from lslam.types.scan_result import SAME_M, SAME_RAD, USUAL, MotionCheck
+from lslam.integrity.pair_registration import SAME_SIGMAS, is_within
+from lslam.types.scan_result import SAME_M, USUAL, MotionCheck
 
 Floats = NDArray[np.float64]
 
@@ -20,7 +20,7 @@ IN_A_ROW = 4
 LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
 # One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.array([0.5, 0.5, 0.5, *np.deg2rad([2.0, 2.0, 2.0])])
-SIGMAS_IN_A_ROW, SIGMAS_ALONE, MORE = 3.0, 6.0, 1.15
+MORE = 1.15
 # Five times gravity over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
 # Checks in a row between standing and moving: one is chance.
@@ -74,12 +74,12 @@ def _noise(apart: Floats) -> Floats:
 def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
     """Begin and end of where they say so again and again, or one of them by much, along one axis."""
     is_better = np.array([check.agreement > MORE * check.claimed_agreement for check in checks])
-    is_large = is_better & (np.abs(apart) > LARGE[axis] + SIGMAS_ALONE * sigma)
+    is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * SAME_SIGMAS * sigma)
     found = []
     for begin, end in _runs(np.where(np.abs(apart) > LEAST[axis], np.sign(apart), 0)):
         part = slice(begin, end)
         mean, count = float(np.mean(apart[part])), end - begin
-        bound = LEAST[axis] + SIGMAS_IN_A_ROW * float(np.median(sigma[part])) / np.sqrt(count)
+        bound = LEAST[axis] + SAME_SIGMAS * float(np.median(sigma[part])) / np.sqrt(count)
         if is_large[part].any() or (count >= IN_A_ROW and abs(mean) > bound):
             found.append((begin, end))
     return found
@@ -160,7 +160,7 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
 
 
 def _is_rest(motion: Floats) -> bool:
-    return is_within(motion, SAME_M, SAME_RAD)
+    return is_within(motion, SAME_M)
 
 
 def _foreign(checks: list[MotionCheck]) -> list[Alert]:

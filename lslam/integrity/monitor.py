@@ -24,14 +24,11 @@ Floats = NDArray[np.float64]
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
 LAG_S, REACH_SHARE = 0.45, 0.75
-# s; the motion of an earlier check is no start over a longer time.
-LONGEST_S = 1.35
-# A pair whose time differs by less than this part has the motion of the one before.
-JITTER = 0.02
 # Points that make the planes of the first scan, and of the last scan those that are laid on them.
-PLANE_POINTS, LAID_POINTS = 5000, 1200
-# m and rad; poses that move by less state no motion, which is tested against a motion of metres.
-STILL_M, STILL_RAD = 0.05, float(np.deg2rad(0.3))
+LAID_POINTS = 1200
+PLANE_POINTS = (PreprocessConfig().source_points_min + PreprocessConfig().source_points_max) // 2
+# m, of a point at `LEVER_M`: poses that move by less state no motion, which is tested against a motion of metres.
+STILL_M = 0.05
 # Another motion than the one found from the claim must explain so many times more points.
 MORE = 1.1
 # m/s2; a vehicle comes to rest no faster, its tyres do not hold.
@@ -134,11 +131,10 @@ class IntegrityMonitor(Stateful):
 
     def _expected(self, seconds: float) -> Floats | None:
         """The motion (4, 4) over so many seconds if it goes on as before; None where nobody knows."""
-        if self._motion is None or seconds > LONGEST_S:
+        if self._motion is None or seconds > 3 * LAG_S:
             return None
         motion, before = self._motion
-        share = seconds / before
-        return motion if abs(share - 1) < JITTER else se3.exp(share * se3.log(motion))
+        return np.asarray(se3.exp(seconds / before * se3.log(motion)))
 
     def _seen(self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior) -> Seen:
         if not (self._is_prepared and isinstance(prepared, PreparedPoints)):
@@ -193,4 +189,4 @@ class IntegrityMonitor(Stateful):
 
 def is_still(motion: Floats) -> bool:
     """Whether the motion (4, 4) is none."""
-    return is_within(motion, STILL_M, STILL_RAD)
+    return is_within(motion, STILL_M)

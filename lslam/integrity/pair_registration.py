@@ -19,14 +19,15 @@ from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
 from lslam.registration.residuals import PLANE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
-from lslam.types.scan_result import SAME_M, SAME_RAD, motion_apart
+from lslam.types.scan import LEVER_M
+from lslam.types.scan_result import SAME_M, motion_apart
 
 Floats = NDArray[np.float64]
 
 SETTINGS = RegistrationConfig(blob_weight=0.0)
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
 # room, and spans several points and several sigma of their noise.
-EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, 2.4
+EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, SETTINGS.coarse_factor * SETTINGS.voxel_size
 # Half of an edge is how far a plane reaches.
 CAPTURE = 0.4
 # Steps that settle a scan which lies within its noise of where it was.
@@ -71,7 +72,7 @@ class MotionHypothesis:
             return True
         if self.sigma is None or other.sigma is None:
             return True
-        bound = np.repeat([SAME_M, SAME_RAD], 3) + SAME_SIGMAS * np.hypot(self.sigma, other.sigma)
+        bound = np.repeat([SAME_M, SAME_M / LEVER_M], 3) + SAME_SIGMAS * np.hypot(self.sigma, other.sigma)
         return bool(np.all(np.abs(motion_apart(self.motion, other.motion)) < bound))
 
 
@@ -152,14 +153,14 @@ def best_of(hypotheses: Sequence[MotionHypothesis], more: float) -> tuple[Motion
 
 def is_near(a: Floats, b: Floats) -> bool:
     """Whether two motions (4, 4) differ so little that they are one."""
-    return is_within(se3.relative(a, b), SAME_M, SAME_RAD)
+    return is_within(se3.relative(a, b), SAME_M)
 
 
-def is_within(motion: Floats, metres: float, radians: float) -> bool:
-    """Whether a motion (4, 4) goes no farther, and turns no more."""
+def is_within(motion: Floats, metres: float) -> bool:
+    """Whether a motion (4, 4) goes no farther, and turns by no more at `LEVER_M`."""
     # The distance of a rotation from none is sqrt(8) sin of half its angle.
     turn = float(np.linalg.norm(motion[:3, :3] - np.eye(3)))
-    return float(np.linalg.norm(motion[:3, 3])) < metres and turn < np.sqrt(8.0) * np.sin(0.5 * radians)
+    return float(np.linalg.norm(motion[:3, 3])) < metres and turn < np.sqrt(8.0) * np.sin(0.5 * metres / LEVER_M)
 
 
 def median_range(points: Floats) -> float:

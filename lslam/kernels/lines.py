@@ -17,7 +17,7 @@ from lslam.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQ
 from lslam.kernels.jit import inline, kernel
 from lslam.kernels.linalg import plane_of
 from lslam.kernels.linearisation import Pose, Sums, Width
-from lslam.kernels.residuals import add_row, octant_slots
+from lslam.kernels.residuals import TILT, add_row, octant_slots
 from lslam.kernels.voxel import MASK, OFFSET
 
 Floats = NDArray[np.float64]
@@ -29,8 +29,6 @@ LineVoxels = tuple[Floats, Longs, Ints, Floats, Longs, Floats]
 NO_LINE = -1.0
 # LOAM's rule: a line when the largest eigenvalue is three times the second one.
 ELONGATION = 3.0
-# Factor on the variance of the direction, two sigma, as for planes: the errors of points on one pole are correlated.
-TILT = 4.0
 
 
 @inline

@@ -274,14 +274,12 @@ def means(
 
 @kernel
 def accompanied(
-    points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float, one_in: int
-) -> tuple[NDArray[np.int64], int]:
+    points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float
+) -> NDArray[np.int64]:
     """Indices of the points (N, 3) whose count times range reaches `least`, and whose voxel's count reaches `least_around`.
 
     counts : (N,) number of returns that each point averages; a voxel's count is the sum over its points that reach `least`
     least, least_around : m, counts times the range of the point
-    one_in : a power of two; one in so many voxels, chosen by the hash of its key, is examined
-    Returns also the number of points in the voxels examined.
     """
     n = len(points)
     table = np.empty(table_size(n), np.int32)
@@ -291,15 +289,12 @@ def accompanied(
     inverse = 1.0 / size
     least2, around2 = least * least, least_around * least_around
     last_key, slot = -1, 0
-    count = filled = seen = 0
+    count = filled = 0
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
-        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
-        if hash_key(key, one_in - 1) != 0:
-            continue
-        seen += 1
         if float(counts[i]) * counts[i] * (x * x + y * y + z * z) < least2:
             continue
+        key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
         if count == 0 or key != last_key:
             last_key = key
             h = place_of(key, keys, table)
@@ -320,7 +315,7 @@ def accompanied(
         if around * around * (x * x + y * y + z * z) >= around2:
             chosen[kept] = i
             kept += 1
-    return chosen[:kept], seen
+    return chosen[:kept]
 
 
 @kernel

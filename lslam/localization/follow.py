@@ -22,6 +22,7 @@ from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 from lslam.types.constraint import FixStatus, MapFix
+from lslam.types.scan import LEVER_M
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import Stateful
 
@@ -29,8 +30,6 @@ Floats = NDArray[np.float64]
 
 # Sigmas that the kernel spans, and the chance that the innovation of a scan that the map holds lies beyond its gate.
 SIGMAS, CHANCE = 3.0, 1e-4
-# m, rms lever arm of a rotation.
-LEVER_M = 10.0
 # Finds the pose (4, 4) of a scan of that position anew within a radius, m, of the prior; None where it does not.
 Search = Callable[[int, Floats, float], Floats | None]
 

@@ -24,8 +24,6 @@ Floats = NDArray[np.float64]
 MEMORY = 10
 # m/s2 and rad/s2, prior sigmas of the acceleration: a car brakes, a hand turns.
 USUAL = np.repeat([3.0, 1.0], 3)
-# Weight, in scans, of the prior that the covariance is isotropic: its six directions.
-DIRECTIONS = 6
 
 
 class DeskewUncertainty(Stateful):
@@ -65,7 +63,8 @@ class DeskewUncertainty(Stateful):
             T, L = prior.span_s, self._lead_s
             return np.diag((USUAL * L**2 / 6.0 + USUAL * ((T**2 - L**2) / 24.0 + L * (T - L) / 4.0)) ** 2)
         alike = np.repeat([np.trace(self._mean[:3, :3]) / 3, np.trace(self._mean[3:, 3:]) / 3], 3)
-        share = self.scans / (self.scans + DIRECTIONS)
+        # The prior that the covariance is isotropic weighs as many scans as it has directions.
+        share = self.scans / (self.scans + len(self._mean))
         return noise.rotated(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
 
     def _learn(self, change: Floats, step_s: float) -> None:

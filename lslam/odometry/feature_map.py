@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.input import PreprocessConfig
 from lslam.kernels import voxel
 from lslam.preprocessing.features import Features
 from lslam.preprocessing.prepare import NO_TIMES
@@ -15,8 +16,8 @@ from lslam.types.state import State, Stateful
 
 # As LOAM fits its lines: five points at least.
 MIN_LINE_POINTS = 5
-# m, grid of the less planar points for wide voxels, and where they stand in for the planar ones: as `source_voxel`.
-WIDE_GRID = 1.0
+# m, grid of the less planar points for wide voxels, and where they stand in for the planar ones.
+WIDE_GRID = PreprocessConfig().source_voxel
 
 
 class FeatureMap(Stateful):

@@ -18,9 +18,6 @@ Grid = tuple[
 
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
 REACH = 2.0
-# m, voxels whose planes tell how the surface around a point lies, and voxels twice as large, for two rings of a sparse
-# sensor, which go first.
-AROUND = 1.0
 # rad, one sigma: a normal that wavers more is not known.
 WAVER = 0.03
 # m, one sigma: what is thicker is no surface, but two that meet.
@@ -62,8 +59,11 @@ def feature_scan(features: Features, T_world_lidar: NDArray[np.float64], grid_st
 
 
 def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 3) normals of the surfaces around points (N, 3), zero where none is found."""
-    fine, normals = GaussianMap(AROUND, capacity=1 << 12), np.zeros_like(points)
+    """(N, 3) normals of the surfaces around points (N, 3), zero where none is found.
+
+    Voxels of half the reach tell them, and before these voxels twice as large, for two rings of a sparse sensor.
+    """
+    fine, normals = GaussianMap(REACH / 2, capacity=1 << 12), np.zeros_like(points)
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(

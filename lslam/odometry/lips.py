@@ -26,7 +26,7 @@ from lslam.registration.acceptance import correction
 from lslam.registration.solver import RegistrationResult
 from lslam.types.imu import SweepLink
 from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
+from lslam.types.scan import LEVER_M, Scan
 from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import StageClock
 from lslam.types.state import Stateful
@@ -36,8 +36,6 @@ Longs = NDArray[np.int64]
 
 # Share of the points on planes that known planes must take; where it is less, the scan is elsewhere.
 LEAST_SHARE = 0.1
-# m, lever arm that makes rotations comparable.
-LEVER_M = 10.0
 
 
 def create(config: Config) -> Lips:

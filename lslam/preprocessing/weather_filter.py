@@ -5,22 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.input import PreprocessConfig
 from lslam.kernels import voxel
 
 # The field of view of a spinning scanner, 360 x 45 deg. With a smaller one the test is more lenient.
 FIELD_OF_VIEW_SR = 4.8
 
 # m; wide enough for several pulses of one ring at fifty metres, and as the source points' grid begins.
-WIDE_CELL = 1.0
+WIDE_CELL = PreprocessConfig().source_voxel
 
 # Least share of sparse cells: edges make up to a fifth of a clear scan's cells sparse.
 CLEAR = 0.25
 
-# A sample of one in eight wide cells decides first where it is significant: its share of at least 500 cells has a standard
-# error of two or three per cent.
-ONE_IN = 8
-SURELY = 0.8
-ENOUGH = 500
 
 # Largest share of returns to remove: beyond, the scan was downsampled before.
 MOSTLY = 0.5
@@ -40,11 +36,7 @@ def on_surfaces(
     """
     pulses = int(counts.sum())
     needed = least_line / np.sqrt(FIELD_OF_VIEW_SR / max(pulses, 1))
-    asked = (centroids, counts, leaf * needed, WIDE_CELL, WIDE_CELL * needed)
-    some, seen = voxel.accompanied(*asked, ONE_IN)
-    if seen >= ENOUGH and seen - len(some) < SURELY * CLEAR * seen:
-        return np.arange(len(counts))
-    kept, _ = voxel.accompanied(*asked, 1)
+    kept = voxel.accompanied(centroids, counts, leaf * needed, WIDE_CELL, WIDE_CELL * needed)
     is_clear = len(counts) - len(kept) < CLEAR * len(counts)
     return np.arange(len(counts)) if is_clear or int(counts[kept].sum()) < MOSTLY * pulses else kept
 

@@ -17,11 +17,13 @@ from lslam.geometry import se3
 from lslam.kernels import facts as at
 from lslam.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
 from lslam.registration.robust import Annealing
+from lslam.types.scan import LEVER_M
 
 Floats = NDArray[np.float64]
 
-# A step below these ends the iteration: a tenth of the noise of a point, and what that is at 10 m.
-STEP_M, STEP_RAD = 1e-3, 1e-4
+# A step below these ends the iteration: a tenth of the noise of a point, and what that is of a turn.
+STEP_M = 1e-3
+STEP_RAD = STEP_M / LEVER_M
 # A pose has six degrees of freedom.
 LEAST_MATCHED = 6
 EVERYWHERE: Floats = np.zeros((0, 6))

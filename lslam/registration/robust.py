@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from lslam.types.state import Stateful
 
+# Of what was lately, what stays from scan to scan: a memory of five.
+FORGETTING = 0.8
+
 
 @dataclass(frozen=True)
 class Annealing:
@@ -25,7 +28,6 @@ class AdaptiveThreshold(Stateful):
     the same at the far end of the scan). Three times the rms of recent errors covers nearly all of the next ones.
     """
 
-    FORGETTING = 0.8
     STATE = ("_mean_square",)
 
     def __init__(self, low: float, high: float) -> None:
@@ -44,7 +46,7 @@ class AdaptiveThreshold(Stateful):
 
     def observe(self, error: float) -> None:
         """Learn from one registered scan's prediction error, m."""
-        self._mean_square = self.FORGETTING * self._mean_square + (1 - self.FORGETTING) * error**2
+        self._mean_square = FORGETTING * self._mean_square + (1 - FORGETTING) * error**2
 
     def widen(self) -> None:
         """Reset to the widest after a failed scan."""
@@ -58,7 +60,6 @@ class UsualAgreement(Stateful):
     separates that from a sparse sensor's good scan. The drop from one scan to the next does.
     """
 
-    FORGETTING = 0.8
     RELAXING = 0.9
     # Scans in a row differ by an eighth at most, unless something has happened.
     LESS = 0.8
@@ -86,7 +87,7 @@ class UsualAgreement(Stateful):
 
         Each scan fills the voxels of a young map, and the next one finds more of them: a mean over the last few lags behind.
         """
-        self.usual = max(share, self.FORGETTING * self.usual + (1 - self.FORGETTING) * share)
+        self.usual = max(share, FORGETTING * self.usual + (1 - FORGETTING) * share)
 
     def relax(self) -> None:
         """Expect less after a bad scan, so that a place that has changed for good is accepted after a few."""

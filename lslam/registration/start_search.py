@@ -28,23 +28,20 @@ Flags = NDArray[np.bool_]
 
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
-NEAR, NO_PLANES = 0.4, 2.0
-# m, from which they find each other.
-REACH = 1.0
+NEAR = 0.4
 ALL_ALIKE = RegistrationConfig(sigma=NEAR, blob_weight=1.0, weak_share=0.0)
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH = 1.2
-# m; starts this far apart leave no gap between their capture ranges, not even between piers of a facade.
+# m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
 START_STEP = 1.0
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
 START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
-# Less than the rings of most sensors are apart.
-AT_REST_DEG = 3.0
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
-CLEARLY, MUCH = 1.06, 1.1
+CLEARLY = 1.05
+MUCH = 2 * CLEARLY - 1
 
 
 class NonGroundPoints:
@@ -55,7 +52,7 @@ class NonGroundPoints:
     """
 
     def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:
-        self._cells = GaussianMap(NEAR, min_points=1, planarity=NO_PLANES, reach=np.inf, capacity=1 << 12)
+        self._cells = GaussianMap(NEAR, min_points=1, planarity=np.inf, reach=np.inf, capacity=1 << 12)
         self._up = up_of(preprocess)
         for points, T_world_lidar in scans:
             index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance, self._up)
@@ -73,12 +70,12 @@ class NonGroundPoints:
         return np.count_nonzero(self.agreeing(seen, T_world_lidar)) / max(len(seen.source), 1)
 
     def align(self, seen: PreparedPoints, T_start: Floats) -> RegistrationResult:
-        """Lay them on these points, point to point, from less than `REACH` away, with height and tilt as they are.
+        """Lay them on these points, point to point, from less than `START_STEP` away, with height and tilt as they are.
 
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
         level = np.eye(6) - upright_directions(T_start, self._up)
-        annealing = Annealing(REACH, NEAR / 2, 0.7, 20)
+        annealing = Annealing(START_STEP, NEAR / 2, 0.7, 20)
         return solve((self._cells,), seen, T_start, annealing, ALL_ALIKE, residual=MEANS, allowed=level)
 
 
@@ -204,9 +201,12 @@ def _likeliest(
 
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:
-    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
+    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it.
+
+    That is nearer than a step of `START_TURNS_DEG`.
+    """
     move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
-    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(AT_REST_DEG))
+    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(np.ptp(START_TURNS_DEG[:2])))
 
 
 def is_much_more(ours: Flags, others: Flags, margin: float = MUCH) -> bool:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 # m along each axis: no LiDAR that is carried along the ground or a little above sees as far.
 FARTHEST_M = 10_000.0
+# m; half the points of a scan are nearer: where a turn is counted in metres.
+LEVER_M = 10.0
 # In `Scan.rings`: the recording gives this point no ring. Methods that need rings leave it out.
 NO_RING = 65535
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import portable, so3
 from lslam.types.imu import ImuDiagnostics
+from lslam.types.scan import LEVER_M
 
 
 @dataclass(frozen=True)
@@ -26,13 +27,12 @@ class ScanEquations:
     g: NDArray[np.float64]
 
 
-# What explains less than this part of what is usual, or less than a share of the points, is rejected, as is what
-# leaves the turn open, rad.
-USUAL, FEWEST, UNTURNED = 0.7, 0.15, float(np.deg2rad(1.0))
+# What explains less than this part of what is usual, or less than a share of the points, is rejected.
+USUAL, FEWEST = 0.7, 0.15
 # m; a check with a larger sigma of the position confirms nothing.
 OPEN_M = 0.5
-# m and rad; two motions of a pair of scans that differ by less are one.
-SAME_M, SAME_RAD = 0.2, float(np.deg2rad(1.0))
+# m, of a point at `LEVER_M`: two motions of a pair of scans that differ by less are one.
+SAME_M = 0.2
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class MotionCheck:
     @property
     def is_conclusive(self) -> bool:
         """Whether enough points are inliers, and the rotation is constrained well enough, to accept it."""
-        return self.agreement >= max(USUAL * self.usual, FEWEST) and float(np.max(self.sigma[3:])) < UNTURNED
+        return self.agreement >= max(USUAL * self.usual, FEWEST) and LEVER_M * float(np.max(self.sigma[3:])) < SAME_M
 
     @property
     def is_open(self) -> bool:

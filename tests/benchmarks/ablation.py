@@ -4,7 +4,7 @@
         [--write docs/results.md]
     python tests/benchmarks/ablation.py --starts
     python tests/benchmarks/ablation.py --lights [--method loam] [--seeds 100-104] [--without 'held at rest']
-    python tests/benchmarks/ablation.py --recordings FOLDER
+    python tests/benchmarks/ablation.py --recordings FOLDER [--method loam]
 
 Recordings are those of the folder given, with all rings, every second and every fourth. Drives are simulated with compensated
 scans: standing 2.5 s before they drive off, and moving from the first scan. A run is lost when its error, the first pose on
@@ -35,7 +35,8 @@ from lslam.config import load_config
 from lslam.errors import UsageError
 from lslam.frontend import tracker
 from lslam.frontend.tracker import Loaded, Tracker
-from lslam.odometry import create_odometry
+from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.odometry import create_odometry, feature_policies, feature_target
 from lslam.registration import local_map, residuals, solver, start_search
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
@@ -72,6 +73,7 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "MUCH": ((), ((start_search, "MUCH", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),
         "possible jumps": ((), ((tracker, "fault", lambda pose, stamp_ns, last: ""),)),
+        "bounded acceleration": ((), ((ConstantVelocity, "MAX_ACCELERATION", np.inf),)),
     },
     "loam": {
         **MAP,
@@ -79,6 +81,8 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "start search": (("recovery.start_search=false",), ()),
         "held at rest": (("recovery.at_rest=false",), ()),
         "less planar": (("recovery.less_planar=false",), ()),
+        "remapping": ((), ((feature_policies.SolutionRemapping, "recover", lambda self, attempt, result: result),)),
+        "newest after failures": ((), ((feature_target, "PATIENCE", np.inf),)),
         "agreement": (("registration.min_agreement=0",), ()),
     },
 }
@@ -184,7 +188,7 @@ def main() -> None:
                 who = ", ".join(f"{k} {v}" for k, v in acted.items())
                 print(f"{case[0]:38} {name:15} {start:9.3f} {shape:8.4f} {turn:9.3f} {failed:7d}  {who}", flush=True)
     drive = f"lights-{args.method}" if args.lights else args.method
-    kind = "recordings" if args.recordings else "starts" if args.starts else drive
+    kind = f"recordings-{args.method}" if args.recordings else "starts" if args.starts else drive
     limit = "half a metre off" if args.starts or args.lights else "a twentieth of its path off"
     caption = (
         f"{args.method}, {count} runs: lost is one {limit}, worse one whose ATE se3 grows by half and a centimetre."

@@ -66,20 +66,6 @@ def test_cells_are_judged_as_numpy_judges_them(seed: int) -> None:
     assert counts[expected].sum() > MOSTLY * len(points)
 
 
-def test_voxels_of_a_sample_are_judged_as_among_all() -> None:
-    rng = np.random.default_rng(5)
-    points = (rng.normal(0, 12, (8000, 3)) * (1, 1, 0.1)).astype(np.float32)
-    counts = rng.integers(1, 5, len(points)).astype(np.int32)
-    kept, everything = voxel.accompanied(points, counts, 12.0, 1.0, 40.0, 1)
-    some, seen = voxel.accompanied(points, counts, 12.0, 1.0, 40.0, 8)
-    assert everything == len(points)
-    assert 0.06 < seen / len(points) < 0.19
-    assert 0.1 < len(kept) / everything < 0.9
-    assert abs(len(some) / seen - len(kept) / everything) < 0.1
-    _, cell = np.unique(np.floor(points), axis=0, return_inverse=True)
-    np.testing.assert_array_equal(some, kept[np.isin(cell.ravel()[kept], cell.ravel()[some])])
-
-
 @pytest.mark.parametrize("sensor", [(64, 2000, 2.0, -24.8), (64, 1024, 22.5, -22.5), (16, 1800, 15.0, -15.0)])
 @pytest.mark.parametrize("share", [0.1, 0.2])
 def test_snow_goes_and_the_street_stays(sensor: tuple[int, int, float, float], share: float) -> None:
