@@ -35,6 +35,7 @@ PATH: dict[str, tuple[str, ...]] = {
     "points": (
         "registration/*.py", "frontend/tracker.py", "frontend/segments.py", "frontend/joint.py", "frontend/scene_scale.py",
         "inertial/constant_velocity.py", "odometry/sanity.py", "odometry/uncertainty.py", "odometry/deskew_uncertainty.py",
+        "frontend/windows.py", "inertial/course.py",
         "odometry/scan_outcome.py", "odometry/icp.py", "preprocessing/prepare.py", "preprocessing/deskew.py",
         "preprocessing/ground.py", "preprocessing/weather_filter.py", "kernels/gauss_newton.py", "kernels/gaussians.py",
         "kernels/residuals.py", "kernels/ground.py", "kernels/voxel.py",
