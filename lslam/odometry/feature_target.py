@@ -27,8 +27,6 @@ Floats = NDArray[np.float64]
 
 # Fewer inliers, ten per degree of freedom, are insignificant.
 MIN_FEATURES = 60
-# A failed scan is no target; after this many in a row the last good one is too far behind.
-PATIENCE = 3
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ class FeatureTarget(Target):
 
     source = "features"
     times_steps = 1
-    STATE = ("map", "scan", "all_points", "_failures", "_keyframes")
+    STATE = ("map", "scan", "all_points", "_keyframes")
 
     def __init__(
         self, config: RegistrationConfig, loam: LoamConfig, variant: LoamVariant, reach: float = 120.0, *,
@@ -71,7 +69,7 @@ class FeatureTarget(Target):
         self.scan: FeatureScan | None = None
         self.all_points = AllPoints(config, self._plane_size(config.voxel_size)) if with_all_points else None
         self._keyframes = None if variant.keyframes is None else FeatureKeyframes(*variant.keyframes)
-        self._failures, self._with_start_search, self._up = 0, with_start_search, up
+        self._with_start_search, self._up = with_start_search, up
 
     def fresh(self) -> FeatureTarget:
         """An empty one of the same settings."""
@@ -162,13 +160,7 @@ class FeatureTarget(Target):
             self.map.insert(features, T_world_lidar)
         if self.all_points is not None:
             self.all_points.enter(result)
-        self.scan, self._failures = feature_scan(features, T_world_lidar, self.loam.grid_step), 0
-
-    def miss(self, result: RegistrationResult) -> None:
-        """A scan failed: after a few in a row the newest is what the next one is registered on."""
-        self._failures += 1
-        if self.scan is not None and self._failures >= PATIENCE:
-            self.scan = feature_scan(result.points, result.T_world_lidar, self.loam.grid_step)
+        self.scan = feature_scan(features, T_world_lidar, self.loam.grid_step)
 
     def cloud(self, points: Features) -> NDArray[np.float32]:
         """All points (N, 3) of a scan, m, LiDAR frame."""

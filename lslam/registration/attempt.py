@@ -70,9 +70,6 @@ class Target(Stateful, ABC):
     def enter(self, result: RegistrationResult) -> None:
         """Insert a scan at its pose, and take out those that no longer belong there."""
 
-    def miss(self, result: RegistrationResult) -> None:
-        """A scan failed, and is not inserted."""
-
     @abstractmethod
     def cloud(self, points: Any) -> NDArray[Any]:
         """All points (N, 3) of a scan, m, LiDAR frame."""

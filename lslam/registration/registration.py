@@ -139,7 +139,6 @@ class Registration(Stateful):
         of a sensor at rest enters at the pose of the one before.
         """
         if not result.ok:
-            self.target.miss(result)
             return
         if result.is_stationary:
             result = replace(result, T_world_lidar=self.history.recent[-1][1])

@@ -36,7 +36,7 @@ from lslam.errors import UsageError
 from lslam.frontend import tracker
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.inertial.constant_velocity import ConstantVelocity
-from lslam.odometry import create_odometry, feature_policies, feature_target
+from lslam.odometry import create_odometry, feature_policies
 from lslam.registration import local_map, residuals, solver, start_search
 from lslam.simulation.scenarios import simulate
 from lslam.types.scan import Scan
@@ -82,7 +82,6 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "held at rest": (("recovery.at_rest=false",), ()),
         "less planar": (("recovery.less_planar=false",), ()),
         "remapping": ((), ((feature_policies.SolutionRemapping, "recover", lambda self, attempt, result: result),)),
-        "newest after failures": ((), ((feature_target, "PATIENCE", np.inf),)),
         "agreement": (("registration.min_agreement=0",), ()),
     },
 }

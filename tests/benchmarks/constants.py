@@ -206,6 +206,7 @@ def measure(work: Path, wanted: list[Number]) -> dict[str, Any]:
     shutil.copytree(ROOT / "lslam", package / "lslam", ignore=shutil.ignore_patterns("__pycache__"))
     for runs in RUNS:
         if f"shipped {runs}" not in known and any(n.runs == runs for n in wanted):
+            run_with(package, work, runs, [])  # compiles
             known[f"shipped {runs}"] = run_with(package, work, runs, [])
             path.write_text(json.dumps(known))
     shipped_kernels = set((work / "kernels").iterdir())
@@ -232,10 +233,10 @@ def measure(work: Path, wanted: list[Number]) -> dict[str, Any]:
 
 
 def effect(shipped: dict[str, Any], found: dict[str, Any]) -> str:
-    """Ratio of the error to the shipped, median and worst of the drives; else what else has changed; or none."""
+    """Ratio of the error to the shipped, median and range over the drives; else what else has changed; or none."""
     if "failed" in found:
         return "no run"
-    pairs = [(shipped[key], found[key]) for key in shipped if "failed" not in shipped[key]]
+    pairs = [(run, found[key]) for key, run in shipped.items() if "failed" not in run and key in found]
     failed = sum("failed" in b for _, b in pairs)
     pairs = [(a, b) for a, b in pairs if "failed" not in b]
     words = []
@@ -244,12 +245,12 @@ def effect(shipped: dict[str, Any], found: dict[str, Any]) -> str:
     moved = [(a, b) for a, b in pairs if a["poses"] != b["poses"]]
     if moved:
         ratios = [b["error"] / max(a["error"], 1e-9) for a, b in pairs]
-        words.append(f"{np.median(ratios):.2f}, {max(ratios):.2f}")
+        words.append(spread(ratios))
     ratios = [
         b["nees"] / a["nees"] for a, b in pairs if a["covariances"] != b["covariances"] and "nees" in a and "nees" in b
     ]
     if ratios and not moved:
-        words.append(f"NEES {np.median(ratios):.2f}, {ratios[int(np.argmax(np.abs(np.log(ratios))))]:.2f}")
+        words.append(f"NEES {spread(ratios)}")
     checks, conclusive, problems = (
         [sum(run[key] for run in runs) for runs in zip(*pairs, strict=True)]
         for key in ("checked", "conclusive", "problems")
@@ -267,12 +268,17 @@ def effect(shipped: dict[str, Any], found: dict[str, Any]) -> str:
     return "; ".join(words) or "none"
 
 
+def spread(ratios: list[float]) -> str:
+    return f"{np.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recordings", type=Path)
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--only", help="parts of labels, comma-separated")
     parser.add_argument("--list", action="store_true", help="names alone")
+    parser.add_argument("--known", action="store_true", help="the table of what the work folder has, without more runs")
     tables.offer(parser, None)
     args = parser.parse_args()
     work = args.work.resolve()
@@ -282,15 +288,19 @@ def main() -> None:
         print("\n".join(f"{n.runs:9} {n.label}" for n in wanted))
         print(len(wanted))
         return
-    load(work, args.recordings, {name for n in wanted for name, _ in RUNS[n.runs]})
-    known = measure(work, wanted)
+    if args.known:
+        known = json.loads((work / "results.json").read_text())
+        wanted = [n for n in wanted if set(FACTORS) <= set(known.get(n.label, ()))]
+    else:
+        load(work, args.recordings, {name for n in wanted for name, _ in RUNS[n.runs]})
+        known = measure(work, wanted)
     rows = [
         [f"`{n.name}`", f"`{n.file}`", *(effect(known[f"shipped {n.runs}"], known[n.label][word]) for word in FACTORS)]
         for n in wanted
     ]
     caption = (
-        "What half and double of each number do: the ATE against that of the shipped value, median and worst of the drives; "
-        "where no pose changes, the NEES, or the conclusive checks (those of the shipped value); none: the same bytes."
+        "What half and double of each number do: the ATE against that of the shipped value, median and range over the drives; "
+        "where no pose changes, the NEES likewise, or the conclusive checks (those of the shipped value); none: the same bytes."
     )
     tables.table("constants", caption, ["name", "file", "half", "double"], rows, args.write)
 

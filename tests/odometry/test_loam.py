@@ -20,7 +20,6 @@ from lslam.geometry import se3
 from lslam.odometry import create_odometry
 from lslam.odometry.all_points import ALL_POINTS
 from lslam.odometry.feature_policies import LessPlanar
-from lslam.odometry.feature_target import PATIENCE
 from lslam.odometry.loam import Loam
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.features import FeaturePoints, Features
@@ -166,22 +165,11 @@ def test_a_scan_without_features_is_bridged_and_the_next_is_registered(method: s
         assert metres(good, truth[k]) < 0.08
 
 
-def test_after_a_row_of_failures_the_target_is_a_scan_at_hand() -> None:
-    scans, _ = street()
-    driver = Driver("loam-odom")
-    driver.drive(scans[:6])
-    before = driver.loam.registration.target.scan
-    for k in range(6, 6 + PATIENCE):
-        assert driver.loam.registration.target.scan is before
-        driver.feed(starved(scans[k], "noise"))
-    assert driver.loam.registration.target.scan is not before
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_recording_that_begins_without_features_begins_with_the_first_scan_that_has_some(method: str) -> None:
     """A lens cap, taken off on the move: what failed is no target, and the step from the first scan is sought far off."""
     scans, truth = street()
-    driver, first = Driver(method), PATIENCE + 1
+    driver, first = Driver(method), 4
     blind = driver.drive([starved(scan, "empty") for scan in scans[:first]])
     assert [r.status for r in blind] == ["bridged"] * first
     found = driver.drive([scans[first], scans[first + 2]])
