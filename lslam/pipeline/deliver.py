@@ -63,7 +63,10 @@ def in_folder(
         try:
             yield _begun(job, folder, goes_on, earlier)
         except BaseException as error:
-            _write_last(folder, manifest.as_dict(manifest.word_for(error), str(error) or type(error).__name__))
+            word = manifest.word_for(error)
+            # A run that was stopped before it knew its configuration has nothing to go on with, and begins anew.
+            if word != "interrupted" or (folder.path / "config.toml").is_file():
+                _write_last(folder, manifest.as_dict(word, str(error) or type(error).__name__))
             raise
         if manifest.outcome != "interrupted":
             folder.keep_odometry()
