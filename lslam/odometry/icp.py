@@ -65,7 +65,7 @@ class Icp(Traits, Stateful):
     """Adapter from scans and motion priors to `Registration`."""
 
     is_searching = True
-    deskew = "by the motion prior, again by the motion that registration finds, and where that bends by later scans, too"
+    deskew = "by the motion prior, and again by the motion that registration finds"
     STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
 
     def __init__(self, registration: Registration) -> None:
