@@ -13,7 +13,7 @@ from lslam.backend.georeferencing import require_crs
 from lslam.backend.manual_files import read_control_points, read_named_pairs
 from lslam.config import Config
 from lslam.errors import InputError
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.maps.georeference import to_wgs84
 from lslam.types.constraint import Instant, KnownPair, Manual, NamedPair
 from lslam.types.scan_result import ScanResult

@@ -3,12 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import click
 
 from lslam.cli import options
+
+_SHOWN = 8  # names of files
+
+
+def bag_lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Label and value of the bag as a whole."""
+    files = len(bag["files"])
+    parts = [f"{files} file{'s' if files > 1 else ''}", _size(bag["size_bytes"]), f"{bag['messages']} messages"]
+    if bag["duration_s"] is not None:
+        begin = bag["start_utc"] or f"{bag['start_ns'] * 1e-9:.3f} s"
+        parts.append(f"{bag['duration_s']:.2f} s from {begin}")
+    yield "bag", ", ".join(parts)
+    if files > 1:
+        names = [PurePath(file).name for file in bag["files"]]
+        yield "parts", ", ".join(names if files <= _SHOWN else [*names[: _SHOWN - 2], "...", names[-1]])
+
+
+def topic_lines(bag: dict[str, Any]) -> Iterator[str]:
+    """A line per topic: name, type, messages, rate, and what it is used for."""
+    topics = bag["topics"]
+    if not topics:
+        yield "none"
+        return
+    name = max(len(topic["name"]) for topic in topics)
+    kind = max(len(topic["type"] or "unknown type") for topic in topics)
+    count = max(len(str(topic["messages"])) for topic in topics)
+    for topic in topics:
+        rate = "" if topic["rate_hz"] is None else f"{topic['rate_hz']:.1f} Hz"
+        yield (
+            f"{topic['name']:<{name}}  {topic['type'] or 'unknown type':<{kind}}  {topic['messages']:>{count}}  {rate:>10}  "
+            f"{topic['used_for'] or '-'}"
+        )
+
+
+def _size(count: int) -> str:
+    """Bytes for people.
+
+    >>> _size(999), _size(1_250_000)
+    ('999 bytes', '1.2 MB')
+    """
+    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count} bytes"
 
 
 @click.command(epilog="Example: lslam info sample_data")
@@ -79,10 +123,9 @@ def command(
 
 
 def _show_topics(bag: dict[str, Any]) -> None:
-    from lslam.cli import bag_page
 
     click.echo("\ntopics")
-    for line in bag_page.table(bag):
+    for line in topic_lines(bag):
         click.echo(f"  {line}")
 
 
@@ -95,7 +138,6 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
         find_folder(name, data_root)
     except LslamError:
         return  # there is nothing: no need to import what would look into it
-    from lslam.cli import bag_page
     from lslam.doctor.examine_bag import bag_at
 
     bag = bag_at(name, data_root)
@@ -106,7 +148,7 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
 
         click.echo(json.dumps({"path": name, "bag": bag, "error": error}, indent=1, allow_nan=False))
         return
-    for label, value in bag_page.lines(bag):
+    for label, value in bag_lines(bag):
         click.echo(f"{label:<18} {value}")
     for sentence in bag["remarks"]:
         click.echo(f"  - {sentence}")
@@ -118,9 +160,7 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "sequence", f"{facts['name']}  ({facts['path']})"
     yield "format", facts["format"] + (f", sensor {facts['sensor']}" if facts["sensor"] else "")
     if facts["bag"] is not None:
-        from lslam.cli import bag_page
-
-        yield from bag_page.lines(facts["bag"])
+        yield from bag_lines(facts["bag"])
     yield "scans", f"{facts['scans']} in {time['duration_s']:.2f} s, {time['rate_hz']:g} Hz"
     if time["period_s"]:
         period = time["period_s"]
@@ -197,7 +237,7 @@ def _noise(noise: dict[str, Any] | None) -> str:
 
 
 def _write_noise(path: Path, facts: dict[str, Any]) -> None:
-    from lslam.doctor.examine_noise import imu_toml
+    from lslam.doctor.examine_imu import imu_toml
     from lslam.errors import InputError
     from lslam.formats.atomic import atomic_write
 

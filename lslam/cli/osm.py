@@ -12,7 +12,7 @@ from lslam.cli import console, options
 if TYPE_CHECKING:
     from lslam.formats.osm_buildings import BuildingExtract
     from lslam.osm.bounds import Bounds
-    from lslam.osm.overpass_reply import OverpassReply
+    from lslam.osm.overpass import OverpassReply
 
 
 @click.group()
@@ -131,7 +131,7 @@ def _write(out: Path, reply: OverpassReply) -> None:
     from lslam.formats.atomic import atomic_write
     from lslam.formats.osm_buildings import buildings_of, middle_of
     from lslam.formats.osm_files import write_osm
-    from lslam.osm.overpass_reply import from_overpass
+    from lslam.osm.overpass import from_overpass
 
     data = from_overpass(reply)
     if out.suffix.lower() == ".json":

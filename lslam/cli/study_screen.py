@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from lslam.cli.console import log, progress, terminal
-from lslam.cli.time_left import TimeLeft
+from lslam.cli.console import TimeLeft, log, progress, terminal
 
 if TYPE_CHECKING:
     from rich.table import Table

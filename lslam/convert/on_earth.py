@@ -1,21 +1,75 @@
-"""The trajectory of a georeferenced run in a format of map programs."""
+"""The trajectory of a georeferenced run in a format of map programs: KML by fastkml, GPX by gpxpy."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from lslam.convert.convert_trajectory import change_frame
-from lslam.convert.gpx_files import write_gpx
-from lslam.convert.kml_files import write_kml
 from lslam.errors import InputError, OutputExistsError, UsageError
+from lslam.extras import importing, install_hint
+from lslam.formats.atomic import write_text
 from lslam.formats.stamp_texts import utc_of
 from lslam.maps.georeference import to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json
 from lslam.types.gnss import Georeference
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
+
+Place = tuple[float, float, float]
+
+
+def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
+    """Write a way of lat, lon (deg), height (m), WGS84, as a line, and as a track in time where `times` (UTC) are known.
+
+    The line lies on the ground: KML counts heights from the sea, ours are above the ellipsoid. They stand in the coordinates.
+    Raises OutputError when the file cannot be written, InputError without fastkml.
+    """
+    with importing("fastkml", install_hint("geo")), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # without lxml it does not indent
+        from fastkml import KML, Document, Placemark, gx
+        from fastkml.enums import AltitudeMode
+        from fastkml.geometry import LineString
+        from fastkml.times import KmlDateTime
+        from pygeoif import geometry
+    coordinates = [(lon, lat, height) for lat, lon, height in places]
+    # KML asks for two points of a line.
+    line = geometry.LineString(coordinates if len(coordinates) > 1 else coordinates * 2)
+    marks = [Placemark(name=name, description=about, kml_geometry=LineString(
+        geometry=line, tessellate=True, altitude_mode=AltitudeMode.clamp_to_ground,
+    ))]  # fmt: skip
+    if times is not None:
+        track = gx.Track(
+            altitude_mode=AltitudeMode.clamp_to_ground, whens=[KmlDateTime(t) for t in times], coords=coordinates
+        )
+        marks.append(Placemark(name=f"{name}, in time", kml_geometry=track))
+    document = KML(features=[Document(name=name, description=about, features=marks)])
+    write_text(path, '<?xml version="1.0" encoding="UTF-8"?>\n' + document.to_string() + "\n")
+
+
+def write_gpx(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
+    """Write a way of lat, lon (deg), height (m), WGS84, as one segment, with `times` (UTC) where they are known.
+
+    Raises OutputError when the file cannot be written, InputError without gpxpy.
+    """
+    with importing("gpxpy", install_hint("geo")):
+        from gpxpy.gpx import GPX, GPXTrack, GPXTrackPoint, GPXTrackSegment
+    points = [
+        GPXTrackPoint(lat, lon, elevation=height, time=None if times is None else times[k])
+        for k, (lat, lon, height) in enumerate(places)
+    ]
+    document = GPX()
+    document.creator = f"lslam {__version__}"
+    track = GPXTrack(name=name, description=about)
+    track.segments.append(GPXTrackSegment(points))
+    document.tracks.append(track)
+    write_text(path, document.to_xml(version="1.1") + "\n")
+
 
 WRITERS = {"kml": write_kml, "gpx": write_gpx}
 TRAJECTORY, MANIFEST = "trajectory.tum", "manifest.json"

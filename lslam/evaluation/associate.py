@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.errors import InputError
-from lslam.geometry import interpolate, so3
+from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -147,7 +147,7 @@ def _interpolated(
     nearest = np.minimum(np.abs(known[after] - stamps), np.abs(known[after - 1] - stamps))
     inside = (stamps >= known[0]) & (stamps <= known[-1]) & (gap <= hole)
     i = np.flatnonzero(inside | (nearest <= limit))
-    truth_poses = interpolate.poses_at(known, truth.poses, stamps[i]) if len(i) else np.zeros((0, 4, 4))
+    truth_poses = se3.poses_at(known, truth.poses, stamps[i]) if len(i) else np.zeros((0, 4, 4))
     return Matches(
         estimate=estimate.poses[i],
         truth=truth_poses,
@@ -246,7 +246,7 @@ def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None
         count = int((t.stamps_ns[-1] - t.stamps_ns[0]) // step) + 1
     if count <= WINDOW:
         return np.zeros((0, 2))
-    poses = interpolate.poses_at(t.stamps_ns, t.poses, first + step * np.arange(count))
+    poses = se3.poses_at(t.stamps_ns, t.poses, first + step * np.arange(count))
     start, end = poses[:-WINDOW], poses[WINDOW:]
     speed = np.linalg.norm(end[:, :3, 3] - start[:, :3, 3], axis=1)
     turn = so3.angle(np.swapaxes(start[:, :3, :3], -1, -2) @ end[:, :3, :3])

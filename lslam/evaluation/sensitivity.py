@@ -9,14 +9,17 @@ import numpy as np
 from lslam.config.study import ExpectedFinding
 from lslam.evaluation.curves import curves_of, divergence, lost_above, median_over_seeds, optimum, over_seeds
 from lslam.evaluation.laws import FEWEST, fit_law, law_over
-from lslam.evaluation.verdicts_of_amounts import judge_acts_only_on, judge_law, judge_matters_little, judge_product
-from lslam.evaluation.verdicts_of_places import (
+from lslam.evaluation.verdicts import (
+    judge_acts_only_on,
     judge_best_between,
     judge_diverges_beyond,
     judge_elbow_at,
     judge_good_from,
     judge_holds_up_to,
     judge_largest_between,
+    judge_law,
+    judge_matters_little,
+    judge_product,
 )
 from lslam.types.study import (
     Curve,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import interpolate, so3
+from lslam.geometry import se3, so3
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
@@ -92,7 +92,7 @@ def _linearised(
     if many < MIN_BLOCKS:
         return None
     before, at, after = (
-        _motions(interpolate.poses_at(truth.stamps_ns, truth.poses, stamps + shift), count, turns)[use]
+        _motions(se3.poses_at(truth.stamps_ns, truth.poses, stamps + shift), count, turns)[use]
         for shift in (-reach, 0, reach)
     )
     r = own[use] - at

@@ -8,8 +8,7 @@ from contextvars import copy_context
 from dataclasses import dataclass
 
 from lslam.config import Config
-from lslam.keyframes.cloud import keyframe_cloud
-from lslam.keyframes.select import KeyframeSelector
+from lslam.keyframes.select import KeyframeSelector, keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan

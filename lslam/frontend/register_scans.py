@@ -22,7 +22,7 @@ from lslam.frontend.segments import Begin, SegmentTracker, Tracked
 from lslam.frontend.tracker import Loaded, Tracker
 from lslam.frontend.windows import WindowTracker
 from lslam.geometry import se3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.inertial.constant_velocity import MotionModel
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.odometry.base import Odometry

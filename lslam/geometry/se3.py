@@ -93,3 +93,20 @@ def _inverse_left_jacobian(phi: Floats) -> Floats:
     series = 1 / 12 + theta2 / 720 + theta2 * theta2 / 30240
     c = np.where(small, series, (1 - half * cosine / sine) / (4 * half * half))
     return np.asarray(np.eye(3) - 0.5 * so3.hat(phi) + c * so3.square(phi))
+
+
+def poses_at(stamps_ns: NDArray[np.int64], poses: Floats, query_ns: NDArray[Any]) -> Floats:
+    """Poses (M, 4, 4) at `query_ns` (M,) from increasing `stamps_ns` (N,) and `poses` (N, 4, 4), N >= 2.
+
+    Queries outside the stamps extrapolate the first or last segment: the caller decides how far that is wise.
+    """
+    stamps = np.asarray(stamps_ns, np.int64)
+    query = np.asarray(query_ns, np.int64)
+    left = np.clip(np.searchsorted(stamps, query, side="right") - 1, 0, len(stamps) - 2)
+    span = (stamps[left + 1] - stamps[left]).astype(np.float64)
+    share = (query - stamps[left]).astype(np.float64) / span
+    a, b = poses[left], poses[left + 1]
+    R_a = a[:, :3, :3]
+    turn = so3.log(portable.product(np.swapaxes(R_a, -1, -2), b[:, :3, :3]))
+    t = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
+    return make(portable.product(R_a, so3.exp(share[:, None] * turn)), t)

@@ -15,7 +15,7 @@ from lslam.errors import GraphError
 from lslam.formats.state_files import Records
 from lslam.geometry import noise, se3
 from lslam.graph.factors import well_conditioned
-from lslam.graph.preintegration import preintegrated
+from lslam.graph.inertial_factors import preintegrated
 from lslam.types.imu import InertialState, InertialStep, SmootherNoise
 from lslam.types.state import State
 

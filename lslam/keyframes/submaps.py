@@ -1,15 +1,18 @@
-"""Submaps: the clouds of neighbouring keyframes in one frame."""
+"""Submaps, clouds of neighbouring keyframes in one frame, and the up direction that they and the mounting tell."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3
 from lslam.kernels import voxel as voxels
 from lslam.kernels.transform import transform
 from lslam.keyframes.store import KeyframeStore
+from lslam.preprocessing.ground import Z, world_up_of
 from lslam.preprocessing.prepare import NO_TIMES
+from lslam.preprocessing.up import find_up
 
 
 def neighbours(count: int, number: int, size: int) -> range:
@@ -38,3 +41,22 @@ def submap(
         transform(cloud, se3.relative(frame, poses[k]), points[first : first + len(cloud)])
         first += len(cloud)
     return points if voxel is None else voxels.means(points, NO_TIMES, voxel)[0]
+
+
+Floats = NDArray[np.float64]
+
+# Keyframes in whose clouds the ground is looked for: rings of a sensor on its side cross it in a line, those of 20 m cover it.
+KEYFRAMES = 10
+
+
+def mounted_up(store: KeyframeStore, poses: Floats, config: PreprocessConfig) -> Floats:
+    """(3,) unit vector up in the world of the poses (K, 4, 4), T_world_lidar of all keyframes.
+
+    By `preprocess.up`, or else by the ground about the first keyframes: z unless it is more than 45 deg off.
+    """
+    if config.up is not None or not len(store):
+        return world_up_of(config, poses[0]) if len(poses) else Z
+    middle = min(KEYFRAMES, len(store)) // 2
+    frame = np.eye(4)
+    frame[:3, 3] = poses[middle, :3, 3]
+    return find_up(submap(store, poses, middle, KEYFRAMES, T_world_frame=frame)).direction

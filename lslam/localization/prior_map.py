@@ -13,7 +13,7 @@ from lslam.config.odometry import RegistrationConfig
 from lslam.errors import InputError
 from lslam.geometry import se3
 from lslam.kernels.transform import transform
-from lslam.loops.level import find_up, level_rotation
+from lslam.loops.level_submap import find_up, level_rotation
 from lslam.preprocessing.ground import Z
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap

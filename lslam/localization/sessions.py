@@ -14,9 +14,8 @@ from lslam.geometry import geodesy, noise, se3
 from lslam.graph.odometry_constraints import positive
 from lslam.kernels import voxel
 from lslam.kernels.transform import transform
-from lslam.keyframes.mounting import mounted_up
 from lslam.keyframes.store import KeyframeStore
-from lslam.keyframes.submaps import submap
+from lslam.keyframes.submaps import mounted_up, submap
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.prior_map import make_prior_map
 from lslam.localization.start import PlaceFinder, Start, StartPrior

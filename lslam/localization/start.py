@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.geometry import se3, so3
 from lslam.kernels.transform import transform
-from lslam.keyframes.mounting import mounted_up
 from lslam.keyframes.store import KeyframeStore
-from lslam.keyframes.submaps import submap
+from lslam.keyframes.submaps import mounted_up, submap
 from lslam.localization.place_search import APART, PlaceSearch, Region
-from lslam.loops.level import find_up, level_rotation
-from lslam.loops.level_submap import LevelSubmap, make_level_submap
+from lslam.loops.level_submap import LevelSubmap, find_up, level_rotation, make_level_submap
 from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.preprocessing.up import ahead_of
 from lslam.registration.acceptance import MAP_MIN_INLIERS, Acceptance

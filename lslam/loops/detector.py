@@ -19,13 +19,9 @@ from lslam.errors import InterruptedRunError
 from lslam.geometry import se3, so3
 from lslam.kernels.transform import transform
 from lslam.loops import create_descriptor
-from lslam.loops.ambiguity import resolve_ambiguity
 from lslam.loops.descriptor import PlaceMatch
-from lslam.loops.gating import OdometryUncertainty, RelativeUncertainty
-from lslam.loops.level import find_up, levelled
-from lslam.loops.level_submap import LevelSubmap, make_level_submap
-from lslam.loops.shared_results import SharedResults
-from lslam.loops.throttling import LoopThrottle
+from lslam.loops.gating import LoopThrottle, OdometryUncertainty, RelativeUncertainty, SharedResults, resolve_ambiguity
+from lslam.loops.level_submap import LevelSubmap, find_up, levelled, make_level_submap
 from lslam.loops.verify import Verification, Verifier
 from lslam.loops.working_memory import WorkingMemory
 from lslam.preprocessing.ground import Z

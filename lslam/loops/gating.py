@@ -1,15 +1,20 @@
-"""Gating of loop candidates: the relative uncertainty of two keyframes by odometry."""
+"""Gating of loop candidates: by the uncertainty of odometry, by how often they are tried, and by what else a keyframe matches."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import so3
 from lslam.kernels import gating
+from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
@@ -89,3 +94,112 @@ def _positive(matrices: Floats) -> Floats:
     """Symmetric (C, 3, 3) without negative eigenvalues: the difference of two estimates may have some."""
     values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+class LoopThrottle:
+    """Distance between two attempts: `spacing` after a change of verdict, up to three times it while verdicts repeat.
+
+    One more loop closure in a row of accepted ones adds little information, and so does one more rejection.
+    """
+
+    LONGEST = 3
+
+    def __init__(self, spacing: float) -> None:
+        self.spacing = spacing
+        self.reset()
+
+    def reset(self) -> None:
+        """Attempt at the next candidate: there were none."""
+        self._tried_at, self._row = -np.inf, 0
+        self.last: Verdict | None = None
+
+    @property
+    def wait(self) -> float:
+        """m between the last attempt and the next."""
+        return self.spacing * min(self._row, self.LONGEST)
+
+    def is_due(self, distance: float) -> bool:
+        """Whether an attempt is due at `distance` m since the start."""
+        return distance - self._tried_at >= self.wait
+
+    def observe(self, distance: float, verdict: Verdict) -> None:
+        """Take the verdict of an attempt at `distance` m."""
+        self._row = self._row + 1 if verdict == self.last else 1
+        self._tried_at, self.last = distance, verdict
+
+
+def resolve_ambiguity(
+    examined: list[LoopCandidate], keyframes: Sequence[Keyframe], reach: Callable[[int, int], float]
+) -> list[LoopCandidate]:
+    """Candidates of one newer keyframe, the most similar first, with at most one loop closure accepted.
+
+    reach : m, gate of odometry between an older and a newer keyframe
+
+    All are rejected when two imply different poses of the keyframe, or when one of them was ambiguous by itself.
+    """
+    accepted = [c for c in examined if c.is_accepted]
+    ambiguous = next((c for c in examined if c.stage == LoopStage.AMBIGUITY), None)
+    if accepted and ambiguous is not None:
+        return [_ambiguous(c, f"keyframe {ambiguous.a} looks as much alike, and is ambiguous") for c in examined]
+    if len(accepted) < 2:
+        return examined
+    first = accepted[0]
+    for other in accepted[1:]:
+        gap = float(np.linalg.norm(_put(other, keyframes) - _put(first, keyframes)))
+        if gap > reach(min(first.a, other.a), max(first.a, other.a)):
+            said = f"keyframes {first.a} and {other.a} fit, at places {gap:.1f} m apart"
+            return [_ambiguous(c, said) for c in examined]
+    said = f"closed with keyframe {first.a} already"
+    extra = {c.a for c in accepted[1:]}
+    return [
+        replace(c, verdict=Verdict.REJECTED, stage=LoopStage.THINNED, reason=said) if c.a in extra else c
+        for c in examined
+    ]
+
+
+def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
+    """(3,) m in the world, position of the newer keyframe by the loop closure and odometry's pose of the older one."""
+    assert candidate.constraint is not None
+    return np.asarray((keyframes[candidate.a].T_world_lidar @ candidate.constraint.T_a_b)[:3, 3])
+
+
+def _ambiguous(candidate: LoopCandidate, reason: str) -> LoopCandidate:
+    """The candidate, rejected as ambiguous unless it was rejected before."""
+    if not candidate.is_accepted:
+        return candidate
+    return replace(candidate, verdict=Verdict.REJECTED, stage=LoopStage.AMBIGUITY, reason=reason)
+
+
+T = TypeVar("T")
+
+
+class SharedResults(Generic[T]):
+    """Results of a function of a number, the last used ones kept; who asks for one that another thread makes waits for it.
+
+    make : the function; kept : how many results, None for all
+
+    >>> squares = SharedResults(lambda number: number**2, kept=1)
+    >>> squares.get(3), squares.get(3), squares.get(4)
+    (9, 9, 16)
+    """
+
+    def __init__(self, make: Callable[[int], T], kept: int | None = None) -> None:
+        self._make, self._kept = make, kept
+        self._made: OrderedDict[int, Future[T]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, number: int) -> T:
+        """The result for `number`; raises what making it raised."""
+        with self._lock:
+            known = self._made.get(number)
+            result = Future() if known is None else known
+            self._made[number] = result
+            self._made.move_to_end(number)
+            if self._kept is not None and len(self._made) > self._kept:
+                self._made.popitem(last=False)
+        if known is None:
+            try:
+                result.set_result(self._make(number))
+            except BaseException as error:
+                result.set_exception(error)
+        return result.result()

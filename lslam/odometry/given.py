@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.inertial.constant_velocity import MotionModel
 from lslam.odometry.base import Traits
 from lslam.preprocessing.deskew import knots_over

@@ -24,7 +24,7 @@ from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_buildings import buildings_of
 from lslam.geometry.geodesy import from_local
 from lslam.osm.bounds import Bounds, around
-from lslam.osm.overpass_reply import OverpassReply, from_overpass
+from lslam.osm.overpass import OverpassReply, from_overpass
 from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")

@@ -20,9 +20,9 @@ from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm import matcher_named
 from lslam.osm.location import Located, finish, locate
-from lslam.osm.prior import match_buildings
 from lslam.osm.source import OsmSource
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
+from lslam.osm.wall_match import match_buildings
 from lslam.stopping import checking
 from lslam.types.gnss import Georeference
 from lslam.types.stage_clock import KeyframeClocks

@@ -24,10 +24,9 @@ from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PlanarPrior, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import neighbours, submap
-from lslam.osm.prior import match_buildings, match_keyframe, shares
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
-from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading
+from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildings, match_keyframe, shares
 from lslam.osm.walls import OsmMap, find_walls
 from lslam.preprocessing.ground import up_of, world_up_of
 from lslam.stopping import checking

@@ -21,8 +21,7 @@ from lslam.formats.osm_files import read_osm
 from lslam.geometry import se2
 from lslam.geometry.geodesy import to_local
 from lslam.osm.buffer import Fetch, OsmBuffer
-from lslam.osm.overpass import fetch_buildings, reply_folder
-from lslam.osm.overpass_reply import OverpassReply, merged
+from lslam.osm.overpass import OverpassReply, fetch_buildings, merged, reply_folder
 from lslam.osm.walls import OsmMap
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence

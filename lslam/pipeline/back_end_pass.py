@@ -24,8 +24,8 @@ from lslam.formats.state_files import Records
 from lslam.formats.trajectory_files import write_tum
 from lslam.frontend.register_scans import to_trajectory
 from lslam.geometry import se2, se3
-from lslam.keyframes.mounting import mounted_up
 from lslam.keyframes.store import KeyframeStore
+from lslam.keyframes.submaps import mounted_up
 from lslam.loops.find_loops import find_loops, verify_known
 from lslam.osm.hold import hold_by_buildings
 from lslam.pipeline.job import PreparedRun

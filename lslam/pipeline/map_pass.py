@@ -17,7 +17,7 @@ from lslam.config.outputs import MapConfig
 from lslam.errors import InputError, InterruptedRunError
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.floor_plan import TopView, top_view
 from lslam.maps.merge import MapMerger

@@ -39,7 +39,7 @@ from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
-from lslam.osm import prior
+from lslam.osm import wall_match
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
@@ -216,7 +216,7 @@ def _load_kernels(
     if config.loops.use or config.localize.map:
         find_loops.warm_up(config.loops)
     if config.osm.extract:
-        prior.warm_up()
+        wall_match.warm_up()
     if config.map.write:
         merge.warm_up()
         crispness.warm_up()

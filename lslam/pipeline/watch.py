@@ -13,7 +13,7 @@ from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.point_files import read_cloud
 from lslam.pipeline.map_files import in_own_world
 from lslam.reports.figures import ON_THE_MAP, PlottedRun, draw_figure
-from lslam.reports.notebook import WIDTH, as_html, drawn
+from lslam.reports.picture import WIDTH, as_html, drawn
 from lslam.reports.plots import first_available
 from lslam.reports.text import summary
 from lslam.types.cloud import ArrayCloud

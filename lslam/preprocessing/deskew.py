@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.kernels import transform
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.types.motion_prior import MotionPrior

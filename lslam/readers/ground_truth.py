@@ -17,7 +17,7 @@ from lslam.formats.text_tables import read_table
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
 from lslam.geometry import geodesy, portable, se3, so3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.readers.listing import file_numbers, filled_stamps, rows_of
 from lslam.remote import RemotePath, as_path
 from lslam.types.sequence import Calibration

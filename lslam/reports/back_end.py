@@ -11,7 +11,7 @@ from lslam.geometry import se3
 from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
-from lslam.reports.crops import PIXELS, Crop, crop_images
+from lslam.reports.map_view import PIXELS, Crop, crop_images
 from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from lslam.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.printable import metres
-from lslam.reports.colours import VIRIDIS
 from lslam.reports.compare_html import style_of
 from lslam.reports.map_view import MapFigure, map_figure
 from lslam.reports.page_data import cloud_data, packed
 from lslam.reports.plots import Figure
+from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render
 from lslam.reports.svg import Track, plane_chart
 from lslam.types.cloud import ArrayCloud

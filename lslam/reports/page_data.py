@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
-from lslam.reports.colours import VIRIDIS, usual_range
 from lslam.reports.plots import first_available
+from lslam.reports.png import VIRIDIS, usual_range
 from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult

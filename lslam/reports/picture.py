@@ -1,7 +1,9 @@
-"""Pictures drawn with matplotlib: one look, and the same bytes for the same input."""
+"""Pictures drawn with matplotlib: one look, the same bytes for the same input, on paper and in a notebook."""
 
 from __future__ import annotations
 
+import base64
+import html
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
     from lslam.evaluation.results import AbsoluteError, Evaluation
     from lslam.formats.osm_buildings import BuildingExtract
+
 
 FORMATS = ("png", "svg", "pdf")
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito: safe for colour blindness
@@ -222,3 +225,21 @@ def _outline(rings: tuple[NDArray[np.float64], ...]) -> Any:
     from matplotlib.path import Path as Outline
 
     return Outline.make_compound_path(*(Outline(np.concatenate([r, r[:1]]), closed=True) for r in rings))
+
+
+# mm
+WIDTH = 150.0
+
+
+def as_html(text: str, picture_svg: bytes | None = None) -> str:
+    """Text as it stands, and under it a picture."""
+    shown = f"<pre>{html.escape(text)}</pre>"
+    if picture_svg is None:
+        return shown
+    return f'{shown}<img alt="" src="data:image/svg+xml;base64,{base64.b64encode(picture_svg).decode()}">'
+
+
+def drawn(make: Any) -> bytes:
+    """SVG of the matplotlib figure that `make` gives, in the house's style."""
+    with house_style():
+        return picture(make(), "svg")

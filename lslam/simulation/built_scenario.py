@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.simulation import path as paths
-from lslam.simulation.aerobatics import EightFlight, eight_flight
 from lslam.simulation.carpark import build_carpark
 from lslam.simulation.city import City, build_city
 from lslam.simulation.countryside import build_corridor, build_motorway, build_woods
 from lslam.simulation.curve import RouteCurve, stretched
-from lslam.simulation.flight import FreePath, buffeting, climb_spline, fly, gait
-from lslam.simulation.hall import build_hall
+from lslam.simulation.flight import EightFlight, FreePath, buffeting, climb_spline, eight_flight, fly, gait
+from lslam.simulation.indoors import build_hall, build_room, build_stairwell
 from lslam.simulation.kinematics import PosePath
-from lslam.simulation.living_room import build_room
 from lslam.simulation.moving import Mover, add_queue, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
@@ -37,7 +35,6 @@ from lslam.simulation.routes import (
 )
 from lslam.simulation.scenario_files import INDOORS, Scenario
 from lslam.simulation.scene_mesh import Surface
-from lslam.simulation.stairwell import build_stairwell
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints

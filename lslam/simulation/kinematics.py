@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from lslam.config.section import Section
 from lslam.geometry import portable, se3, so3
-from lslam.simulation.splines import interpolating_spline
+from lslam.simulation.curve import interpolating_spline
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import portable, se3, so3
-from lslam.simulation.curve import RouteCurve
-from lslam.simulation.splines import interpolating_spline
+from lslam.simulation.curve import RouteCurve, interpolating_spline
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]

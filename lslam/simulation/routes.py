@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from lslam.errors import UsageError
 from lslam.geometry import portable
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
-from lslam.simulation.living_room import room_line
+from lslam.simulation.indoors import room_line, stairs_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
-from lslam.simulation.stairwell import stairs_line
 from lslam.simulation.terrain import flat
 from lslam.simulation.waypoints import WayPoints
 

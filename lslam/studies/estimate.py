@@ -18,9 +18,9 @@ from lslam.readers import open_sequence
 from lslam.studies.grid import Job
 from lslam.studies.jobs import Local
 from lslam.studies.results import Results
+from lslam.studies.results_csv import FINAL, read_state
 from lslam.studies.runner import StudyProgress
 from lslam.studies.scenes import drive_of, simulate_once
-from lslam.studies.states import FINAL, read_state
 from lslam.studies.subjects import used
 from lslam.studies.sweep import write_study_report
 from lslam.studies.variants import Variant

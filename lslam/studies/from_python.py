@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.reports import compare_table
-from lslam.reports.notebook import as_html
+from lslam.reports.picture import as_html
 from lslam.studies import compare as compared
 from lslam.studies.output import COMPARISON, require_free
 from lslam.studies.plan import Plan

@@ -1,16 +1,17 @@
-"""The grid of a study: recordings and simulations as cells with digests of their input, x methods x seeds, as jobs."""
+"""Studies by name or file, and their grid: cells of recordings and simulations, x methods x seeds, as jobs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
-from lslam.config.study import StudySequence
-from lslam.errors import InputError, UsageError
+from lslam.config.study import StudyConfig, StudySequence, parse_study, read_study
+from lslam.errors import InputError, UsageError, nearest
 from lslam.formats.bag_listing import stem_of
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.printable import file_safe
@@ -22,6 +23,7 @@ from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
 from lslam.studies.subjects import check_range, scans_needed, with_range
 from lslam.studies.variants import Variant, free_name
+from lslam.untrusted import parse_toml
 
 if TYPE_CHECKING:
     from lslam.types.trajectory import Trajectory
@@ -229,3 +231,26 @@ def _simulated(
     scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
     scene = fitted_scene(scene, needed, own, seeds)
     return [scene_cell(scene, seed, output.scenes or output.out / SIMULATED, own) for seed in seeds]
+
+
+# Studies that ship with lslam.
+FOLDER = "ready"
+
+
+def study_names() -> tuple[str, ...]:
+    """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
+    files = resources.files(__package__).joinpath(FOLDER).iterdir()
+    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+
+
+def find_study(word: str) -> StudyConfig:
+    """The study of a TOML file, else the ready one of that name.
+
+    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
+    """
+    if word.endswith(".toml") or Path(word).is_file():
+        return read_study(Path(word))
+    if word not in study_names():
+        raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
+    text = resources.files(__package__).joinpath(FOLDER, f"{word}.toml").read_text(encoding="utf-8")
+    return parse_study(parse_toml(text), f"study {word!r}", word)

@@ -15,9 +15,9 @@ from typing import Protocol
 from lslam.pipeline.storage import spool_of
 from lslam.remote import RemotePath
 from lslam.studies.grid import Job
+from lslam.studies.results_csv import State, is_reusable, read_state, write_state
 from lslam.studies.runner import StudyProgress, Task, WorkerPool, run_tasks
 from lslam.studies.scenes import simulate_once
-from lslam.studies.states import State, is_reusable, read_state, write_state
 from lslam.studies.subjects import used
 from lslam.studies.worker import WorkerContext, execute
 

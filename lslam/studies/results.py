@@ -20,8 +20,7 @@ from lslam.extras import install_command
 from lslam.remote import RemotePath
 from lslam.reports.compare_table import HEALTH
 from lslam.studies.grid import Job
-from lslam.studies.results_csv import read_study_csv, write_study_csv, write_study_parquet
-from lslam.studies.states import FINAL, State, read_state
+from lslam.studies.results_csv import FINAL, State, read_state, read_study_csv, write_study_csv, write_study_parquet
 from lslam.studies.variants import Variant
 from lslam.types.comparison import Group, Metric, RunScore
 from lslam.types.study import StudyRow

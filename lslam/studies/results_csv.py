@@ -1,4 +1,4 @@
-"""results.csv: one row per run of a study.
+"""results.csv, one row per run of a study, and how each of its jobs ended, in a small file beside its run folder.
 
 The first column is the version of the file. Studied parameters are columns named by their configuration key, `input.skip_frames`;
 stages are columns `stage_ms.NAME`. An empty cell is a number that is not there, or a parameter that the run was not given.
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,6 +21,57 @@ from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write, write_text
 from lslam.printable import printable_tree
 from lslam.types.study import StudyRow, Value
+from lslam.untrusted import MISFIT, parse_json
+
+# What a repetition would end with again; everything else is tried anew.
+FINAL = ("done", "degraded", "diverged")
+
+
+@dataclass(frozen=True)
+class State:
+    """status : `done`, `degraded`, `diverged`, `interrupted`, `failed` or `crashed`; reason : one sentence, empty when done.
+
+    digest : of the job; jobs : runs that shared the machine; load : of the machine before the first run of the study
+    seconds : of the whole run; is_alone : whether it had a core to itself, as far as the study knows; waited : share of the
+        seconds in which it had none; machine : name of the host
+    """
+
+    digest: str
+    status: str
+    reason: str = ""
+    jobs: int = 1
+    load: float = 0.0
+    seconds: float = 0.0
+    is_alone: bool = True
+    waited: float = 0.0
+    machine: str = ""
+
+
+def write_state(path: Path, state: State) -> None:
+    """Write the file atomically; raises OutputError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps(asdict(state), indent=1) + "\n")
+
+
+def read_state(path: Path) -> State | None:
+    """The state; None when there is none that can be read."""
+    try:
+        tree = parse_json(path.read_text(encoding="utf-8"))
+        return State(
+            str(tree["digest"]), str(tree["status"]), str(tree["reason"]), int(tree["jobs"]), float(tree["load"]),
+            float(tree["seconds"]), bool(tree["is_alone"]), float(tree["waited"]), str(tree["machine"]),
+        )  # fmt: skip
+    except (OSError, *MISFIT):
+        return None
+
+
+def is_reusable(path: Path, folder: Path, digest: str) -> bool:
+    """Whether the job was finished before, by the same configuration, input and version, and its folder is still there."""
+    state = read_state(path)
+    return (
+        state is not None and state.digest == digest and state.status in FINAL and (folder / "manifest.json").is_file()
+    )
+
 
 VERSION = 3
 SCHEMA = "study_version"

@@ -32,7 +32,7 @@ from lslam.pipeline.storage import spool_of
 from lslam.remote import RemotePath
 from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
-from lslam.studies.states import State, write_state
+from lslam.studies.results_csv import State, write_state
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence, SequenceView
 

@@ -28,7 +28,7 @@ from lslam.errors import LslamError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.point_times import with_point_times
 from lslam.geometry import se3, so3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.pipeline.deliver import in_folder
 from lslam.pipeline.job import prepare
 from lslam.pipeline.odometry_pass import estimate_poses

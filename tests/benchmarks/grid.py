@@ -36,7 +36,7 @@ from lslam.config.load import known_presets
 from lslam.errors import RunFailedError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.pipeline.run import RunOutcome, Watch, run
 from lslam.readers import open_sequence
 from lslam.simulation.record import record

@@ -20,7 +20,7 @@ from lslam.config.backend import KeyframesConfig, LoopsConfig
 from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
-from lslam.keyframes.cloud import keyframe_cloud
+from lslam.keyframes.select import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops.find_loops import find_loops
 from lslam.loops.scan_context import PlaceIndex

@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 from lslam.errors import UsageError
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.maps import merge
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points

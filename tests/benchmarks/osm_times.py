@@ -20,10 +20,10 @@ from lslam.config.backend import KeyframesConfig, OsmConfig
 from lslam.config.input import PreprocessConfig
 from lslam.formats.osm_buildings import read_buildings
 from lslam.geometry import se2
-from lslam.keyframes.cloud import keyframe_cloud
+from lslam.keyframes.select import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm.location import see_walls
-from lslam.osm.prior import match_buildings, match_keyframe, warm_up
+from lslam.osm.wall_match import match_buildings, match_keyframe, warm_up
 from lslam.osm.walls import OsmMap
 from lslam.readers import open_sequence
 from lslam.types.building import KeyframeMatch

@@ -14,7 +14,7 @@ from lslam.config.input import PreprocessConfig
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.frontend.point_times import with_point_times
 from lslam.frontend.register_scans import estimate
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.odometry import create_odometry
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.preprocessing.rings import decide_rings

@@ -28,7 +28,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lslam.studies.states import read_state
+from lslam.studies.results_csv import read_state
 
 LIMIT_S = 0.2
 GROWTH_MB = 50.0

@@ -20,7 +20,7 @@ from scores import rotation_rpe
 
 from lslam.config import load_config
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence
 

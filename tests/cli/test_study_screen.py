@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 from lslam.cli import study_screen
+from lslam.cli.console import TimeLeft
 from lslam.cli.study_screen import BestTable, bars, best_so_far
-from lslam.cli.time_left import TimeLeft
 from lslam.types.study import StudyRow
 
 ROWS = [

@@ -14,7 +14,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.time_offset import fit_offset
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import se3, so3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.types.trajectory import Trajectory
 
 SCANS, STEP_NS = 300, 100_000_000

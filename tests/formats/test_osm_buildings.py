@@ -22,7 +22,7 @@ from lslam.formats.osm_data import ATTRIBUTION
 from lslam.formats.osm_files import read_osm, write_osm
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.osm.overpass_reply import from_overpass
+from lslam.osm.overpass import from_overpass
 from lslam.simulation.osm_extract import osm_from_buildings
 from lslam.types.building import Building, Footprint, footprint_polygon
 

@@ -14,7 +14,7 @@ from lslam.errors import InputError, OutputError
 from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_data import ATTRIBUTION, Member, OsmData, Relation, Way
 from lslam.formats.osm_files import read_osm, write_osm
-from lslam.osm.overpass_reply import from_overpass
+from lslam.osm.overpass import from_overpass
 
 
 def small() -> ExtractMaker:

@@ -13,8 +13,7 @@ import pytest
 from lslam.formats.osm_data import OsmData
 from lslam.formats.osm_files import read_osm, write_osm
 from lslam.osm.bounds import Bounds
-from lslam.osm.overpass import _file_name, kept_reply
-from lslam.osm.overpass_reply import OverpassReply, from_overpass, merged
+from lslam.osm.overpass import OverpassReply, _file_name, from_overpass, kept_reply, merged
 
 HOUSES = 6_000
 BOX = Bounds(48.95, 8.35, 49.05, 8.45)

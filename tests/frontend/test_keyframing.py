@@ -16,7 +16,7 @@ from lslam.errors import OutputError
 from lslam.frontend.keyframing import Keyframing
 from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
-from lslam.keyframes.cloud import keyframe_cloud
+from lslam.keyframes.select import keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.odometry import create_odometry
 from lslam.preprocessing.views import with_rings

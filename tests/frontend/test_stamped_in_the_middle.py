@@ -17,7 +17,7 @@ from lslam.config import load_config
 from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.pipeline.run import run
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate

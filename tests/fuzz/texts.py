@@ -35,7 +35,7 @@ from lslam.simulation.osm_perturb import read_perturbation
 from lslam.simulation.record import read_mark
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.waypoints import read_way_points
-from lslam.studies import states
+from lslam.studies import results_csv
 from lslam.studies.results_csv import read_study_csv, write_study_csv
 from lslam.types.study import StudyRow
 from lslam.version import __version__
@@ -280,7 +280,7 @@ PARSERS = [
     _text_parser("buildings.geojson", "buildings.geojson", read_corrected, CORRECTED),
     _text_parser("perturbed map", "p.json", read_perturbation, _PERTURBED),
     Parser("kept reply", lambda f: kept_reply(_BOUNDS, f), _kept),
-    _text_parser("job state", "state.json", states.read_state,
+    _text_parser("job state", "state.json", results_csv.read_state,
                  json.dumps({"digest": "a", "status": "done", "reason": "", "jobs": 1, "load": 0.5, "seconds": 1.0,
                              "is_alone": True, "waited": 0.0, "machine": "m"})),
     _text_parser("simulation mark", "simulation.json", lambda p: read_mark(p.parent), '{"fingerprint": "a"}'),

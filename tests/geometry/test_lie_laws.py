@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from lslam.geometry import interpolate, se3, so3, umeyama
+from lslam.geometry import se3, so3, umeyama
 
 vectors = arrays(np.float64, 3, elements=st.floats(-1.7, 1.7))
 twists = arrays(np.float64, 6, elements=st.floats(-1.7, 1.7))
@@ -77,7 +77,7 @@ def test_normalise_returns_to_the_group() -> None:
 
 def test_interpolation_hits_poses_and_halves() -> None:
     poses = np.stack([np.eye(4), se3.exp(np.array([1.0, 0, 0, 0, 0, 0.4]))])
-    out = interpolate.poses_at(np.array([0, 100]), poses, np.array([0, 50, 100]))
+    out = se3.poses_at(np.array([0, 100]), poses, np.array([0, 50, 100]))
     np.testing.assert_allclose(out[[0, 2]], poses, atol=1e-12)
     assert so3.log(out[1, :3, :3])[2] == pytest.approx(0.2)
 

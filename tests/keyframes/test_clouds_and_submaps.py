@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from lslam.config.backend import KeyframesConfig
 from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3
-from lslam.keyframes.cloud import GRAIN, keyframe_cloud
+from lslam.keyframes.select import GRAIN, keyframe_cloud
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import neighbours, submap
 from lslam.types.motion_prior import MotionPrior

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from known_town import keyframes_of, pose
 
-from lslam.loops.ambiguity import resolve_ambiguity
-from lslam.loops.throttling import LoopThrottle
+from lslam.loops.gating import LoopThrottle, resolve_ambiguity
 from lslam.types.constraint import Constraint, LoopCandidate, Verdict
 
 KEYFRAMES = keyframes_of(np.array([pose(10.0 * k, 0) for k in range(9)]))

@@ -11,8 +11,7 @@ from known_town import keyframes_of, pose, round_the_square, seen, town
 
 from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
-from lslam.loops.level import find_up, levelled
-from lslam.loops.level_submap import make_level_submap
+from lslam.loops.level_submap import find_up, levelled, make_level_submap
 
 
 @pytest.mark.parametrize("tilt", [(0, 0), (25, 0), (-15, 30)])

@@ -15,9 +15,8 @@ from lslam.config.odometry import RegistrationConfig
 from lslam.errors import ConfigError
 from lslam.geometry import se3, so3
 from lslam.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector
-from lslam.loops.gating import RelativeUncertainty
+from lslam.loops.gating import RelativeUncertainty, SharedResults
 from lslam.loops.scan_context import PlaceMatch
-from lslam.loops.shared_results import SharedResults
 from lslam.loops.verify import Verification, Verifier, _is_elsewhere
 from lslam.registration.solver import RegistrationResult
 from lslam.types.constraint import LoopCandidate, LoopStage, Verdict

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from lslam.config.input import PreprocessConfig
 from lslam.geometry import se3, so3
-from lslam.keyframes.mounting import KEYFRAMES, mounted_up
 from lslam.keyframes.store import KeyframeStore
+from lslam.keyframes.submaps import KEYFRAMES, mounted_up
 from lslam.preprocessing.ground import Z
 from lslam.preprocessing.up import AXIS, find_up
 from lslam.types.trajectory import Keyframe

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from lslam.loops.shared_results import SharedResults
+from lslam.loops.gating import SharedResults
 
 
 def test_whoever_asks_meanwhile_waits_for_the_one_that_makes_it() -> None:

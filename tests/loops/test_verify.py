@@ -12,8 +12,7 @@ from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
 from lslam.loops import verify
 from lslam.loops.level_submap import LevelSubmap, make_level_submap
-from lslam.loops.search import LARGE, _peaks, find_initial_guesses
-from lslam.loops.verify import Verification, Verifier
+from lslam.loops.verify import LARGE, Verification, Verifier, _peaks, find_initial_guesses
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.solver import RegistrationResult, solve

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.maps.things import ABOVE, GAP, REACH, SQUARE, Floor, floor_of, standing, things_of, whole
+from lslam.maps.clean import ABOVE, GAP, REACH, SQUARE, Floor, floor_of, standing, things_of, whole
 
 SENSOR = np.array([1234.5, -987.25, 40.0])
 

@@ -20,8 +20,7 @@ from lslam.errors import InputError
 from lslam.formats.osm_buildings import buildings_of
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer
-from lslam.osm.overpass import fetch_buildings
-from lslam.osm.overpass_reply import from_overpass
+from lslam.osm.overpass import fetch_buildings, from_overpass
 from lslam.osm.walls import OsmMap
 from lslam.types.building import Building
 

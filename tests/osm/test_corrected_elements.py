@@ -16,7 +16,7 @@ from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_data import ATTRIBUTION, Member, OsmData, Way
 from lslam.formats.osm_files import read_osm, write_osm
 from lslam.osm.corrected_elements import corrected_osm
-from lslam.osm.overpass_reply import from_overpass
+from lslam.osm.overpass import from_overpass
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap
 
 Floats = NDArray[np.float64]

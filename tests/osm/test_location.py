@@ -16,7 +16,7 @@ from lslam.graph.problem import Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.osm import location
 from lslam.osm.location import Located, finish, locate
-from lslam.osm.prior import match_keyframe
+from lslam.osm.wall_match import match_keyframe
 from lslam.osm.walls import OsmMap
 from lslam.types.building import Building, Footprint, KeyframeMatch
 from lslam.types.trajectory import Keyframe

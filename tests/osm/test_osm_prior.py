@@ -9,7 +9,7 @@ from wall_scenes import box_at
 
 from lslam.config.backend import OsmConfig
 from lslam.kernels import segments, wall_matching
-from lslam.osm.prior import match_buildings, match_keyframe, shares, warm_up
+from lslam.osm.wall_match import match_buildings, match_keyframe, shares, warm_up
 from lslam.osm.walls import OsmMap
 from lslam.types.building import Building, Footprint, KeyframeMatch
 

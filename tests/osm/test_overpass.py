@@ -16,8 +16,7 @@ from overpass_server import FakeOverpass, running
 from lslam.config.backend import OsmConfig
 from lslam.errors import InputError
 from lslam.osm.bounds import Bounds
-from lslam.osm.overpass import fetch_buildings, kept_reply, query
-from lslam.osm.overpass_reply import OverpassReply, from_overpass
+from lslam.osm.overpass import OverpassReply, fetch_buildings, from_overpass, kept_reply, query
 
 BOX = Bounds(49.0, 8.4, 49.01, 8.42)
 

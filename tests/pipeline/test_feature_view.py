@@ -16,7 +16,7 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline.feature_pass import MOST_SCANS, view_features
 from lslam.pipeline.run import run
-from lslam.reports.feature_view import feature_figures
+from lslam.reports.map_view import feature_figures
 from lslam.types.scan_result import ScanResult
 
 CONFIG = load_config(None, ["odometry.method=floam", "map.write=false"], {})

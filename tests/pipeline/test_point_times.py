@@ -16,7 +16,7 @@ from lslam.cli.main import cli
 from lslam.config import load_config
 from lslam.errors import InputError
 from lslam.geometry import se3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.pipeline.rebuild import open_scans, read_run
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence

@@ -16,7 +16,7 @@ from lslam.errors import InputError
 from lslam.formats.sequence_toml import SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3, so3
-from lslam.geometry.interpolate import poses_at
+from lslam.geometry.se3 import poses_at
 from lslam.readers import open_sequence
 
 

@@ -18,7 +18,7 @@ from test_html import parse
 from lslam.config.outputs import EvalConfig
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
-from lslam.reports.crops import Crop, choose_crops, crop_images
+from lslam.reports.map_view import Crop, choose_crops, crop_images
 from lslam.studies.results import metrics_of
 from lslam.types.comparison import Spread
 

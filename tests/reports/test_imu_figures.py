@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from conftest import MakeRecord
 
-from lslam.reports import imu_figures as module
+from lslam.reports import html as module
 from lslam.reports import svg
-from lslam.reports.imu_figures import imu_figures
+from lslam.reports.html import imu_figures
 from lslam.types.imu import ImuDiagnostics, ImuState, ImuStream
 
 

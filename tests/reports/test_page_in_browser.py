@@ -22,10 +22,10 @@ from reported_study import study_rows
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.reports.colours import palette
 from lslam.reports.compare_html import write_page
 from lslam.reports.html import write_report
 from lslam.reports.picture import COLOURS
+from lslam.reports.png import palette
 from lslam.reports.study_html import write_study_files
 from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from lslam.reports.picture_points import picture_points
+from lslam.reports.study_figures import picture_points
 
 
 def test_points_say_their_value_with_half_the_interval() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 import lslam
 from lslam.geometry import se3
-from lslam.simulation.living_room import SIZE
+from lslam.simulation.indoors import SIZE
 from lslam.simulation.scenarios import simulate
 
 

@@ -17,7 +17,7 @@ from lslam.formats.osm_buildings import buildings_of
 from lslam.formats.osm_data import ATTRIBUTION
 from lslam.formats.osm_files import read_osm, write_osm
 from lslam.geometry.geodesy import from_local, to_local
-from lslam.osm.overpass_reply import from_overpass
+from lslam.osm.overpass import from_overpass
 from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import buildings_near, read_extract

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lslam.errors import ConfigError, UsageError
-from lslam.simulation.aerobatics import HOVER, VIOLENT
+from lslam.simulation.flight import HOVER, VIOLENT
 from lslam.simulation.imu import GRAVITY, specific_force
 from lslam.simulation.kinematics import Kinematics
 from lslam.simulation.scenario_files import scenario_named

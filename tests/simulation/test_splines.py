@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
-from lslam.simulation.splines import interpolating_spline, smoothed
+from lslam.simulation.curve import interpolating_spline, smoothed
 
 
 @pytest.mark.parametrize("closed", [False, True])

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.geometry import se3
-from lslam.simulation import stairwell as st
+from lslam.simulation import indoors as st
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 SEEDS = (0, 1)

@@ -18,8 +18,7 @@ from lslam.studies.cluster import connected
 from lslam.studies.expanded_study import make_runs
 from lslam.studies.jobs import finished, said_file
 from lslam.studies.output import OutputOptions
-from lslam.studies.results_csv import read_study_csv
-from lslam.studies.states import read_state
+from lslam.studies.results_csv import read_state, read_study_csv
 from lslam.types.study import StudyRow
 
 

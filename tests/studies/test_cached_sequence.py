@@ -12,8 +12,8 @@ from lslam.config.load import load_config
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.studies.grid import Job
 from lslam.studies.jobs import run_jobs
+from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress, Task, WorkerPool
-from lslam.studies.states import read_state
 from lslam.studies.worker import ScanStore, SequenceCache, memory_bound, size_of
 from lslam.types.scan import Scan
 

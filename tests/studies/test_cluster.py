@@ -21,9 +21,8 @@ from lslam.studies import cluster
 from lslam.studies.cluster import Cluster, connected, pack, unpack
 from lslam.studies.grid import Job
 from lslam.studies.output import OutputOptions
-from lslam.studies.results_csv import read_study_csv
+from lslam.studies.results_csv import State, read_state, read_study_csv, write_state
 from lslam.studies.runner import StudyProgress
-from lslam.studies.states import State, read_state, write_state
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.studies.worker import WorkerContext
 from lslam.types.study import StudyRow

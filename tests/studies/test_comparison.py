@@ -28,8 +28,8 @@ from lslam.studies.compare import _in_world_of_truth, compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.plan import Plan, check_plan
+from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress, WorkerPool
-from lslam.studies.states import read_state
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
 from lslam.studies.worker import WorkerContext

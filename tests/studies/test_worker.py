@@ -21,9 +21,8 @@ from lslam.pipeline import job as prepared
 from lslam.studies import worker
 from lslam.studies.grid import Job
 from lslam.studies.results import Results
-from lslam.studies.results_csv import read_study_csv
+from lslam.studies.results_csv import read_state, read_study_csv
 from lslam.studies.runner import Task, WorkerPool, run_tasks
-from lslam.studies.states import read_state
 from lslam.studies.variants import Variant
 from lslam.studies.worker import WorkerContext, execute
 

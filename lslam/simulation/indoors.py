@@ -1,4 +1,4 @@
-"""A stairwell of two storeys between an entrance hall and a corridor without any feature along it, and the way through."""
+"""Rooms under a roof: a hall, a living room, a stairwell with its corridors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,117 @@ from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation.city import City
-from lslam.simulation.curve import RouteCurve, smooth_curve
+from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.simulation.terrain import Terrain
 
 Floats = NDArray[np.float64]
+
+SIDE = 12.0  # m from the middle line to the walls
+END = 1.0  # m that the hall is longer than its line at either end
+HEIGHT = 11.0
+BAY = 7.5  # m from column to column, and from beam to beam
+AISLE = 7.5  # m on both sides of the middle that are free up to the roof
+LOW = 2.2  # m, of what stands in the aisle
+
+
+def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
+    """The hall round a straight `line` along x, which is the middle of its floor."""
+    ends = line.position(np.array([0.0, line.length]))
+    low, high = float(ends[0, 0]) - END, float(ends[1, 0]) + END
+    middle = float(ends[0, 1])
+    builder = MeshBuilder()
+    # What is above a start is no roof that one would be caught under.
+    builder.add_box([low, middle - SIDE, -0.3], [high, middle + SIDE, 0.0], Surface.ROAD)
+    builder.add_box([low, middle - SIDE, HEIGHT], [high, middle + SIDE, HEIGHT + 0.3], Surface.PAVEMENT)
+    for y in (-SIDE, SIDE):
+        builder.add_box([low, middle + y - 0.15, 0.0], [high, middle + y + 0.15, HEIGHT], Surface.WALL)
+    for x in (low, high):
+        builder.add_box([x - 0.15, middle - SIDE, 0.0], [x + 0.15, middle + SIDE, HEIGHT], Surface.WALL)
+    for x in np.arange(low + rng.uniform(2, 4), high - 1.0, BAY).tolist():
+        builder.add_box([x - 0.15, middle - SIDE, HEIGHT - 0.8], [x + 0.15, middle + SIDE, HEIGHT], Surface.WALL)
+        for y in (middle - SIDE + 0.4, middle + SIDE - 0.4):
+            builder.add_box([x - 0.2, y - 0.25, 0.0], [x + 0.2, y + 0.25, HEIGHT], Surface.WALL)
+    for side in (-1, 1):
+        _add_racks(builder, low, high, middle, side, rng)
+    for x in np.arange(low + 3.0, high - 3.0, 5.0):
+        at = np.array([x + rng.uniform(-1.5, 1.5), middle + rng.uniform(-AISLE, AISLE)])
+        size = rng.uniform([0.4, 0.4, 0.6], [1.0, 1.0, LOW])
+        builder.add_box([*(at - size[:2]), 0.0], [*(at + size[:2]), size[2]], Surface.FENCE)
+    outline = np.array([[low, middle - SIDE], [high, middle - SIDE], [high, middle + SIDE], [low, middle + SIDE]])
+    return City(builder.build(), terrain, line, [outline], [HEIGHT + 0.3])
+
+
+def _add_racks(
+    builder: MeshBuilder, low: float, high: float, middle: float, side: int, rng: np.random.Generator
+) -> None:
+    """Racks of different heights and depths between the aisle and one wall, with gaps."""
+    x = low + rng.uniform(0.5, 3.0)
+    while x < high - 3.0:
+        length, depth = min(rng.uniform(2.0, 6.0), high - 0.5 - x), rng.uniform(0.8, 2.0)
+        front = rng.uniform(AISLE, SIDE - 1.0 - depth)
+        y = sorted((middle + side * front, middle + side * (front + depth)))
+        builder.add_box([x, y[0], 0.0], [x + length, y[1], rng.uniform(1.5, 6.0)], Surface.FENCE)
+        x += length + rng.uniform(0.8, 4.0)
+
+
+SIZE = np.array([5.0, 4.0, 2.6])  # m, clear
+LOOP = (1.8, 1.2, 0.5)  # m along and across, and radius of its corners
+TABLE = (1.2, 0.7, 0.75)  # m
+SHELVES, BOXES = 7, 16
+
+
+def room_line() -> RouteCurve:
+    """Round the middle of the room."""
+    return smooth_curve(rounded_rectangle(*LOOP), closed=True, smoothing=0.1)
+
+
+def build_room(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
+    """The room round `room_line`; where its furniture stands differs from seed to seed."""
+    builder, half = MeshBuilder(), SIZE / 2
+    low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], SIZE[2]])
+    # What is above a start is no roof that one would be caught under.
+    for z in (0.0, SIZE[2]):
+        builder.add_box([low[0], low[1], z - 0.1], [high[0], high[1], z], Surface.PAVEMENT)
+    for axis in (0, 1):
+        for side in (low, high):
+            a, b = low - 0.1, high + 0.1
+            a[axis], b[axis], a[2], b[2] = side[axis] - 0.05, side[axis] + 0.05, 0.0, SIZE[2]
+            builder.add_box(a, b, Surface.WALL)
+    _add_shelves(builder, rng)
+    corner = half[:2] * rng.choice([-1.0, 1.0], 2)
+    _add_table(builder, corner - np.sign(corner) * (np.array(TABLE[:2]) / 2 + 0.05), rng)
+    outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    return City(builder.build(), terrain, line, [outline], [SIZE[2]])
+
+
+def _add_shelves(builder: MeshBuilder, rng: np.random.Generator) -> None:
+    """Cupboards along the walls, with boxes on top of them."""
+    for _ in range(SHELVES):
+        axis, side = int(rng.integers(0, 2)), float(rng.choice([-1.0, 1.0]))
+        depth, width, height = rng.uniform(0.2, 0.4), rng.uniform(0.4, 1.2), rng.uniform(0.4, 1.9)
+        a, b = np.zeros(3), np.zeros(3)
+        wall = side * SIZE[axis] / 2
+        a[axis], b[axis] = sorted((wall, wall - side * depth))
+        along = rng.uniform(-1, 1) * (SIZE[1 - axis] / 2 - width / 2)
+        a[1 - axis], b[1 - axis], b[2] = along - width / 2, along + width / 2, height
+        builder.add_box(a, b, Surface.FENCE)
+        at = a + (b - a) * rng.uniform(0.1, 0.6, 3)
+        at[2] = height
+        builder.add_box(at, at + rng.uniform([0.1, 0.1, 0.1], [0.2, 0.2, 0.4]), Surface.FENCE)
+
+
+def _add_table(builder: MeshBuilder, middle: Floats, rng: np.random.Generator) -> None:
+    """A table on four legs, with things on it."""
+    half, top = np.array(TABLE[:2]) / 2, TABLE[2]
+    builder.add_box([*(middle - half), top - 0.03], [*(middle + half), top], Surface.FENCE)
+    for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        leg = middle + np.array(corner) * (half - 0.05)
+        builder.add_box([*(leg - 0.03), 0.0], [*(leg + 0.03), top], Surface.FENCE)
+    for _ in range(BOXES):
+        at, size = middle + rng.uniform(-0.9, 0.9, 2) * half, rng.uniform([0.04, 0.04, 0.05], [0.15, 0.15, 0.4])
+        builder.add_box([*(at - size[:2] / 2), top], [*(at + size[:2] / 2), top + size[2]], Surface.FENCE)
+
 
 # DIN 18065: twice the rise and the run are 0.63 m.
 RISE, RUN, STEPS = 0.17, 0.29, 9  # m, m, of a flight; two of them a storey
