@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import DebugConfig
 from lslam.errors import InputError
@@ -23,10 +22,9 @@ from lslam.evaluation.associate import associate
 from lslam.evaluation.frames import main_axis
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import noise, se3, so3
+from lslam.types.arrays import Floats
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Keyframe
-
-Floats = NDArray[np.float64]
 
 # x ahead, y to the left, z up, of axes with x to the right, y down, z ahead.
 CAMERA_TO_LIDAR = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -7,7 +7,6 @@ from collections.abc import Sequence as Many
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement
 from lslam.backend.manual import stamp_of
@@ -21,13 +20,13 @@ from lslam.graph.problem import PositionFix
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.preprocessing.ground import world_up_of
 from lslam.printable import counted
+from lslam.types.arrays import Floats, Longs
 from lslam.types.constraint import ControlPoint, ControlResidual
 from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 # rad; with a heading known no better, the points say nothing of which way a run goes.
 VAGUE = np.deg2rad(10.0)
@@ -174,7 +173,7 @@ def _on_earth(points: Many[ControlPoint], geoid: str) -> Floats:
     return np.concatenate([to_wgs84(p.position[None], p.epsg, p.height_epsg, geoid) for p in points])
 
 
-def _seen(points: Many[ControlPoint], stamps: NDArray[np.int64], results: Many[ScanResult]) -> Floats:
+def _seen(points: Many[ControlPoint], stamps: Longs, results: Many[ScanResult]) -> Floats:
     """(N, 3) m, where the results have the points, in their world."""
     poses = poses_at(np.array([r.stamp_ns for r in results]), np.stack([r.T_world_lidar for r in results]), stamps)
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], np.stack([p.seen for p in points])) + poses[:, :3, 3])

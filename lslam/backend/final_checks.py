@@ -14,10 +14,9 @@ from lslam.geometry import geodesy, se3
 from lslam.graph.chi_square import quantile
 from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import plane_variances
+from lslam.types.arrays import Floats
 from lslam.types.constraint import ControlPoint
 from lslam.types.gnss import Georeference
-
-Floats = NDArray[np.float64]
 
 # Points of all keyframes, neighbourhoods of that comparison, and parts of the drive whose noise is independent.
 POINTS, SAMPLES, PARTS = 400_000, 20_000, 16

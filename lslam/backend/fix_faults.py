@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry.se3 import poses_at
 from lslam.graph.fix_errors import (
@@ -20,9 +19,8 @@ from lslam.graph.fix_errors import (
     rough_residuals,
 )
 from lslam.graph.gnss_alignment import GnssAlignment, align
+from lslam.types.arrays import Bools, Floats, Longs
 from lslam.types.gnss import GnssStream
-
-Floats = NDArray[np.float64]
 
 # Fixes that heights alone reject, at least, as a share of all.
 LEAST_SHARE = 0.05
@@ -42,7 +40,7 @@ class Fixes:
     is_refuted : whether fixes scatter by more than was stated, east or north; the sigmas are those of their scatter
     """
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     positions: Floats
     sigmas: Floats
     antenna: Floats
@@ -53,7 +51,7 @@ class Fixes:
     is_refuted: bool = False
 
     @property
-    def has_height(self) -> NDArray[np.bool_]:
+    def has_height(self) -> Bools:
         """(F,) whether the height counts."""
         return np.asarray(self.sigmas[:, 2] < NO_HEIGHT)
 
@@ -70,9 +68,7 @@ class Faults:
         return Faults((*self.problems, problem), {**(self.facts or {}), **facts})
 
 
-def clock_of(
-    fixes: Fixes, stamps_ns: NDArray[np.int64], poses: Floats, arm: Floats, level: Floats
-) -> ClockOffset | None:
+def clock_of(fixes: Fixes, stamps_ns: Longs, poses: Floats, arm: Floats, level: Floats) -> ClockOffset | None:
     """The offset of the fixes' stamps against those of the scans, `stamps_ns` (N,), of `poses` (N, 4, 4); None where unclear.
 
     arm : (3,) of the antenna; level : (3, 3) of the poses' world
@@ -131,7 +127,7 @@ def with_actual_sigmas(
     return replace(fixes, sigmas=sigmas, is_refuted=is_refuted), faults.and_another(said, fix_sigma_m=facts)
 
 
-def _kinds(sigmas: Floats) -> list[NDArray[np.bool_]]:
+def _kinds(sigmas: Floats) -> list[Bools]:
     """Which of the fixes state alike, by their sigmas (F,): a receiver says one thing of a fixed solution, another of a float."""
     ordered = np.sort(sigmas)
     edges, begin = [], 0

@@ -30,13 +30,13 @@ from lslam.graph.gnss_alignment import GnssAlignment
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection
 from lslam.preprocessing.ground import world_up_of
+from lslam.types.arrays import Floats
 from lslam.types.gnss import Georeference, GnssStream
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 # m; of a fix that does not state its sigma.
 UNSTATED = 5.0

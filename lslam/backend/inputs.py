@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.graph.problem import FloorPlane, UpDirection
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import Z, levelling
 from lslam.stopping import checking
+from lslam.types.arrays import Floats
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Keyframe
-
-Floats = NDArray[np.float64]
 
 # s, correlation time of the errors of the IMU's up direction.
 MEMORY_S = 20.0

@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InputError
@@ -19,11 +18,11 @@ from lslam.kernels import jit
 from lslam.locks import one_at_a_time
 from lslam.preprocessing.ground import levelling, up_of
 from lslam.preprocessing.up import NEAR_Z
+from lslam.types.arrays import Floats
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 ORIGIN = "LiDAR at the first scan"
 UP = np.array([0.0, 0.0, 1.0])

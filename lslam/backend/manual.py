@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import require_crs
 from lslam.backend.manual_files import read_control_points, read_named_pairs
@@ -20,7 +19,6 @@ from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Selection, Sequence
 from lslam.types.trajectory import Keyframe
 
-Floats = NDArray[np.float64]
 # Beyond the first and the last scan a control point's stamp is that of a pose only as far as seconds are rounded.
 ROUNDING_NS = 5_000_000
 

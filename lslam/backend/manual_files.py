@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError, cause, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.stamp_texts import seconds_to_ns
 from lslam.formats.text_tables import separator_of, split_cells
 from lslam.geometry.geodesy import parse_crs
+from lslam.types.arrays import Floats
 from lslam.types.constraint import ControlPoint, ControlResidual, Instant, NamedPair
 from lslam.untrusted import whole_number
 
@@ -141,7 +141,7 @@ def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
     write_text(path, "\n".join(rows) + "\n")
 
 
-def _seen(row: _Row) -> NDArray[np.float64]:
+def _seen(row: _Row) -> Floats:
     seen = [row.number(f"lidar_{axis}", f"lidar_{axis}_m") for axis in "xyz"]
     if any(value is None for value in seen) and any(value is not None for value in seen):
         raise row.error("lidar_x, lidar_y and lidar_z go together")

@@ -13,7 +13,6 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.control_points import (
     against_odometry,
@@ -38,6 +37,7 @@ from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import up_of, world_up_of
 from lslam.stopping import checking
+from lslam.types.arrays import Floats
 from lslam.types.constraint import ControlPoint, LoopCandidate, Turn
 from lslam.types.gnss import Georeference
 from lslam.types.imu import InertialChain
@@ -46,7 +46,6 @@ from lslam.types.sequence import Sequence
 from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 # Solves the graph with the priors of a map, given its georeference; None where the map gives none.
 Hold = Callable[[PoseGraph, Placement, Given], BackEnd | None]
 

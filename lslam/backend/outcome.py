@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import GraphError
@@ -21,6 +20,7 @@ from lslam.graph.odometry_constraints import corrected
 from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import EstimatedDrift, PoseGraph, Solution
 from lslam.keyframes.store import KeyframeStore
+from lslam.types.arrays import Floats
 from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.constraint import Constraint, ControlPoint, ControlResidual, LoopCandidate, LoopStage, Verdict
 from lslam.types.gnss import Georeference
@@ -29,7 +29,6 @@ from lslam.types.scan_result import ScanResult
 from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 # Names of the rates of an estimated drift, from walls and from loop closures.
 _OF_WALLS = ("east_percent", "north_percent", "left_deg_per_100m")

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from lslam.formats.pointcloud2 import TYPES
 from lslam.geometry import so3
+from lslam.types.arrays import Floats, Longs
 from lslam.types.scan import Scan
-
-Floats = NDArray[np.float64]
 
 _CODES = {np.dtype(name): code for code, name in TYPES.items()}  # of sensor_msgs/PointField
 _UNKNOWN = np.r_[-1.0, np.zeros(8)]  # sensor_msgs/Imu: a first covariance of -1 means that there is no such reading
@@ -108,7 +107,7 @@ def odometry(
     )
 
 
-def path(store: Any, stamps_ns: NDArray[np.int64], poses: Floats, frame: str) -> Any:
+def path(store: Any, stamps_ns: Longs, poses: Floats, frame: str) -> Any:
     """Path of poses (N, 4, 4) in `frame` at their stamps (N,), stamped with the last."""
     posed = store.types["geometry_msgs/msg/PoseStamped"]
     return store.types["nav_msgs/msg/Path"](

@@ -21,6 +21,7 @@ from lslam.maps.clean import PosedScan
 from lslam.pipeline.map_files import in_own_world
 from lslam.pipeline.map_pass import scan_poser
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, map_of, results_of
+from lslam.types.arrays import Floats
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
@@ -97,7 +98,7 @@ def convert_run(
     return RunBag(out, len(stamps), clouds, map_points)
 
 
-def _write_pose(writer: BagWriter, stamp: int, T: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> None:
+def _write_pose(writer: BagWriter, stamp: int, T: Floats, covariance: Floats | None) -> None:
     writer.write("/tf", stamp, bag_messages.transforms(writer.store, stamp, {(WORLD, BODY): T}))
     writer.write(POSE_TOPIC, stamp, bag_messages.odometry(writer.store, stamp, T, WORLD, BODY, covariance))
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.convert.on_earth import georeference_beside
 from lslam.convert.output import staged
@@ -22,6 +21,7 @@ from lslam.maps.georeference import to_lat_lon
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
 from lslam.pipeline.run_folder import require_run
+from lslam.types.arrays import Floats
 from lslam.types.building import CorrectedMap
 from lslam.types.gnss import Georeference
 
@@ -105,7 +105,7 @@ def _plain(value: Value) -> int | float | str | None:
 
 def _extent(layer: GeoLayer) -> tuple[float, float, float, float]:
     """West, south, east, north."""
-    parts: list[NDArray[np.float64]] = []
+    parts: list[Floats] = []
     for feature in layer.features:
         parts += (
             [ring for polygon in feature for ring in polygon] if layer.shape == "polygons" else [np.atleast_2d(feature)]
@@ -115,7 +115,6 @@ def _extent(layer: GeoLayer) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
-Floats = NDArray[np.float64]
 SUFFIX = ".gpkg"
 
 

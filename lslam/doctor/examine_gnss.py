@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.doctor.findings import Facts, Finding, plural
 from lslam.geometry.geodesy import to_local
+from lslam.types.arrays import Floats, Longs
 from lslam.types.sequence import Sequence, no_shared_time
 
 # No carrier of a LiDAR accelerates more, m/s2; a fix that does not state its sigma is taken to be so good, m.
@@ -48,9 +48,7 @@ def examine_gnss(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     }
 
 
-def _examine_jumps(
-    fixes: NDArray[np.float64], stamps_ns: NDArray[np.int64], sigma: NDArray[np.float64], findings: list[Finding]
-) -> int:
+def _examine_jumps(fixes: Floats, stamps_ns: Longs, sigma: Floats, findings: list[Finding]) -> int:
     """Fixes that leave the line through their neighbours by more than acceleration and their sigma explain."""
     if len(fixes) < 3:
         return 0

@@ -12,6 +12,7 @@ from lslam.errors import InputError
 from lslam.integrity.directions import MOST_EMPTIED, emptied, filled_directions
 from lslam.preprocessing.rings import RingRule
 from lslam.preprocessing.views import with_rings
+from lslam.types.arrays import Longs
 from lslam.types.scan import FARTHEST_M, NO_RING, Scan
 from lslam.types.sequence import Sequence
 
@@ -93,7 +94,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
     }
 
 
-def _examine_frame(directions: list[NDArray[np.int64]], findings: list[Finding]) -> None:
+def _examine_frame(directions: list[Longs], findings: list[Finding]) -> None:
     """Whether the scans are seen from their sensor, which sees something below it, or above, wherever it goes."""
     shares = [emptied(directions[0], later) for later in directions[1:]]
     if len(shares) > 1 and np.median(shares) > MOST_EMPTIED:

@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.doctor.findings import Facts, Finding
@@ -17,12 +16,12 @@ from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agree
 from lslam.inertial.fusion import InertialMotion
 from lslam.inertial.imu_cleaning import Cleaned, ImuFault, ImuRefusedError, clean
 from lslam.inertial.initialise import FirstPoses, start, told_poses
+from lslam.types.arrays import Bools, Floats, Longs
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 
-Floats = NDArray[np.float64]
 
 _SCANS, _FEWEST = 60, 5
 # s: less moves a point 20 m away by 5 cm at 30 deg/s.
@@ -81,9 +80,7 @@ def _swept_by_imu(
     return again if len(again.instants_ns) >= _FEWEST else first
 
 
-def compare(
-    cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, findings: list[Finding]
-) -> Facts:
+def compare(cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, findings: list[Finding]) -> Facts:
     """Compare the gyroscope with the poses (N, 4, 4) of the LiDAR at `stamps_ns` (N,)."""
     agreement = Agreement(False)
     refusal: ImuRefusedError | None = None
@@ -116,7 +113,7 @@ def compare(
     }
 
 
-def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: NDArray[np.int64], poses: Floats) -> Agreement:
+def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
     """The agreement once the axes are put right: clocks cannot be told before. R may mirror."""
     T = np.eye(4)
     T[:3, :3] = R
@@ -127,7 +124,7 @@ def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: NDArray[np.int64], poses:
 
 
 def _far_off(
-    cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, near: Agreement
+    cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, near: Agreement
 ) -> Agreement | None:
     """The agreement at an offset beyond those that a run looks at, where that is clearly better than `near`, else None."""
     best, at = 0.0, 0.0
@@ -185,7 +182,7 @@ def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Find
     return _turned(seen, felt, R_lidar_imu) if judged.sum() > 1 else None
 
 
-def _best_axes(correlation: Floats, judged: NDArray[np.bool_]) -> Floats:
+def _best_axes(correlation: Floats, judged: Bools) -> Floats:
     """The signed permutation (3, 3), seen = P felt, that correlates best; as given where nothing turned."""
     weight = correlation * judged[:, None] + 0.01 * np.eye(3)
     best, score = np.eye(3), -np.inf

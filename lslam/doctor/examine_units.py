@@ -6,14 +6,12 @@ Nothing is converted: what a file means only its owner knows.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.doctor.findings import Finding
+from lslam.types.arrays import Stamps
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
-
-Stamps = NDArray[np.int64]
 
 # So many times too long is what was taken for s, and too short what was taken for ns.
 UNITS = {1e3: ("ms", "us"), 1e6: ("us", "ms"), 1e9: ("ns", "s")}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.input import PreprocessConfig
 from lslam.doctor.examine_bag import examine_bag
@@ -18,6 +17,7 @@ from lslam.doctor.examine_units import examine_units
 from lslam.doctor.findings import Facts, Finding
 from lslam.formats.bag_files import Bag
 from lslam.frontend.point_times import with_point_times
+from lslam.types.arrays import Longs
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
@@ -97,7 +97,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     }
 
 
-def _ground_truth(truth: Trajectory | None, stamps_ns: NDArray[np.int64]) -> Facts | None:
+def _ground_truth(truth: Trajectory | None, stamps_ns: Longs) -> Facts | None:
     if truth is None or not len(truth):
         return None
     inside = (truth.stamps_ns >= stamps_ns[0]) & (truth.stamps_ns <= stamps_ns[-1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
 from lslam.errors import UsageError, nearest
@@ -23,9 +22,8 @@ from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
 from lslam.geometry import se3, so3, umeyama
 from lslam.printable import fixed, metres, significant
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
-
-Floats = NDArray[np.float64]
 
 
 def absolute_error(estimate: Floats, truth: Floats, alignment: str, has_rotations: bool = True) -> AbsoluteError:

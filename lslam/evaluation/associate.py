@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
+from lslam.types.arrays import Floats, Longs, Stamps
 from lslam.types.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 LEAST = 3
 # Interpolation pays when truth has a pose at least every 0.6 estimate intervals, and stops at holes of 5 of its own.
 DENSER, HOLE = 0.6, 5
@@ -222,7 +221,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
     return _snap(estimate, truth, offset, step), float(scores[best])
 
 
-def _peaks(scores: Floats, lags: NDArray[np.int64]) -> list[int]:
+def _peaks(scores: Floats, lags: Longs) -> list[int]:
     """Indices of the best scores that are neither poor nor neighbours of a better one, at most 20."""
     chosen: list[int] = []
     for k in np.argsort(-scores, kind="stable")[:2000].tolist():
@@ -253,7 +252,7 @@ def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None
     return np.stack([speed, turn], axis=1) * (1e9 / (WINDOW * step))
 
 
-def _correlation(a: Floats, b: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def _correlation(a: Floats, b: Floats) -> tuple[Floats, Longs]:
     """Pearson correlation of a shifted by lag against b, mean of the channels that vary, and the lags."""
     from scipy.signal import correlate
 

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import geodesy, se2
+from lslam.types.arrays import Floats
 from lslam.types.building import BuildingCorrection, BuildingStatus, CorrectedMap
-
-Floats = NDArray[np.float64]
 
 HELD = 0.6  # m; one sigma along an axis below which walls hold it: a building that nothing holds has 1 m
 
@@ -35,7 +33,7 @@ class BuildingError:
 
 
 def building_errors(
-    found: CorrectedMap, truth: Mapping[str, Floats], origin: NDArray[np.float64], shift: NDArray[np.float64]
+    found: CorrectedMap, truth: Mapping[str, Floats], origin: Floats, shift: Floats
 ) -> list[BuildingError]:
     """Errors of the buildings whose true displacement (3,) is in `truth`, by number, with the run begun at its true start.
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
 from lslam.errors import InputError
@@ -22,6 +21,7 @@ from lslam.evaluation.thesis import DelTufo, Girolimetto
 from lslam.evaluation.time_offset import fit_offset
 from lslam.geometry import se3, so3
 from lslam.printable import metres
+from lslam.types.arrays import Floats
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
 
@@ -34,7 +34,6 @@ METRICS: tuple[TrajectoryMetric[Any], ...] = (
 )
 __all__ = ["Evaluation", "evaluate"]
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 STRAIGHT = 0.01
 # Spread of the truth's positions per metre of the estimate's, and the unit that they then seem to have. What is left of a path in
 # km may be the motion of a lever arm.

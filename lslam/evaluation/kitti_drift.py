@@ -12,9 +12,9 @@ from lslam.config.outputs import EvalConfig
 from lslam.evaluation.metric import NO_ROTATIONS, Document, MatchedPoses, MetricRow, TrajectoryMetric
 from lslam.evaluation.results import Evaluation
 from lslam.printable import counted, significant
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
 
-Floats = NDArray[np.float64]
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 START_EVERY = 10
 

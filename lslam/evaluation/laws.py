@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lslam.evaluation.curves import two_sided
-from lslam.types.study import Curve, Floats, Interval, Law, LawKind
+from lslam.types.arrays import Floats
+from lslam.types.study import Curve, Interval, Law, LawKind
 
 FEWEST = 6
 LEVEL = 0.99  # as the bands of Girolimetto's figure 5.19

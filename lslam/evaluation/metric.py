@@ -8,14 +8,13 @@ from dataclasses import asdict, dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
 from lslam.evaluation.results import Evaluation, Statistics
 from lslam.printable import significant
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
 
-Floats = NDArray[np.float64]
 Document = dict[str, Any]
 Score = TypeVar("Score")
 

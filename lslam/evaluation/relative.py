@@ -23,6 +23,7 @@ from lslam.evaluation.recipes import parse_delta
 from lslam.evaluation.results import Evaluation, RelativeError, describe
 from lslam.geometry import se3, so3
 from lslam.printable import metres
+from lslam.types.arrays import Floats, Longs
 from lslam.types.comparison import Metric, Table
 
 Pairs = NDArray[np.int64]
@@ -36,7 +37,6 @@ RULES = {
     ("s", "consecutive"): "end to end, each with the later pose whose stamp is nearest `delta` later, within 10 %",
     ("s", "all"): "every pose with the later one whose stamp is nearest `delta` later, within 10 %",
 }
-Floats = NDArray[np.float64]
 
 
 def by_index(count: int, delta: int, all_pairs: bool) -> Pairs:
@@ -45,7 +45,7 @@ def by_index(count: int, delta: int, all_pairs: bool) -> Pairs:
     return np.stack([starts, starts + delta], axis=1)
 
 
-def by_path(positions: NDArray[np.float64], delta: float, all_pairs: bool) -> Pairs:
+def by_path(positions: Floats, delta: float, all_pairs: bool) -> Pairs:
     """Pairs (M, 2) of poses `delta` metres of path apart, `positions` (N, 3) of the estimate."""
     if all_pairs:
         steps = np.linalg.norm(positions[:-1] - positions[1:], axis=1)
@@ -60,7 +60,7 @@ def by_path(positions: NDArray[np.float64], delta: float, all_pairs: bool) -> Pa
     return np.stack([ends[:-1], ends[1:]], axis=1).astype(np.int64)
 
 
-def by_time(seconds: NDArray[np.float64], delta: float, all_pairs: bool) -> Pairs:
+def by_time(seconds: Floats, delta: float, all_pairs: bool) -> Pairs:
     """Pairs (M, 2) of poses `delta` seconds apart, `seconds` (N,) increasing."""
     every = _nearest(seconds, delta)
     if all_pairs:
@@ -74,7 +74,7 @@ def by_time(seconds: NDArray[np.float64], delta: float, all_pairs: bool) -> Pair
     return np.array(chain, np.int64).reshape(-1, 2)
 
 
-def _nearest(along: NDArray[np.float64], delta: float) -> Pairs:
+def _nearest(along: Floats, delta: float) -> Pairs:
     """Every i with the first j > i whose `along[j] - along[i]` is nearest `delta`, dropped when off by over 10 %."""
     tolerance = delta * TOLERANCE
     slack = 1e-9 * max(abs(float(along[-1])), delta, 1.0)
@@ -120,13 +120,13 @@ def _without_rotations(recipe: str) -> RelativeError:
     return RelativeError(delta, unit, rule, 0, None, None, NO_ROTATIONS, sentence)
 
 
-def error_transforms(estimate: Floats, truth: Floats, pairs: NDArray[np.int64]) -> Floats:
+def error_transforms(estimate: Floats, truth: Floats, pairs: Longs) -> Floats:
     """E (M, 4, 4) = inv(inv(Q_i) Q_j) (inv(P_i) P_j) of `pairs` (M, 2); P estimate, Q truth, (N, 4, 4)."""
     i, j = pairs[:, 0], pairs[:, 1]
     return se3.relative(se3.relative(truth[i], truth[j]), se3.relative(estimate[i], estimate[j]))
 
 
-def _pairs(poses: Floats, seconds: Floats | None, delta: float, unit: str, all_pairs: bool) -> NDArray[np.int64]:
+def _pairs(poses: Floats, seconds: Floats | None, delta: float, unit: str, all_pairs: bool) -> Longs:
     if unit == "scan":
         return by_index(len(poses), int(delta), all_pairs)
     if unit == "m":

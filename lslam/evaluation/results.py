@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.evaluation.recipes import ALIGNMENTS
+from lslam.types.arrays import Floats, Longs
 
 # A path this short, m, is the rounding of poses that do not move.
 STANDS_M = 1e-3
-Floats = NDArray[np.float64]
 UNITS = {"scan": "scans", "m": "m", "s": "s"}
 
 
@@ -48,7 +48,7 @@ def describe(errors: NDArray[Any]) -> Statistics | None:
     )
 
 
-def percent_of_length(rmse: float, truth: NDArray[np.float64]) -> float:
+def percent_of_length(rmse: float, truth: Floats) -> float:
     """An error, m, in % of the path of the poses `truth` (N, 4, 4); NaN for a sensor that stood still."""
     length = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
     return 100 * rmse / length if length > STANDS_M else float("nan")
@@ -101,7 +101,7 @@ class RelativeError:
     rotation_deg: Statistics | None
     note: str
     rule: str = ""
-    pair_ends: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    pair_ends: Longs = field(default_factory=lambda: np.zeros(0, np.int64))
     translation_errors: Floats = field(default_factory=lambda: np.zeros(0))
     rotation_errors_deg: Floats = field(default_factory=lambda: np.zeros(0))
 
@@ -133,7 +133,7 @@ class Evaluation:
     ground_truth: str
     matched: int
     possible: int
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     distance: Floats
     gt_positions: Floats
     path_length: float

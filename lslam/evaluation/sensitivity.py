@@ -21,11 +21,11 @@ from lslam.evaluation.verdicts import (
     judge_matters_little,
     judge_product,
 )
+from lslam.types.arrays import Floats
 from lslam.types.study import (
     Curve,
     CurveResult,
     FindingVerdict,
-    Floats,
     Interval,
     Judged,
     Law,

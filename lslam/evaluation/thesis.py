@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
 from lslam.evaluation.absolute import align
@@ -18,9 +17,8 @@ from lslam.evaluation.metric import NO_ROTATIONS, MatchedPoses, MetricRow, Traje
 from lslam.evaluation.results import Evaluation, percent_of_length
 from lslam.geometry import so3
 from lslam.printable import fixed, metres, significant
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

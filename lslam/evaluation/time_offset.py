@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
+from lslam.types.arrays import Bools, Floats, Stamps
 from lslam.types.trajectory import Trajectory
 
-Floats = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 # Windows that are compared, s; how far an offset may lie from the one that is begun with, s; rounds of the fit.
 WINDOW_S, FARTHEST_S, ROUNDS = 0.3, 0.5, 20
 # Least correlation of how the motions of both change: where both merely rattle, each does so by itself.
@@ -79,7 +78,7 @@ def _linearised(
     stamps: Stamps,
     truth: Trajectory,
     own: Floats,
-    is_whole: NDArray[np.bool_],
+    is_whole: Bools,
     count: int,
     reach: int,
     turns: bool,
@@ -114,7 +113,7 @@ def _linearised(
     return change, max(sigma, information**-0.5 * 0.1), coherence
 
 
-def _known(known: Stamps, stamps: Stamps) -> NDArray[np.bool_]:
+def _known(known: Stamps, stamps: Stamps) -> Bools:
     """Whether stamps lie among the truth's and in no hole of it."""
     after = np.clip(np.searchsorted(known, stamps, side="left"), 1, len(known) - 1)
     gaps = known[after] - known[after - 1]

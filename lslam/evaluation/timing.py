@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.remote import as_path
+from lslam.types.arrays import Floats, Longs
 
 SAVED = "saved_s"
 NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)
@@ -27,10 +27,10 @@ class TimingRows:
     back_end : (N,) seconds by name, of what was done to a scan after odometry and does not count in `total`
     """
 
-    stamps_ns: NDArray[np.int64] | None
-    stages: dict[str, NDArray[np.float64]]
-    total: NDArray[np.float64]
-    back_end: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    stamps_ns: Longs | None
+    stages: dict[str, Floats]
+    total: Floats
+    back_end: dict[str, Floats] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def read_timing(path: str | Path) -> Timing:
     )
 
 
-def summarise(seconds: NDArray[np.float64], whole: float) -> StageTime:
+def summarise(seconds: Floats, whole: float) -> StageTime:
     """One stage (N,), s, of scans that took `whole` s in all."""
     median, p95 = (float(v) for v in np.percentile(seconds, [50, 95]))
     share = float(seconds.sum()) / whole if whole > 0 else 0.0
@@ -108,7 +108,7 @@ def read_timing_rows(path: Path) -> TimingRows:
     return TimingRows(stamps, stages, total, later)
 
 
-def _table(path: Path) -> tuple[list[str], NDArray[np.float64]]:
+def _table(path: Path) -> tuple[list[str], Floats]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             lines = [

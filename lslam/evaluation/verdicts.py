@@ -22,7 +22,8 @@ from lslam.evaluation.curves import (
     rise_below,
 )
 from lslam.evaluation.laws import FEWEST, law_over, rival
-from lslam.types.study import Bools, Curve, CurveResult, Floats, Judged, Law, Optimum, Outcome
+from lslam.types.arrays import Bools, Floats
+from lslam.types.study import Curve, CurveResult, Judged, Law, Optimum, Outcome
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them

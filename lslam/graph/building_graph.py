@@ -33,9 +33,8 @@ from lslam.graph.solve import (
     truncated_weights,
 )
 from lslam.stopping import checking
+from lslam.types.arrays import Bools, Floats
 from lslam.types.building import BuildingMatch
-
-Floats = NDArray[np.float64]
 
 PROBABILITY = 0.999  # chi-square quantile of an inlier match
 SUPPORT = 2  # other matches that must agree
@@ -68,11 +67,11 @@ class BuildingSolution:
     displacements: Floats
     covariances: Floats
     shift: Floats
-    inliers: NDArray[np.bool_]
+    inliers: Bools
 
 
 def solve_buildings(
-    middles: NDArray[np.float64],
+    middles: Floats,
     matches: Sequence[BuildingMatch],
     poses: Mapping[int, Floats],
     map_prior: MapPrior,
@@ -107,9 +106,7 @@ def solve_buildings(
     return BuildingSolution(solution[0], covariances, solution[2], inliers)
 
 
-def agreeing(
-    middles: NDArray[np.float64], matches: Sequence[BuildingMatch], poses: Mapping[int, Floats]
-) -> NDArray[np.bool_]:
+def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[int, Floats]) -> Bools:
     """(M,) true where `SUPPORT` other matches of the same building, which observe the same directions, agree.
 
     One keyframe may match a hedge or the neighbour's wall; along a direction that no other match observes, it could not be
@@ -180,7 +177,7 @@ class JointSolution:
 
 def optimise_jointly(
     graph: PoseGraph,
-    middles: NDArray[np.float64],
+    middles: Floats,
     matches: Sequence[BuildingMatch],
     map_prior: MapPrior | None,
     config: GraphConfig,
@@ -256,7 +253,7 @@ def _solution(
     seen: list[int],
     places: Floats,
     spread: Floats,
-    inliers: NDArray[np.bool_],
+    inliers: Bools,
     map_prior: MapPrior | None,
 ) -> BuildingSolution:
     """Displacements of all buildings; those without a match follow the shift of the others."""

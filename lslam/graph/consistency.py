@@ -18,9 +18,8 @@ from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import quantile
 from lslam.graph.problem import PoseGraph
 from lslam.stopping import check_stop
+from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
-
-Floats = NDArray[np.float64]
 
 # Neighbours that each loop closure is tested against, and the share that must agree.
 NEIGHBOURS, SHARE = 16, 0.5

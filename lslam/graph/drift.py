@@ -16,9 +16,8 @@ from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.chi_square import chance_of_median, quantile
 from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
-
-Floats = NDArray[np.float64]
 
 # Loop closures used at most, evenly spread, and bounds of the factor on the drift's variance.
 MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
@@ -206,7 +205,7 @@ def _length(constraint: Constraint) -> float:
     return float(np.linalg.norm(constraint.T_a_b[:3, 3]))
 
 
-def linear_basis(distances: NDArray[np.float64], apart: float = MEMORY) -> Floats:
+def linear_basis(distances: Floats, apart: float = MEMORY) -> Floats:
     """(K-1, n) linear (hat) basis functions of the knots, halfway between keyframes reached after `distances` (K,), m.
 
     apart : m from knot to knot at the most
@@ -239,7 +238,7 @@ def walk_root(length: float, config: GraphConfig, axes: list[int], apart: float)
     return np.asarray(np.kron(times * np.eye(len(knots)), _prior_sigmas(config, axes)))
 
 
-def correct_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
+def correct_drift(graph: PoseGraph, rates: Floats) -> PoseGraph:
     """The graph with poses and odometry corrected by `rates` (K-1, 6) per m: m along the axes of the world, rad about them."""
     steps = se3.relative(graph.poses[:-1], graph.poses[1:])
     by = rates * np.diff(graph.distances)[:, None]

@@ -10,15 +10,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import noise, se2, se3, so3
 from lslam.graph.fix_noise import GaussMarkovNoise
 from lslam.graph.inertial_factors import inertial_factors, insert_inertial
 from lslam.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
+from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint, Turn
-
-Floats = NDArray[np.float64]
 
 # Sigmas of the prior on the first pose, m and rad, when anchored and when the fixes anchor it, where its tilt has one of its
 # own (`PoseGraph.tilt_sigma`); of its tilt before up is known.

@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.graph.chi_square import quantile
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from lslam.types.arrays import Bools, Floats
 
 # s; offsets that are tried, their step, and the time over which displacements are compared.
 LARGEST_S, STEP_S, LAG_S = 2.5, 0.05, 1.0

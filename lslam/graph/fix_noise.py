@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from lslam.graph.chi_square import quantile
 from lslam.graph.fix_errors import NO_HEIGHT
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Bools, Floats
 
 # Size of the covariance: more fixes are averaged in groups.
 MOST = 60
@@ -106,7 +105,7 @@ def fit_gauss_markov(
     return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], np.sqrt(variance) * typical, memory), factor
 
 
-def _near_neighbours(scaled: Floats, probability: float) -> NDArray[np.bool_]:
+def _near_neighbours(scaled: Floats, probability: float) -> Bools:
     """(F,) inliers of `scaled` (F, 2) residuals about their running median."""
     from scipy.ndimage import median_filter
 

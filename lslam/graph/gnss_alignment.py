@@ -9,12 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import se3, so3
 from lslam.graph.chi_square import quantile
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Bools, Floats
 
 # RANSAC samples, and the least distance of a pair as a share of the largest.
 TRIALS, APART_SHARE = 500, 0.5
@@ -27,7 +25,7 @@ class GnssAlignment:
     """T_enu_world (4, 4); inliers : (F,) bool; residuals : (F, 3) m, east, north, up, of fixes minus trajectory."""
 
     T_enu_world: Floats
-    inliers: NDArray[np.bool_]
+    inliers: Bools
     residuals: Floats
 
 
@@ -91,7 +89,7 @@ def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
     return best
 
 
-def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> NDArray[np.bool_]:
+def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> Bools:
     with np.errstate(invalid="ignore"):
         whitened = ((fixes - se3.apply(T, a)) / sigmas) ** 2
     return np.asarray(np.nan_to_num(whitened.sum(1), nan=np.inf) <= quantile(0.999, 3))

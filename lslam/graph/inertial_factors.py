@@ -8,11 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.types.arrays import Floats
 from lslam.types.imu import InertialChain, InertialStep, SmootherNoise
-
-Floats = NDArray[np.float64]
 
 # m2 per s, of the integration itself: none but rounding.
 INTEGRATION = 1e-10

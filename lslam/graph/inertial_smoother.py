@@ -9,17 +9,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import GraphError
 from lslam.formats.state_files import Records
 from lslam.geometry import noise, se3
 from lslam.graph.factors import well_conditioned
 from lslam.graph.inertial_factors import preintegrated
+from lslam.types.arrays import Floats
 from lslam.types.imu import InertialState, InertialStep, SmootherNoise
 from lslam.types.state import State
-
-Floats = NDArray[np.float64]
 
 GRAVITY_KEY = 1 << 40
 # Pose, velocity, biases and gravity among the 18 of a state.

@@ -21,9 +21,8 @@ from lslam.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basi
 from lslam.graph.pose_graph import check_graph, with_distances
 from lslam.graph.problem import EstimatedDrift, PoseGraph
 from lslam.stopping import checking
+from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
-
-Floats = NDArray[np.float64]
 
 # Loop closures used at most, evenly spread.
 MOST = 30

@@ -13,11 +13,10 @@ from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
 from lslam.graph.drift import drift_covariance
 from lslam.graph.factors import PLANAR
+from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Keyframe
-
-Floats = NDArray[np.float64]
 
 # m and rad; least sigmas of a step when a method states no covariance, and those of one into another frame.
 LEAST_M, LEAST_RAD = 1e-3, 1e-4

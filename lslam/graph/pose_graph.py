@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.errors import GraphError
@@ -26,9 +25,8 @@ from lslam.graph.solve import (
     solve,
     solve_incrementally,
 )
+from lslam.types.arrays import Bools, Floats
 from lslam.types.constraint import Constraint, LoopStage
-
-Floats = NDArray[np.float64]
 
 
 def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
@@ -168,7 +166,7 @@ def check_graph(graph: PoseGraph) -> None:
         raise GraphError(f"the pose graph is in pieces: odometry does not join keyframe {lost} to the first")
 
 
-def _are_finite(constraints: Sequence[Constraint]) -> NDArray[np.bool_]:
+def _are_finite(constraints: Sequence[Constraint]) -> Bools:
     """(C,) whether a constraint's numbers are finite."""
     if not constraints:
         return np.zeros(0, np.bool_)

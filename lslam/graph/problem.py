@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.graph.fix_noise import GaussMarkovNoise
+from lslam.types.arrays import Bools, Floats
 from lslam.types.constraint import Constraint, LoopStage, Turn
 from lslam.types.imu import InertialChain
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -176,7 +174,7 @@ class Solution:
     covariances: Floats
     loop_reasons: list[str]
     loop_stages: list[LoopStage]
-    fix_inliers: NDArray[np.bool_]
+    fix_inliers: Bools
     map_reasons: list[str]
     shift: Floats
     shift_sigma: Floats

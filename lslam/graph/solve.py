@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.errors import GraphError
@@ -17,8 +16,7 @@ from lslam.graph.factors import FIX_NOISE
 from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
 from lslam.graph.selected_inverse import selected_inverse
 from lslam.stopping import check_stop, checking
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 # Keyframes that iSAM2 takes in per update.
 BATCH = 10

@@ -11,6 +11,7 @@ from lslam.geometry import se3, so3
 from lslam.kernels import voxel
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.prepare import NO_TIMES, as_cloud, gate_points
+from lslam.types.arrays import Floats
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
 from lslam.types.scan_result import ScanResult
@@ -30,8 +31,8 @@ class KeyframeSelector(Stateful):
         self._distance, self._angle = config.distance, float(np.deg2rad(config.angle_deg))
         self._count = 0
         self._travelled = 0.0
-        self._here: NDArray[np.float64] | None = None
-        self._last: NDArray[np.float64] | None = None
+        self._here: Floats | None = None
+        self._last: Floats | None = None
         self._segment = 0
 
     def consider(self, scan: int, result: ScanResult) -> Keyframe | None:
@@ -46,7 +47,7 @@ class KeyframeSelector(Stateful):
         self._count += 1
         return Keyframe(self._count - 1, scan, result.stamp_ns, pose, result.covariance, self._travelled)
 
-    def _is_due(self, pose: NDArray[np.float64]) -> bool:
+    def _is_due(self, pose: Floats) -> bool:
         if self._last is None:
             return True
         step = se3.relative(self._last, pose)

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
 from lslam.formats.state_files import pack_npz, read_npz, write_npz
+from lslam.types.arrays import Points
 from lslam.types.trajectory import Keyframe
-
-Points = NDArray[np.float32]
 
 INDEX = "index.npz"
 CACHED = 32

@@ -13,6 +13,7 @@ from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import Z, world_up_of
 from lslam.preprocessing.prepare import NO_TIMES
 from lslam.preprocessing.up import find_up
+from lslam.types.arrays import Floats
 
 
 def neighbours(count: int, number: int, size: int) -> range:
@@ -25,8 +26,8 @@ def neighbours(count: int, number: int, size: int) -> range:
 
 
 def submap(
-    store: KeyframeStore, poses: NDArray[np.float64], number: int, size: int, voxel: float | None = None,
-    T_world_frame: NDArray[np.float64] | None = None,
+    store: KeyframeStore, poses: Floats, number: int, size: int, voxel: float | None = None,
+    T_world_frame: Floats | None = None,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame or in `T_world_frame` (4, 4).
 
@@ -42,8 +43,6 @@ def submap(
         first += len(cloud)
     return points if voxel is None else voxels.means(points, NO_TIMES, voxel)[0]
 
-
-Floats = NDArray[np.float64]
 
 # Keyframes in whose clouds the ground is looked for: rings of a sensor on its side cross it in a line, those of 20 m cover it.
 KEYFRAMES = 10

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.kernels import bev
+from lslam.types.arrays import Bools, Floats, Longs
 
-Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 Spectrum = NDArray[np.complex64]
 
@@ -26,7 +26,7 @@ class BevGrid:
 
     size: int
 
-    def cells_of(self, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def cells_of(self, points: Floats) -> tuple[Longs, Bools]:
         """Flat cell of each point (N, 3), m, 0 outside, and whether it lies inside."""
         cells = np.floor(points[:, :2] / CELL).astype(np.int64) + self.size // 2
         inside = np.asarray(((cells >= 0) & (cells < self.size)).all(axis=1))

@@ -8,6 +8,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.arrays import Longs
+
 
 @dataclass(frozen=True)
 class PlaceMatch:
@@ -33,7 +35,7 @@ class PlaceDescriptor(Protocol):
     def add(self, number: int, points: NDArray[np.float32]) -> None:
         """Describe the cloud (N, 3), m, round keyframe `number`, level with z up; keyframes come once, in any order."""
 
-    def nearest(self, number: int, others: NDArray[np.int64], turn: float = np.pi) -> list[PlaceMatch]:
+    def nearest(self, number: int, others: Longs, turn: float = np.pi) -> list[PlaceMatch]:
         """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.
 
         turn : rad, headings differ by no more

@@ -11,7 +11,6 @@ from dataclasses import replace
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import LoopsConfig
 from lslam.config.odometry import RegistrationConfig
@@ -25,12 +24,10 @@ from lslam.loops.level_submap import LevelSubmap, find_up, levelled, make_level_
 from lslam.loops.verify import Verification, Verifier
 from lslam.loops.working_memory import WorkingMemory
 from lslam.preprocessing.ground import Z
+from lslam.types.arrays import Floats, Longs, Points
 from lslam.types.constraint import Constraint, KnownPair, LoopCandidate, LoopStage, Verdict
 from lslam.types.stage_clock import KeyframeClocks, StageClock
 from lslam.types.trajectory import Keyframe
-
-Floats = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 # m; two passes of a street lie so far apart at most.
 NEAR = 8.0
@@ -92,7 +89,7 @@ class Detector:
             self._level_world()
         # Of thousands of keyframes, each has thousands: those of the next few are held.
         gated = SharedResults(self._gated, HELD)
-        ahead: dict[int, tuple[NDArray[np.int64], Future[list[LoopCandidate]]]] = {}
+        ahead: dict[int, tuple[Longs, Future[list[LoopCandidate]]]] = {}
         with ThreadPoolExecutor(threads, "lslam-loops") as pool:
             try:
                 for b, keyframe in enumerate(self.keyframes):
@@ -145,7 +142,7 @@ class Detector:
             None if closed is None else replace(closed, is_held=not found.reason),
         )  # fmt: skip
 
-    def _due_after(self, b: int, gated: SharedResults[NDArray[np.int64]], throttle: LoopThrottle) -> Iterator[int]:
+    def _due_after(self, b: int, gated: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
         """The next keyframes after `b` that are due if all verdicts are as the last one."""
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
@@ -156,7 +153,7 @@ class Detector:
                 yield n
                 throttle.observe(self.keyframes[n].distance, throttle.last or Verdict.ACCEPTED)
 
-    def _examined(self, b: int, older: NDArray[np.int64], clock: StageClock) -> list[LoopCandidate]:
+    def _examined(self, b: int, older: Longs, clock: StageClock) -> list[LoopCandidate]:
         """Keyframe `b` verified against the similar ones of the `older`, with verdicts."""
         with clock.stage("loops"):
             alike, fallback = self._choose(b, older)
@@ -177,14 +174,14 @@ class Detector:
         self.keyframes = levelled(self.keyframes, up)
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
-    def _gated(self, b: int) -> NDArray[np.int64]:
+    def _gated(self, b: int) -> Longs:
         """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
         among = self._allowed(b, self.memory.before(b))
         if self.config.radius is None:
             return self.uncertainty.gated(b, among, self.config.min_travel, NEAR, self.config.sigmas)
         return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
 
-    def _allowed(self, b: int, among: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _allowed(self, b: int, among: Longs) -> Longs:
         """Those that no forbidden pair lies at: so near along the way the same surfaces are taken for the same place."""
         distances = self.uncertainty.distances
         for older, newer in self.forbidden:
@@ -192,19 +189,19 @@ class Detector:
                 among = among[np.abs(distances[among] - distances[older]) > NEAR]
         return among
 
-    def _thinned(self, older: NDArray[np.int64], b: int, wait: float) -> LoopCandidate:
+    def _thinned(self, older: Longs, b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)
         said = f"the last one tried was less than {wait:g} m ago"
         return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, said)
 
-    def _nearest(self, older: NDArray[np.int64], b: int) -> int:
+    def _nearest(self, older: Longs, b: int) -> int:
         away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
         return int(older[away.argmin()])
 
     def _away(self, a: int, b: int) -> float:
         return float(np.linalg.norm(self.uncertainty.positions[b] - self.uncertainty.positions[a]))
 
-    def _choose(self, b: int, older: NDArray[np.int64]) -> tuple[list[PlaceMatch], Callable[[], list[PlaceMatch]]]:
+    def _choose(self, b: int, older: Longs) -> tuple[list[PlaceMatch], Callable[[], list[PlaceMatch]]]:
         """The candidates to verify, and what gives a fallback, if there is one.
 
         Where odometry is nearly certain, its nearest is the candidate and the most similar the fallback. Elsewhere it is the
@@ -227,14 +224,14 @@ class Detector:
         """Those of the matches that are not at the place of a chosen one."""
         return [m for m in matches if all(self._away(m.number, c.number) > NEAR / 2 for c in chosen)]
 
-    def _alike(self, b: int, older: NDArray[np.int64]) -> list[PlaceMatch]:
+    def _alike(self, b: int, older: Longs) -> list[PlaceMatch]:
         """Those of the `older` that look like keyframe `b`: the most similar and its rivals."""
         near = self._nearest(older, b)
         matches = self._matches(b, older[self._is_described[older] | (older == near)])
         limit = min(self.config.max_descriptor_distance, RIVAL * matches[0].distance)
         return self._apart([m for m in matches if m.distance <= limit])
 
-    def _matches(self, b: int, older: NDArray[np.int64]) -> list[PlaceMatch]:
+    def _matches(self, b: int, older: Longs) -> list[PlaceMatch]:
         """The `older` by their similarity to keyframe `b`, the best first."""
         for number in (b, *older):
             self._described.get(int(number))

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import LoopsConfig
 from lslam.config.odometry import RegistrationConfig
@@ -20,14 +19,12 @@ from lslam.loops.gating import OdometryUncertainty
 from lslam.loops.level_submap import make_level_submap
 from lslam.loops.verify import Verifier
 from lslam.preprocessing.ground import Z
+from lslam.types.arrays import Floats, Points
 from lslam.types.constraint import KnownPair, LoopCandidate, LoopStage
 from lslam.types.stage_clock import KeyframeClocks
 from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
-
-Points = NDArray[np.float32]
-Floats = NDArray[np.float64]
 
 
 def find_loops(

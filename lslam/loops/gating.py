@@ -10,14 +10,12 @@ from dataclasses import dataclass, replace
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import so3
 from lslam.kernels import gating
+from lslam.types.arrays import Floats, Longs
 from lslam.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.types.trajectory import Keyframe
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class OdometryUncertainty:
         self._sum = np.concatenate([zero, np.cumsum(self.positions, axis=0)])
         self._squares = np.concatenate([[0.0], np.cumsum((self.positions**2).sum(axis=1))])
 
-    def between(self, b: int, older: NDArray[np.int64]) -> RelativeUncertainty:
+    def between(self, b: int, older: Longs) -> RelativeUncertainty:
         """Uncertainty of keyframe `b` relative to each of the keyframes `older`."""
         travelled = self.distances[b] - self.distances[older]
         turn = self._turn_per_m * travelled
@@ -71,7 +69,7 @@ class OdometryUncertainty:
             square = square + np.maximum(np.linalg.eigvalsh(own[:, 3:, 3:])[:, 2], 0.0)
         return RelativeUncertainty(position, np.sqrt(square))
 
-    def gated(self, b: int, among: NDArray[np.int64], least: float, near: float, sigmas: float) -> NDArray[np.int64]:
+    def gated(self, b: int, among: Longs, least: float, near: float, sigmas: float) -> Longs:
         """Those `among` the older keyframes (C,) at least `least` m of way ago and no farther from keyframe `b` than `near` m and
         so many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
         """
@@ -81,7 +79,7 @@ class OdometryUncertainty:
             (self._per_m, float(self._turn_per_m)), (float(least), float(near), float(sigmas)),
         ))  # fmt: skip
 
-    def _lever(self, b: int, older: NDArray[np.int64]) -> Floats:
+    def _lever(self, b: int, older: Longs) -> Floats:
         """(C,) m, rms distance of keyframe `b` from the keyframes since each of `older`."""
         count = b + 1 - older
         mean = (self._sum[b + 1] - self._sum[older]) / count[:, None]
@@ -157,7 +155,7 @@ def resolve_ambiguity(
     ]
 
 
-def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> NDArray[np.float64]:
+def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> Floats:
     """(3,) m in the world, position of the newer keyframe by the loop closure and odometry's pose of the older one."""
     assert candidate.constraint is not None
     return np.asarray((keyframes[candidate.a].T_world_lidar @ candidate.constraint.T_a_b)[:3, 3])

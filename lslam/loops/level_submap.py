@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.odometry import RegistrationConfig
 from lslam.geometry import se3, so3
@@ -15,9 +14,8 @@ from lslam.preprocessing.ground import Z
 from lslam.preprocessing.prepare import PreparedPoints
 from lslam.preprocessing.up import NEAR_Z
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.types.arrays import Floats, Longs, Points
 from lslam.types.trajectory import Keyframe
-
-Floats = NDArray[np.float64]
 
 # Cosines: surfaces tilted by less against the estimate so far are taken for ground, floors and flat roofs.
 ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 15.0, 15.0))
@@ -59,8 +57,6 @@ def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
         for k in keyframes
     ]  # fmt: skip
 
-
-Points = NDArray[np.float32]
 
 # m; larger voxels serve sparse single scans; a submap is dense.
 LARGEST = 0.8
@@ -115,7 +111,7 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
     )
 
 
-def _source(target: GaussianMap, slots: NDArray[np.int64]) -> PreparedPoints:
+def _source(target: GaussianMap, slots: Longs) -> PreparedPoints:
     """Means of voxels with the scatter round them."""
     s = target.moments[slots] / np.maximum(target.moments[slots, :1], 1.0)
     mean = s[:, 1:4]

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from lslam.config.backend import LoopsConfig
 from lslam.kernels.polar_image import polar_image
 from lslam.loops.descriptor import PlaceMatch
+from lslam.types.arrays import Bools, Floats, Longs
 
 Images = NDArray[np.float32]
 
@@ -33,7 +34,7 @@ def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float
     return np.where(seen, np.maximum(image - ground, 0) + LIFT, 0).astype(np.float32)
 
 
-def distances(query: Images, images: Images) -> NDArray[np.float64]:
+def distances(query: Images, images: Images) -> Floats:
     """(C, S) distance of a query (R, S) to images (C, R, S) at each of S column shifts: mean of 1 - cos over the columns.
 
     Shift n compares column j of the query with column j + n (equations 2.36 and 2.37 of Girolimetto). Columns that
@@ -50,7 +51,7 @@ def distances(query: Images, images: Images) -> NDArray[np.float64]:
     return np.where(either > 0, 1 - cosines / np.maximum(either, 1), 1.0)
 
 
-def _unit_columns(images: Images) -> tuple[Images, NDArray[np.bool_]]:
+def _unit_columns(images: Images) -> tuple[Images, Bools]:
     """Columns of images (C, R, S) at length 1, and which (C, S) hold anything."""
     norms = np.linalg.norm(images, axis=1)
     return images / np.maximum(norms, 1e-12)[:, None, :], norms > 0
@@ -85,7 +86,7 @@ class PlaceIndex:
         # tells places apart when a submap fills every cell.
         self._keys[row] = self._images[row].mean(axis=1)
 
-    def nearest(self, number: int, others: NDArray[np.int64], turn: float = np.pi) -> list[PlaceMatch]:
+    def nearest(self, number: int, others: Longs, turn: float = np.pi) -> list[PlaceMatch]:
         """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.
 
         turn : rad, headings differ by no more

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import LoopsConfig
 from lslam.config.odometry import RegistrationConfig
@@ -17,9 +16,8 @@ from lslam.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
+from lslam.types.arrays import Bools, Floats
 from lslam.types.constraint import LoopStage
-
-Floats = NDArray[np.float64]
 
 # Cells; the smaller image serves where the search is short.
 SMALL, LARGE = BevGrid(128), BevGrid(256)
@@ -96,8 +94,6 @@ def _pose(grid: BevGrid, a: LevelSubmap, b: LevelSubmap, shift: Floats, yaw: flo
     return se3.make(R, np.array([*shift, climb]))
 
 
-Flags = NDArray[np.bool_]
-
 # Every so many-th source point serves to rank the initial guesses.
 FEW = 4
 # m; kernel widths: at an initial guess, and for rmse and overlap.
@@ -153,7 +149,7 @@ class Verifier:
         backward = self._refine(b, a, se3.inverse(rough))
         return self._agree(facts, forward, backward)
 
-    def _try(self, a: LevelSubmap, b: LevelSubmap, seen: Flags, start: Floats) -> tuple[float, Floats]:
+    def _try(self, a: LevelSubmap, b: LevelSubmap, seen: Bools, start: Floats) -> tuple[float, Floats]:
         """Inlier share of the upright points after registration from `start`, 0 to 1, and the pose found."""
         r = self.registration
         few = thin(b.source, FEW)
@@ -172,7 +168,7 @@ class Verifier:
     ) -> RegistrationResult:
         return solve((a.coarse if coarse_only else a.fine,), points, start, annealing, self.registration)
 
-    def _support(self, a: LevelSubmap, upright: PreparedPoints, seen: Flags, T_a_b: Floats) -> float:
+    def _support(self, a: LevelSubmap, upright: PreparedPoints, seen: Bools, T_a_b: Floats) -> float:
         """Inlier share among the points in cells that a observed: unlike their number, it does not depend on the shift."""
         cells, inside = LARGE.cells_of(se3.apply(T_a_b, upright.source))
         comparable = int((inside & seen[cells]).sum())

@@ -6,7 +6,8 @@ import math
 from bisect import bisect_left, insort
 
 import numpy as np
-from numpy.typing import NDArray
+
+from lslam.types.arrays import Floats, Longs
 
 # Places of one verified loop that are retrieved at each new place, as in the paper.
 RETRIEVED = 2
@@ -26,9 +27,7 @@ class WorkingMemory:
     recent_m : m; places on the way just travelled are not candidates yet and stay (short-term memory)
     """
 
-    def __init__(
-        self, place_of: NDArray[np.int64], distances: NDArray[np.float64], bound: int | None, recent_m: float
-    ) -> None:
+    def __init__(self, place_of: Longs, distances: Floats, bound: int | None, recent_m: float) -> None:
         self.bound = bound
         self._place_of, self._distances, self._recent_m = place_of, distances, recent_m
         count = int(place_of[-1]) + 1 if len(place_of) else 0
@@ -68,7 +67,7 @@ class WorkingMemory:
         self._weigh(place, self._weights[place] + weight)
         self._weigh(self._loop, 0)
 
-    def before(self, keyframe: int) -> NDArray[np.int64]:
+    def before(self, keyframe: int) -> Longs:
         """Keyframes older than `keyframe`, increasing, that are compared with it.
 
         Places behind the newest one that was entered count, so that the memory can be asked about keyframes to come.

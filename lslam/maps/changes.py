@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from lslam.errors import ConfigError
 from lslam.maps.occupancy import MODEL, Evidence
 from lslam.stopping import check_stop
+from lslam.types.arrays import Bools, Floats, Longs
 
 Keys = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 Kind = Literal["appeared", "vanished"]
 
 # Cells in a thing, at most, that noise explains: what is smaller than a cell lies in up to eight of them.
@@ -25,11 +25,11 @@ class MapChange:
     """A thing that only one drive saw, where beams of the other passed: cells (K, 3) of edge `voxel`, m."""
 
     kind: Kind
-    cells: NDArray[np.int64]
+    cells: Longs
     voxel: float
 
     @property
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> Floats:
         """(K, 3) middles of the cells, m."""
         return np.asarray((self.cells + 0.5) * self.voxel)
 
@@ -49,7 +49,7 @@ class MapChange:
         return float(len(self.cells) * self.voxel**3)
 
     @property
-    def outline(self) -> NDArray[np.float64]:
+    def outline(self) -> Floats:
         """(C, 2) convex hull of the cells seen from above, counter-clockwise, m."""
         from scipy.spatial import ConvexHull
 
@@ -79,7 +79,7 @@ class ChangedCells:
     """
 
     changes: tuple[MapChange, ...]
-    same: NDArray[np.int64]
+    same: Longs
     voxel: float
     occupied_new: int
     occupied_old: int
@@ -160,7 +160,7 @@ def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[Ma
     return [MapChange(kind, _cells(cells[labels == label], found), found.voxel) for label in kept]
 
 
-def _components(keys: Keys) -> NDArray[np.int64]:
+def _components(keys: Keys) -> Longs:
     """Number of the part that each of the rising keys is of, parts being joined by faces, edges and corners of cells."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -175,7 +175,7 @@ def _components(keys: Keys) -> NDArray[np.int64]:
     return np.asarray(connected_components(pairs, directed=False)[1], np.int64)
 
 
-def _beside(keys: Keys, others: Keys) -> Mask:
+def _beside(keys: Keys, others: Keys) -> Bools:
     """Whether a cell or one of its 26 neighbours is among `others`, which rise."""
     near = np.zeros(len(keys), np.bool_)
     for step in _steps():
@@ -184,7 +184,7 @@ def _beside(keys: Keys, others: Keys) -> Mask:
     return near
 
 
-def _open(keys: Keys, seen: Keys) -> Mask:
+def _open(keys: Keys, seen: Keys) -> Bools:
     """Whether all six cells beyond the faces of a cell are among `seen`, which rise."""
     steps = _steps()
     return np.asarray(np.all([_among(keys + steps[k], seen) for k in (4, 10, 12, 14, 16, 22)], axis=0))
@@ -199,11 +199,11 @@ def _steps() -> list[int]:
     ]  # fmt: skip
 
 
-def _among(keys: Keys, others: Keys) -> Mask:
+def _among(keys: Keys, others: Keys) -> Bools:
     return np.asarray(_found(keys, others) >= 0)
 
 
-def _found(keys: Keys, others: Keys) -> NDArray[np.int64]:
+def _found(keys: Keys, others: Keys) -> Longs:
     """Where each key stands in `others`, which rise; -1 where it does not."""
     if not len(others):
         return np.full(len(keys), -1, np.int64)
@@ -211,7 +211,7 @@ def _found(keys: Keys, others: Keys) -> NDArray[np.int64]:
     return np.where(others[at] == keys, at, -1)
 
 
-def _cells(keys: Keys, found: Evidence) -> NDArray[np.int64]:
+def _cells(keys: Keys, found: Evidence) -> Longs:
     from lslam.kernels.voxel_average import unpack_cells
 
     return unpack_cells(keys, found.origin)

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.preprocessing.ground import Z
 from lslam.stopping import checking
+from lslam.types.arrays import Bools, Floats, Longs
 from lslam.types.state import State
-
-Ints = NDArray[np.int64]
 
 # The ground is the lowest of some scans around a place, by squares of so many m; what is higher stands on it. On slopes
 # above some 7 % ground does, too, as one large thing that does not move.
@@ -34,10 +33,10 @@ class Floor:
         world's z, inf where there is no point
     """
 
-    first: Ints
+    first: Longs
     lowest: NDArray[np.float32]
 
-    def lower(self, image: NDArray[np.float32], first: Ints) -> None:
+    def lower(self, image: NDArray[np.float32], first: Longs) -> None:
         """Put what is lower than in `image`, whose corner is the square `first`, into it."""
         shift = np.clip(self.first - first, -_SIDE, _SIDE)
         (x, y), (u, v) = np.maximum(shift, 0), np.maximum(-shift, 0)
@@ -45,7 +44,7 @@ class Floor:
         np.minimum(there, self.lowest[u : _SIDE - x, v : _SIDE - y], out=there)
 
 
-def floor_of(points: NDArray[np.float32], sensor: NDArray[np.float64]) -> Floor:
+def floor_of(points: NDArray[np.float32], sensor: Floats) -> Floor:
     """Of points (N, 3) as seen from the sensor, but along the axes of a world whose z is up, m; sensor : (3,) where it is."""
     near = points[_within_reach(points)]
     first, squares = _squares(near, sensor)
@@ -54,7 +53,7 @@ def floor_of(points: NDArray[np.float32], sensor: NDArray[np.float64]) -> Floor:
     return Floor(first, lowest)
 
 
-def standing(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: Iterable[Floor]) -> NDArray[np.bool_]:
+def standing(points: NDArray[np.float32], sensor: Floats, floors: Iterable[Floor]) -> Bools:
     """(N,) whether a point is within reach and above the ground, as far as `floors` know it.
 
     points, sensor : as for `floor_of`; floors : of this scan and of others around it
@@ -74,7 +73,7 @@ def standing(points: NDArray[np.float32], sensor: NDArray[np.float64], floors: I
     return stands
 
 
-def things_of(points: NDArray[np.float32], chosen: NDArray[np.bool_]) -> Ints:
+def things_of(points: NDArray[np.float32], chosen: Bools) -> Longs:
     """Number of the thing that each point (N, 3) is of, from 1, were there only the `chosen`; 0 for the others.
 
     points : as for `floor_of`; chosen : (N,), within reach
@@ -90,7 +89,7 @@ def things_of(points: NDArray[np.float32], chosen: NDArray[np.bool_]) -> Ints:
     return labels
 
 
-def whole(moves: NDArray[np.bool_], labels: Ints, share: float, least: int) -> NDArray[np.bool_]:
+def whole(moves: Bools, labels: Longs, share: float, least: int) -> Bools:
     """The mask (N,), and all of the things of which `share`, and `least` points, are masked."""
     total, moving = np.bincount(labels), np.bincount(labels, moves)
     chosen = (moving >= least) & (moving >= share * total)
@@ -98,14 +97,14 @@ def whole(moves: NDArray[np.bool_], labels: Ints, share: float, least: int) -> N
     return np.asarray(moves | chosen[labels])
 
 
-def _squares(near: NDArray[np.float32], sensor: NDArray[np.float64]) -> tuple[Ints, Ints]:
+def _squares(near: NDArray[np.float32], sensor: Floats) -> tuple[Longs, Longs]:
     """(2,) the square in the corner of what is in reach, and (N,) where points lie in an image of it, row after row."""
     first = np.floor((sensor[:2] - REACH) / SQUARE).astype(np.int64)
     at = np.floor((near[:, :2] + sensor[:2]) / SQUARE).astype(np.int64) - first
     return first, at[:, 0] * _SIDE + at[:, 1]
 
 
-def _within_reach(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _within_reach(points: NDArray[np.float32]) -> Bools:
     """(N,) whether a point is; no NaN is."""
     x, y, z = np.abs(points).T
     return np.asarray((x < REACH) & (y < REACH) & (z < REACH))
@@ -137,7 +136,7 @@ class PosedScan:
     """
 
     points: NDArray[np.float32]
-    T_world_lidar: NDArray[np.float64]
+    T_world_lidar: Floats
     intensity: NDArray[np.float32] | None = None
 
 
@@ -155,7 +154,7 @@ class _Grid:
 class _Look:
     """What is kept of a scan for the others: its pose, its range image and its floor."""
 
-    T_world_lidar: NDArray[np.float64]
+    T_world_lidar: Floats
     image: NDArray[np.float32]
     floor: Floor
 
@@ -174,7 +173,7 @@ class Cleaner:
     removed, seen : points taken out, of so many
     """
 
-    def __init__(self, up: NDArray[np.float64] = Z) -> None:
+    def __init__(self, up: Floats = Z) -> None:
         self._R_level = so3.level_frame(up)
         self._scans: deque[PosedScan] = deque()
         self._looks: deque[_Look] = deque()
@@ -238,7 +237,7 @@ class Cleaner:
         intensity = None if scan.intensity is None else scan.intensity[kept]
         return [replace(scan, points=scan.points[kept], intensity=intensity)]
 
-    def _moves(self, scan: PosedScan, number: int) -> NDArray[np.bool_]:
+    def _moves(self, scan: PosedScan, number: int) -> Bools:
         around = (number + sign * offset for offset in OFFSETS for sign in (-1, 1))
         others = [self._looks[k - self._begin] for k in around if self._begin <= k < self._count]
         floors = [look.floor for look in (self._looks[number - self._begin], *others)]
@@ -254,14 +253,14 @@ class Cleaner:
         moves[stands] = moving
         return moves
 
-    def _upright(self, scan: PosedScan) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    def _upright(self, scan: PosedScan) -> tuple[NDArray[np.float32], Floats]:
         """Its points (N, 3) as seen from the sensor, and where that is, m, along the world's axes once z is up."""
         T = self._R_level @ scan.T_world_lidar[:3]
         with np.errstate(invalid="ignore"):  # organised clouds mark what they did not see by infinity
             return scan.points @ T[:, :3].T.astype(np.float32), T[:, 3]
 
     def _votes(
-        self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64], others: list[_Look]
+        self, points: NDArray[np.float32], T_world_lidar: Floats, others: list[_Look]
     ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
         """Of how many of the `others` each point (N, 3) was looked through, and by how many something was seen there.
 
@@ -278,7 +277,7 @@ class Cleaner:
         return free, hit
 
 
-def spread(moves: NDArray[np.bool_], points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def spread(moves: Bools, points: NDArray[np.float32]) -> Bools:
     """The mask (N,), and all points (N, 3), m, of cubes in which a good share is masked: wheels, and what hides behind."""
     if not moves.any():
         return moves
@@ -313,7 +312,7 @@ def _grid_of(points: NDArray[np.float32]) -> _Grid | None:
     return grid
 
 
-def _filled(grid: _Grid, elevation: NDArray[np.float64], azimuth: NDArray[np.float64]) -> float:
+def _filled(grid: _Grid, elevation: Floats, azimuth: Floats) -> float:
     """Share of pixels with a point, in each column between its lowest and its highest."""
     row = ((elevation - grid.low) / grid.size).astype(np.int64)
     column = np.minimum((azimuth / (2 * np.pi) * grid.columns).astype(np.int64), grid.columns - 1)

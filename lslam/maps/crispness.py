@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
 from lslam.maps.merge import MergedMap
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.types.run_record import Crispness, MapDifference
-
-Floats = NDArray[np.float64]
 
 RADIUS = 0.5  # m
 LEAST = 10  # points in a neighbourhood

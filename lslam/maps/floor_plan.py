@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.maps.occupancy import OccupancyGrid
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud, Cloud
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254  # the grey values of ROS' map_server
@@ -128,7 +129,7 @@ def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 160
     return TopView(counts.reshape(shape).astype(np.float32), heights.reshape(shape).astype(np.float32), extent)
 
 
-def _bounds(cloud: Cloud, trim: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _bounds(cloud: Cloud, trim: float) -> tuple[Floats, Floats]:
     """Quantiles of a regular sample of some 100,000 points: cheap, deterministic, blind to stray points."""
     step, seen = max(1, len(cloud) // 100_000), 0
     parts = [np.zeros((0, 2))]

@@ -23,10 +23,9 @@ from lslam.geometry.geodesy import (
     local_crs,
     to_local,
 )
+from lslam.types.arrays import Floats
 from lslam.types.cloud import Cloud, CloudBlock
 from lslam.types.gnss import Georeference
-
-Floats = NDArray[np.float64]
 
 
 def utm_epsg(lat: float, lon: float) -> int:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lslam.errors import ConfigError, InputError
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
 from lslam.stopping import checking
+from lslam.types.arrays import Floats, Longs
 from lslam.types.cloud import BLOCK, CloudBlock, in_memory
 from lslam.types.state import State
 
@@ -34,9 +35,7 @@ class MergedMap:
         averaged
     """
 
-    def __init__(
-        self, rows: NDArray[np.int64] | StoredRows, origin: NDArray[np.int64], voxel: float, has_intensity: bool
-    ) -> None:
+    def __init__(self, rows: Longs | StoredRows, origin: Longs, voxel: float, has_intensity: bool) -> None:
         self._rows, self._origin, self.voxel = rows, origin, voxel
         self._has_intensity = has_intensity
 
@@ -49,7 +48,7 @@ class MergedMap:
         return self._has_intensity
 
     @property
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Floats:
         """All points, (M, 3)."""
         return in_memory(self).points
 
@@ -59,7 +58,7 @@ class MergedMap:
         return in_memory(self).intensity
 
     @property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> Longs:
         """How many points were averaged, (M,)."""
         return np.concatenate([rows[:, 4] for rows in self._pieces()] or [np.zeros(0, np.int64)])
 
@@ -73,7 +72,7 @@ class MergedMap:
             )
             yield CloudBlock(unpack(rows, self._origin, self.voxel), intensity)
 
-    def _pieces(self) -> Iterator[NDArray[np.int64]]:
+    def _pieces(self) -> Iterator[Longs]:
         for start in checking(range(0, len(self), BLOCK)):
             stop = min(start + BLOCK, len(self))
             yield self._rows.read(start, stop) if isinstance(self._rows, StoredRows) else self._rows[start:stop]
@@ -125,7 +124,7 @@ class MapMerger:
             )
         self._voxel, self._range_min = float(voxel), float(range_min)
         self._range_max = min(float(range_max), 1e150)  # squared it must stay finite, or Inf would pass the gate
-        self._origin: NDArray[np.int64] | None = None
+        self._origin: Longs | None = None
         self._most, self._used = most, 0
         self._start(columns=5)
         self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
@@ -134,9 +133,7 @@ class MapMerger:
         self._with_intensity: bool | None = None
         self.scans = self.gated = self.outside = self.refused = 0
 
-    def add(
-        self, points: NDArray[Any], T_world_lidar: NDArray[np.float64], intensity: NDArray[Any] | None = None
-    ) -> None:
+    def add(self, points: NDArray[Any], T_world_lidar: Floats, intensity: NDArray[Any] | None = None) -> None:
         """Add one scan: points (N, 3) m in the LiDAR frame, its pose (4, 4), intensity (N,) or None.
 
         The map has intensity only when every scan has; an intensity that is not finite counts as 0. A scan whose pose
@@ -180,7 +177,7 @@ class MapMerger:
                 self._voxel * 2**20 / 1000,
             )
         origin = np.zeros(3, np.int64) if self._origin is None else self._origin
-        rows: NDArray[np.int64] | StoredRows
+        rows: Longs | StoredRows
         if self._runs is None:
             rows = self._take()
         else:
@@ -209,7 +206,7 @@ class MapMerger:
             self._with_intensity = bool(state["with_intensity"])
             self._start(columns=6 if self._with_intensity else 5)
 
-    def _take(self) -> NDArray[np.int64]:
+    def _take(self) -> Longs:
         """The rows in memory, sorted; none are left."""
         rows = self._rows[: self._used]
         rows = rows[np.argsort(rows[:, 0])]
@@ -218,7 +215,7 @@ class MapMerger:
 
     def _start(self, columns: int) -> None:
         """Room for `most` rows: the system gives memory for those only that are written to."""
-        self._rows: NDArray[np.int64] = np.empty((self._most, columns), np.int64)
+        self._rows: Longs = np.empty((self._most, columns), np.int64)
         self._slots: NDArray[np.int32] = np.full(_slots_for(self._most), -1, np.int32)
         self._used = 0
 
@@ -251,7 +248,7 @@ def _slots_for(rows: int) -> int:
     return 1 << int(np.ceil(np.log2(max(rows, 1) * 2)))
 
 
-def _add_up(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def _add_up(rows: Longs) -> Longs:
     """One row per key of sorted rows: the sums added."""
     first = np.flatnonzero(np.diff(rows[:, 0], prepend=rows[0, 0] - 1))
     summed = np.add.reduceat(rows, first, axis=0)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.extras import importing_open3d
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud
 
 NEIGHBOURS, DEVIATIONS = 20, 2.0
@@ -22,7 +23,7 @@ _DEEPEST = 11
 class Mesh:
     """A surface: vertices (V, 3) float64, m; triangles (F, 3) int32, counter-clockwise seen from where the sensor was."""
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     triangles: NDArray[np.int32]
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import ConfigError
 from lslam.maps.sorted_runs import SortedRuns
+from lslam.types.arrays import Bools, Floats, Longs
 from lslam.types.state import State
 
 # Log-odds in hundredths: hit 0.7, miss 0.4, clamped to 0.12 and 0.97 (OctoMap's): what has left is free after some ten scans.
@@ -34,12 +35,12 @@ class OccupancyGrid:
         return len(self.cells)
 
     @property
-    def is_occupied(self) -> NDArray[np.bool_]:
+    def is_occupied(self) -> Bools:
         """(M,) more likely occupied than free."""
         return np.asarray(self.log_odds > 0)
 
     @property
-    def centres(self) -> NDArray[np.float64]:
+    def centres(self) -> Floats:
         """(M, 3) middles of the cells, m."""
         return np.asarray((self.cells + 0.5) * self.voxel)
 
@@ -52,10 +53,10 @@ class Evidence:
     same without clamps, which no order changes; origin : (3,) cell in the middle of the key range
     """
 
-    keys: NDArray[np.int64]
+    keys: Longs
     log_odds: NDArray[np.int16]
-    sums: NDArray[np.int64]
-    origin: NDArray[np.int64]
+    sums: Longs
+    origin: Longs
     voxel: float
 
     def __len__(self) -> int:
@@ -87,7 +88,7 @@ class OccupancyMapper:
 
     def __init__(
         self, voxel: float = 0.4, range_min: float = 1.0, range_max: float = 40.0, *, spool: Path | None = None,
-        keep: Path | None = None, most: int = _MOST_ROWS, origin: NDArray[np.int64] | None = None,
+        keep: Path | None = None, most: int = _MOST_ROWS, origin: Longs | None = None,
     ) -> None:  # fmt: skip
         if not (np.isfinite([voxel, range_max]).all() and voxel > 0 and 0 <= range_min < range_max):
             raise ConfigError(
@@ -105,7 +106,7 @@ class OccupancyMapper:
         self.scans = 0
         self._reserve(_START_ROWS)
 
-    def add(self, points: NDArray[Any], T_world_lidar: NDArray[np.float64]) -> None:
+    def add(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
         """One deskewed scan: points (N, 3) m in the LiDAR frame, its pose (4, 4); poses that are not finite are left out."""
         from lslam.kernels.ray_cells import carve, mark_ends
 
@@ -168,7 +169,7 @@ class OccupancyMapper:
             self._runs.restore(state["runs"])
         self._origin, self.scans = state["origin"], state["scans"]
 
-    def _take(self) -> NDArray[np.int64]:
+    def _take(self) -> Longs:
         rows = self._rows[: self._used]
         rows = rows[np.argsort(rows[:, 0])]
         self._used = 0

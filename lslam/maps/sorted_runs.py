@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.errors import InputError, OutputError, cause
 from lslam.stopping import checking
+from lslam.types.arrays import Longs
 from lslam.types.state import State
 
 Rows = NDArray[np.int64]
@@ -118,7 +119,7 @@ class StoredRows:
         return self._count
 
     @property
-    def keys(self) -> NDArray[np.int64]:
+    def keys(self) -> Longs:
         """(n,) first column, mapped from the file."""
         return np.memmap(self._path.with_suffix(".keys"), np.int64, "r") if self._count else np.zeros(0, np.int64)
 

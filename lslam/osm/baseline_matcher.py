@@ -29,10 +29,9 @@ from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 from lslam.stopping import checking
+from lslam.types.arrays import Floats
 from lslam.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.types.stage_clock import KeyframeClocks, StageClock
-
-Floats = NDArray[np.float64]
 
 # Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5
@@ -152,7 +151,7 @@ def flatten_scan(cloud: NDArray[np.float32], reach: float) -> Floats:
     return np.asarray(flat[np.sort(first)])
 
 
-def outline_points(walls: NDArray[np.float64]) -> Floats:
+def outline_points(walls: Floats) -> Floats:
     """(N, 2) points along walls (T, 2, 2), m."""
     found = []
     for a, b in walls:
@@ -161,12 +160,12 @@ def outline_points(walls: NDArray[np.float64]) -> Floats:
     return np.concatenate(found) if found else np.zeros((0, 2))
 
 
-def lay_scan(seen: Floats, walls: NDArray[np.float64], prior: Floats) -> FlatFit | None:
+def lay_scan(seen: Floats, walls: Floats, prior: Floats) -> FlatFit | None:
     """Register the flattened scan (N, 2) with all `walls` (T, 2, 2) by NDT from `prior` (3,); None without convergence."""
     return _align(seen, outline_points(walls), prior, NDT_VOXEL, "ndt")
 
 
-def lay_building(walls: NDArray[np.float64], seen: Floats, prior: Floats) -> FlatFit | None:
+def lay_building(walls: Floats, seen: Floats, prior: Floats) -> FlatFit | None:
     """Register a building's `walls` (T, 2, 2), about its middle, with the flattened scan (N, 2) by VGICP; None likewise."""
     return _align(outline_points(walls), seen, prior, VGICP_VOXEL, "vgicp")
 

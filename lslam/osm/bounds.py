@@ -14,6 +14,7 @@ from lslam.formats.geojson import read_line
 from lslam.formats.stamped_csv import read_gnss_csv
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry.geodesy import from_local
+from lslam.types.arrays import Floats
 
 METRES_PER_DEGREE = 111_320.0
 DECIMALS = 6  # docs/conventions.md: a cached reply is found by the rounded box
@@ -101,9 +102,7 @@ def around(lat_lon: NDArray[Any], radius: float) -> Bounds:
     return Bounds(south, west, north, east_side)
 
 
-def positions_along(
-    what: str, data_root: Path | None = None, origin: NDArray[Any] | None = None
-) -> NDArray[np.float64]:
+def positions_along(what: str, data_root: Path | None = None, origin: NDArray[Any] | None = None) -> Floats:
     """(N, 2) lat, lon in deg, WGS84, of `what`: a run folder or GeoJSON line, fixes as CSV, a trajectory, or a sequence.
 
     A trajectory in metres (TUM, EuRoC, KITTI) is in a georeferenced world, x east and y north of `origin` (3,) lat, lon,

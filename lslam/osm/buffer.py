@@ -25,6 +25,7 @@ from lslam.formats.osm_buildings import buildings_of
 from lslam.geometry.geodesy import from_local
 from lslam.osm.bounds import Bounds, around
 from lslam.osm.overpass import OverpassReply, from_overpass
+from lslam.types.arrays import Floats
 from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")
@@ -37,10 +38,10 @@ Fetch = Callable[[Bounds], Mapping[str, Any]]
 class _RequestedCircle:
     """A circle to be requested: its centre (2,) and radius, m, in the local frame."""
 
-    centre: NDArray[np.float64]
+    centre: Floats
     radius: float
 
-    def is_at(self, place: NDArray[np.float64], radius: float) -> bool:
+    def is_at(self, place: Floats, radius: float) -> bool:
         return float(np.linalg.norm(place - self.centre)) <= radius
 
 

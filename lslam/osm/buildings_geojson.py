@@ -7,17 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.osm_data import DECIMALS
 from lslam.geometry import se2
 from lslam.geometry.geodesy import from_local, to_local
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 from lslam.untrusted import MISFIT, parse_json
 
-Floats = NDArray[np.float64]
 SCHEMA = "lslam-buildings-1"
 
 

@@ -6,13 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.formats.osm_data import DECIMALS, OsmData
 from lslam.geometry.geodesy import from_local, to_local
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, about
-
-Floats = NDArray[np.float64]
 
 ONE_NODE = 0.05  # m; a node that its buildings want nearer together than this stays one node
 STAYS = 0.01  # m; what moves less is not edited

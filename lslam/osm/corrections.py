@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import OsmConfig
 from lslam.formats.osm_data import OsmData
@@ -23,6 +22,7 @@ from lslam.osm.overlap import Untangled, remove_overlaps
 from lslam.osm.wall_match import LIKENESS
 from lslam.osm.walls import walls_of
 from lslam.stopping import checking
+from lslam.types.arrays import Bools, Floats
 from lslam.types.building import (
     Building,
     BuildingCorrection,
@@ -34,8 +34,6 @@ from lslam.types.building import (
     footprint_polygon,
     is_canopy,
 )
-
-Floats = NDArray[np.float64]
 
 VIEWS = 3  # keyframes that must agree
 NEAR = 1.5  # m; a building with walls seen within it of its outline is not absent
@@ -62,7 +60,7 @@ class _PlacedView:
 
 def absent_buildings(
     buildings: Sequence[Building], sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Whether each building (B,) is absent: no wall is seen near its outline, and walls behind are seen through it.
 
     buildings : displaced, m, map frame; poses : (3,) planar pose of each keyframe in the map frame
@@ -176,7 +174,7 @@ def _ground(building: Building) -> Any:
     return union_all([footprint_polygon(f).buffer(0) for f in building.footprints])
 
 
-def correct_buildings(matches: OsmMatches, poses: NDArray[np.float64], config: OsmConfig) -> CorrectedMap:
+def correct_buildings(matches: OsmMatches, poses: Floats, config: OsmConfig) -> CorrectedMap:
     """The map with the estimated displacements of the buildings of `matches`.
 
     Parameters

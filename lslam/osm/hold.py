@@ -6,7 +6,6 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import Placement, on_earth
 from lslam.backend.outcome import BackEnd, Given, solve
@@ -24,11 +23,11 @@ from lslam.osm.source import OsmSource
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
 from lslam.osm.wall_match import match_buildings
 from lslam.stopping import checking
+from lslam.types.arrays import Floats
 from lslam.types.gnss import Georeference
 from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 # Iterations of the drift estimate: the drift within a submap is not visible in its walls at first.
 ROUNDS = 5
 # Modes in which the buildings of the map do not move relative to each other.

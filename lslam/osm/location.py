@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.inputs import floor_planes
 from lslam.backend.levelling import UP
@@ -30,12 +29,12 @@ from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildi
 from lslam.osm.walls import OsmMap, find_walls
 from lslam.preprocessing.ground import up_of, world_up_of
 from lslam.stopping import checking
+from lslam.types.arrays import Floats
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import Verdict
 from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 # Sigmas of the map beyond which the track is lost, and a match has to observe all three coordinates.
 LOST = 4.0

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.stopping import checking
+from lslam.types.arrays import Floats, Longs
 from lslam.types.building import Building, about, footprint_polygon, is_canopy
-
-Floats = NDArray[np.float64]
 
 TOUCHING = 0.05  # m; walls of neighbours at most this far apart on the map are a party wall
 SHARED = 0.5  # m; least length of a party wall
@@ -198,9 +196,7 @@ class Untangled:
     left: tuple[tuple[int, int], ...]
 
 
-def remove_overlaps(
-    buildings: Sequence[Building], displacements: NDArray[np.float64], information: NDArray[np.float64]
-) -> Untangled:
+def remove_overlaps(buildings: Sequence[Building], displacements: Floats, information: Floats) -> Untangled:
     """The least displacements that separate overlapping buildings and keep party walls aligned.
 
     Parameters
@@ -252,7 +248,7 @@ def _neighbours(solids: Sequence[Solid]) -> list[tuple[int, int]]:
     return _pairs(solids, STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING))
 
 
-def _pairs(solids: Sequence[Solid], found: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _pairs(solids: Sequence[Solid], found: Longs) -> list[tuple[int, int]]:
     """Numbers of the two buildings of each pair, every pair once and sorted."""
     return sorted((solids[a].number, solids[b].number) for a, b in found.T.tolist() if a < b)
 

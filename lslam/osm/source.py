@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.georeferencing import require_crs
 from lslam.config import Config
@@ -23,12 +22,12 @@ from lslam.geometry.geodesy import to_local
 from lslam.osm.buffer import Fetch, OsmBuffer
 from lslam.osm.overpass import OverpassReply, fetch_buildings, merged, reply_folder
 from lslam.osm.walls import OsmMap
+from lslam.types.arrays import Floats, Longs
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
 from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 AUTO = "auto"
 # s; longest wait for the first buildings, and for the last ones after odometry.
@@ -140,7 +139,7 @@ def first_pose(config: OsmConfig) -> Floats:
     )
 
 
-def _places(gnss: GnssStream, origin: Floats) -> tuple[NDArray[np.int64], Floats]:
+def _places(gnss: GnssStream, origin: Floats) -> tuple[Longs, Floats]:
     """Stamps (F,), ns, and positions (F, 2), m, of the valid fixes."""
     return gnss.stamps_ns[gnss.is_place], to_local(gnss.lat_lon_alt[gnss.is_place], origin)[:, :2]
 

@@ -8,12 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import se2
+from lslam.types.arrays import Floats
 from lslam.types.building import KeyframeMatch
-
-Floats = NDArray[np.float64]
 
 # m, correlation length of odometry's drift.
 MEMORY = 100.0

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.graph.chi_square import quantile
@@ -21,8 +20,7 @@ from lslam.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_r
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import EstimatedDrift, PoseGraph
 from lslam.stopping import checking
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats, Longs
 
 # Degrees of freedom of the residuals (Student's t), against walls matched wrongly.
 FREEDOM = 3.0
@@ -49,8 +47,8 @@ class WallSightings:
     share : 0..1, weight of a sighting, since errors of neighbouring keyframes are correlated
     """
 
-    keyframes: NDArray[np.int64]
-    walls: NDArray[np.int64]
+    keyframes: Longs
+    walls: Longs
     normals: Floats
     places: Floats
     offsets: Floats
@@ -273,7 +271,7 @@ def _likeliest(fit: DriftFit, roots: Sequence[Floats]) -> Sizes:
     return best
 
 
-def without_drift(graph: PoseGraph, rates: NDArray[np.float64]) -> PoseGraph:
+def without_drift(graph: PoseGraph, rates: Floats) -> PoseGraph:
     """The graph with poses and odometry corrected by `rates` of `find_wall_drift`."""
     whole = np.zeros((len(rates), 6))
     whole[:, PLANAR] = rates

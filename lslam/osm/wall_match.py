@@ -18,10 +18,9 @@ from lslam.config.backend import OsmConfig
 from lslam.geometry import se2
 from lslam.kernels import wall_matching
 from lslam.osm.walls import OsmMap, find_walls
+from lslam.types.arrays import Floats, Longs
 from lslam.types.building import BuildingMatch, KeyframeMatch
 from lslam.types.constraint import Verdict
-
-Floats = NDArray[np.float64]
 
 WINDOW = 3.0  # sigmas of the prior that are searched
 REACH = 20.0  # m; a virtual edge lies at most so far beyond the ends of its walls
@@ -69,7 +68,7 @@ class WallMatch:
     coverage: float
     distance: float
     rms: float
-    pairs: NDArray[np.int64]
+    pairs: Longs
     kind: Literal["edges", "lines"]
     is_ambiguous: bool
 
@@ -147,7 +146,7 @@ def _rows(segments: NDArray[Any]) -> Floats:
     return np.ascontiguousarray(np.asarray(segments, np.float64).reshape(-1, 4))
 
 
-def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floats, NDArray[np.int64]]:
+def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floats, Longs]:
     """The target walls within reach of the source, and their numbers."""
     reach = min(float(np.abs(seen).max(initial=0.0)) * np.sqrt(2), LONGEST * 2) + slack + 5.0
     a, b = known[:, :2] - at[:2], known[:, 2:] - at[:2]
@@ -275,7 +274,7 @@ def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> Keyfr
     return matched(view, found, numbers)
 
 
-def matched(view: KeyframeMatch, found: WallMatch, numbers: NDArray[np.int64]) -> KeyframeMatch:
+def matched(view: KeyframeMatch, found: WallMatch, numbers: Longs) -> KeyframeMatch:
     """`view` with the match `found`; numbers : (T,) of the map's walls that it was matched with."""
     pairs = np.column_stack([found.pairs[:, 0], numbers[found.pairs[:, 1]]])
     return replace(

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import OsmConfig
 from lslam.kernels import ground, segments
+from lslam.types.arrays import Floats, Longs
 from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
-
-Floats = NDArray[np.float64]
 
 CELL = 2.0  # m; of the grid in which the ground is found
 SLOPE = 0.3  # m per m; steepest street
@@ -42,7 +41,7 @@ class Walls:
     """
 
     segments: Floats
-    counts: NDArray[np.int64]
+    counts: Longs
     rms: Floats
 
     def __len__(self) -> int:
@@ -83,7 +82,7 @@ def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDA
     return Walls(_directed(found[:, :4].reshape(-1, 2, 2), seen_from), found[:, 4].astype(np.int64), found[:, 5])
 
 
-def walls_of(buildings: Iterable[Building]) -> tuple[Floats, NDArray[np.int64]]:
+def walls_of(buildings: Iterable[Building]) -> tuple[Floats, Longs]:
     """Walls (T, 2, 2), m, of the footprints of `buildings`, the outside to the right, and the number (T,) of each one's building.
 
     Nodes on straight walls are left out; canopies have no walls.
@@ -101,7 +100,7 @@ def walls_of(buildings: Iterable[Building]) -> tuple[Floats, NDArray[np.int64]]:
     return np.asarray(found, np.float64), np.array(owners, np.int64)
 
 
-def _high(cloud: NDArray[np.float32], height: float) -> NDArray[np.int64]:
+def _high(cloud: NDArray[np.float32], height: float) -> Longs:
     """Indices of the points more than `height` m above the ground."""
     half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / CELL)) + 1
     lowest = ground.lowest(cloud, np.eye(3), CELL, half)
@@ -147,7 +146,7 @@ class OsmMap:
         self._low = np.array([c.min(0) for c in corners]).reshape(-1, 2)
         self._high = np.array([c.max(0) for c in corners]).reshape(-1, 2)
 
-    def near(self, place: Floats, reach: float) -> NDArray[np.int64]:
+    def near(self, place: Floats, reach: float) -> Longs:
         """Numbers of the buildings whose box comes within `reach` m of `place` (2,)."""
         return np.flatnonzero(self._away(place) <= reach)
 
@@ -155,7 +154,7 @@ class OsmMap:
         """From `place` (2,) to the box of the nearest building, m; inf without one."""
         return float(self._away(place).min(initial=np.inf))
 
-    def walls_near(self, place: Floats, reach: float) -> NDArray[np.int64]:
+    def walls_near(self, place: Floats, reach: float) -> Longs:
         """Numbers of the walls of the buildings within `reach`, m, of `place` (2,)."""
         return np.flatnonzero(np.isin(self.owners, self.near(place, reach)))
 

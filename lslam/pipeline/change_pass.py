@@ -8,7 +8,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.geojson import write_areas
@@ -26,12 +25,12 @@ from lslam.pipeline.rebuild import EarlierRun, results_of
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.preprocessing.ground import world_up_of
 from lslam.stopping import asking
+from lslam.types.arrays import Floats
 from lslam.types.gnss import Georeference
 from lslam.types.sequence import Sequence
 from lslam.version import __version__
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 
 CLOUD, AREAS = "changes.ply", "changes.geojson"
 INTERRUPTED = "interrupted while the drives were compared: nothing is written"

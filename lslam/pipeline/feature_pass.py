@@ -18,6 +18,7 @@ from lslam.odometry.base import FeatureSource
 from lslam.pipeline.map_pass import MapCheckpoints, motion_within
 from lslam.preprocessing.features import Features
 from lslam.stopping import asking
+from lslam.types.arrays import Floats
 from lslam.types.run_record import FeatureView
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
@@ -36,7 +37,7 @@ class FeatureCloud:
     points : (M, 3) float64, m; kinds : (M,) uint8, EDGE 1 or PLANE 0
     """
 
-    points: NDArray[np.float64]
+    points: Floats
     kinds: NDArray[np.uint8]
 
     def __len__(self) -> int:
@@ -52,7 +53,7 @@ class FeatureMaker:
             for name in ("edges", "planes")
         }
 
-    def add(self, features: Features, T_world_lidar: NDArray[np.float64]) -> None:
+    def add(self, features: Features, T_world_lidar: Floats) -> None:
         """Those of one more scan, and its pose (4, 4)."""
         self._parts["edges"].add(features.less_edges.points, T_world_lidar)
         self._parts["planes"].add(features.less_planes.points, T_world_lidar)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InterruptedRunError, RunFailedError
@@ -32,6 +31,7 @@ from lslam.pipeline.prior_map_files import read_prior_map
 from lslam.pipeline.watch import Watch
 from lslam.preprocessing.deskew import deskew
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.types.arrays import Floats
 from lslam.types.constraint import MapFix
 from lslam.types.run_record import RunRecord
 from lslam.types.scan import Scan
@@ -40,7 +40,6 @@ from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Keyframe
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 # Sentences of reasons in a message, at most.
 MOST_SAID = 3
 # m that the antenna may be away from the LiDAR.

@@ -6,14 +6,12 @@ import logging
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.integrity.alerts import LARGE, Alert, alerts, stamp_faults
 from lslam.pipeline.manifest import Manifest
+from lslam.types.arrays import Floats, Longs
 from lslam.types.scan_result import MotionCheck, ScanResult, motion_apart
-
-Floats = NDArray[np.float64]
 
 log = logging.getLogger("lslam")
 
@@ -63,7 +61,7 @@ def _report_stamps(results: list[ScanResult]) -> None:
         )  # fmt: skip
 
 
-def _positions(results: list[ScanResult]) -> tuple[Floats, NDArray[np.int64]]:
+def _positions(results: list[ScanResult]) -> tuple[Floats, Longs]:
     positions = np.stack([r.at_stamp.T_world_lidar[:3, 3] for r in results])
     return positions, np.array([r.stamp_ns for r in results])
 

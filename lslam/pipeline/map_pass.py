@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.config.outputs import MapConfig
@@ -27,6 +26,7 @@ from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.preprocessing.ground import Z, world_up_of
 from lslam.stopping import asking
+from lslam.types.arrays import Floats, Longs
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory, thinned
 from lslam.types.motion_prior import MotionPrior
 from lslam.types.scan import Scan
@@ -117,7 +117,7 @@ class MapMaker:
     """
 
     def __init__(
-        self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: NDArray[np.float64] = Z
+        self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: Floats = Z
     ) -> None:  # fmt: skip
         self._section = section
         self._merger = MapMerger(
@@ -198,7 +198,7 @@ def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
     return scan.select(np.flatnonzero(~inside))
 
 
-def motion_within(scan: Scan, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> MotionPrior:
+def motion_within(scan: Scan, stamps_ns: Longs, poses: Floats) -> MotionPrior:
     """How the sensor moved during a sweep, from the final poses (N, 4, 4) of all scans; one pose when they cannot say."""
     times = knots_over(scan.span)
     if len(times) < 2 or len(stamps_ns) < 2:
@@ -231,7 +231,7 @@ class MapCheckpoints:
         """Where voxels are kept, in folders of their own."""
         return self._checkpoints.folder
 
-    def begin(self, make: Callable[[], M], poses: NDArray[np.float64]) -> tuple[M, int]:
+    def begin(self, make: Callable[[], M], poses: Floats) -> tuple[M, int]:
         """A maker that is where an earlier pass over `poses` (N, 4, 4) left off, and after how many scans that was."""
         self._poses = hashlib.sha256(np.ascontiguousarray(poses).tobytes()).hexdigest()
         latest, maker = self._checkpoints.latest(), make()

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.point_files import read_cloud, write_cloud
@@ -19,6 +18,7 @@ from lslam.pipeline.map_files import LOCAL, MapNote, georeference_note, read_jso
 from lslam.pipeline.map_pass import INTERRUPTED, build_map
 from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
 from lslam.pipeline.run_folder import SPOOL
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.types.gnss import Georeference, OutputCrs
 from lslam.types.sequence import Sequence
@@ -92,7 +92,7 @@ def _publish(stage: Path, folder: Path, names: set[str]) -> None:
 
 def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple[int, int], ArrayCloud]]:
     """The points of each tile, tiles in order."""
-    waiting: dict[tuple[int, int], list[NDArray[np.float64]]] = {}
+    waiting: dict[tuple[int, int], list[Floats]] = {}
     held, keys = 0, set[tuple[int, int]]()
     try:
         for block in cloud.blocks():
@@ -116,7 +116,7 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
         raise OutputError(f"the tiles in {spool.parent} cannot be written: {cause(error)}") from None
 
 
-def _spill(waiting: dict[tuple[int, int], list[NDArray[np.float64]]], spool: Path) -> set[tuple[int, int]]:
+def _spill(waiting: dict[tuple[int, int], list[Floats]], spool: Path) -> set[tuple[int, int]]:
     """Append what waits to the files of its tiles."""
     for key, parts in waiting.items():
         with ExitStack() as stack:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.outcome import judged_by
 from lslam.config import Config
@@ -26,12 +25,12 @@ from lslam.loops.find_loops import warm_up
 from lslam.pipeline.rebuild import EarlierRun, read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES, MANIFEST
 from lslam.stopping import asking
+from lslam.types.arrays import Floats
 from lslam.types.constraint import LoopCandidate
 from lslam.types.scan_result import ScanResult
 from lslam.untrusted import parse_json
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 Stop = Callable[[], bool]
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InputError, InterruptedRunError, LslamError, OutputError
@@ -31,6 +30,7 @@ from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
 from lslam.pipeline.run_tables import write_loops
 from lslam.pipeline.watch import Watch
 from lslam.reports.merge_html import SessionView, write_page
+from lslam.types.arrays import Floats
 from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence as Recording
@@ -38,7 +38,6 @@ from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 SCHEMA = 1
 COLUMNS = "session,run,scans,keyframes,first_keyframe,start_votes,start_tried,loops_between,ate_before_m,ate_after_m"
 
@@ -205,7 +204,7 @@ def _map(
     config: Config,
     watch: Watch,
     spool: Path,
-    up: NDArray[np.float64],
+    up: Floats,
 ) -> BuiltMap:
     """The scans of all sessions in one map; up : (3,) unit vector in their common world."""
     watch.on_start(

@@ -7,7 +7,6 @@ from contextlib import suppress
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.errors import InputError
@@ -46,6 +45,7 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import helped
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.pipeline.segments import checks_within, join_segments
+from lslam.types.arrays import Floats
 from lslam.types.constraint import Turn
 from lslam.types.imu import InertialChain
 from lslam.types.run_record import RunRecord
@@ -132,7 +132,7 @@ def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:
     if not isinstance(job.odometry, Deskewing):
         return None
 
-    def begin(pose: NDArray[np.float64]) -> Tracker:
+    def begin(pose: Floats) -> Tracker:
         motion: MotionModel = ConstantVelocity(pose)
         if inertial.motion is not None and inertial.start is not None:
             motion = copy_of(inertial.motion, inertial.start, config)

@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.odometry import RegistrationConfig
 from lslam.errors import ConfigError, InputError, UsageError
@@ -19,10 +18,10 @@ from lslam.pipeline.merge_runs import read_session
 from lslam.pipeline.rebuild import map_of
 from lslam.pipeline.run_folder import require_run
 from lslam.preprocessing.ground import Z
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 # m; coordinates beyond are those of a projection, which a trajectory in float32 plots and maps would lose centimetres of.
 LARGE, KILOMETRE = 1e5, 1000.0
 

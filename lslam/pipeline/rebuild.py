@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config, load_config
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
@@ -50,6 +49,7 @@ from lslam.remote import as_path
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.reports.recording import ViewedRun
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference, OutputCrs
 from lslam.types.run_record import Crispness, RunRecord
@@ -297,7 +297,7 @@ def results_of(run: EarlierRun) -> list[ScanResult]:
     ]
 
 
-def covariances_of(run: EarlierRun) -> NDArray[np.float64] | None:
+def covariances_of(run: EarlierRun) -> Floats | None:
     """(N, 6, 6) of the poses, as `Trajectory` has them, NaN all over where one is not known; None where none are kept.
 
     Raises InputError when the file is damaged.

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.evaluation.timing import AFTER, SAVED
 from lslam.formats.atomic import write_text
+from lslam.types.arrays import Floats
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import LoopCandidate
 from lslam.types.imu import IMU_STATES
@@ -57,7 +57,7 @@ def _number(value: float) -> str:
     return f"{value:.4f}" if np.isfinite(value) else ""
 
 
-def write_osm_matches(path: Path, matches: OsmMatches, scans: Sequence[int], poses: NDArray[np.float64]) -> None:
+def write_osm_matches(path: Path, matches: OsmMatches, scans: Sequence[int], poses: Floats) -> None:
     """One row per keyframe, `building` empty, then one per building seen from one, with its OpenStreetMap number.
 
     scans : of the keyframes, as the recording numbers them; poses : (K, 3) their final planar poses in the map frame.
@@ -71,7 +71,7 @@ def write_osm_matches(path: Path, matches: OsmMatches, scans: Sequence[int], pos
 
 
 def _match_row(
-    match: KeyframeMatch | BuildingMatch, scans: Sequence[int], building: str, pose: NDArray[np.float64]
+    match: KeyframeMatch | BuildingMatch, scans: Sequence[int], building: str, pose: Floats
 ) -> tuple[Any, ...]:
     place = (pose[0], pose[1], np.degrees(pose[2])) if match.rank else (np.nan, np.nan, np.nan)
     return (
@@ -87,7 +87,7 @@ def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) ->
 
 
 def timing_text(
-    indices: list[int], stamps_ns: list[int], names: list[str], seconds: NDArray[np.float64],
+    indices: list[int], stamps_ns: list[int], names: list[str], seconds: Floats,
     back_end: Mapping[int, Mapping[str, float]] | None = None, saved: Mapping[int, float] | None = None,
 ) -> str:  # fmt: skip
     """The file of scans by number and stamp, with seconds (N, S) of the stages `names`.

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config import Config
 from lslam.geometry import noise, se3
@@ -18,12 +17,12 @@ from lslam.localization.sessions import Chain, Session, Vicinity, tie
 from lslam.localization.start import is_elsewhere
 from lslam.loops.detector import LEAST_REACH
 from lslam.pipeline.manifest import Manifest
+from lslam.types.arrays import Floats
 from lslam.types.scan_result import MotionCheck, ScanResult
 from lslam.types.trajectory import Segment
 
 log = logging.getLogger("lslam")
 
-Floats = NDArray[np.float64]
 MAX_SENTENCES = 6
 
 

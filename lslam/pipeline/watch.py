@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.evaluation.evaluate import Evaluation
 from lslam.formats.point_files import read_cloud
@@ -16,6 +15,7 @@ from lslam.reports.figures import ON_THE_MAP, PlottedRun, draw_figure
 from lslam.reports.picture import WIDTH, as_html, drawn
 from lslam.reports.plots import first_available
 from lslam.reports.text import summary
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord
 from lslam.types.trajectory import Trajectory
@@ -42,7 +42,7 @@ class RunOutcome:
         return in_own_world(path, read_cloud(path))[0]
 
     @property
-    def errors(self) -> NDArray[np.float64] | None:
+    def errors(self) -> Floats | None:
         """(N,) m, position errors of the matched poses, aligned as the report draws them; None without ground truth."""
         absolute = first_available(self.evaluation)
         return None if absolute is None else np.linalg.norm(absolute.errors, axis=1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import se3
 from lslam.printable import counted, metres
@@ -15,13 +14,13 @@ from lslam.reports.map_view import PIXELS, Crop, crop_images
 from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Table
 from lslam.types.run_record import LoopView, RunRecord
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
-Floats = NDArray[np.float64]
 # How fixes were used.
 _WAYS = {"graph": "GNSS in the graph", "fit": "GNSS fitted afterwards"}
 

@@ -8,17 +8,15 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import se2
 from lslam.printable import counted
 from lslam.reports.plots import Figure
 from lslam.reports.svg import MOST_POINTS, Track, plane_chart
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.types.comparison import Table
 from lslam.types.run_record import RunRecord
-
-Floats = NDArray[np.float64]
 
 MOST_WALLS = 2500  # drawn; the page stays small
 MOST_ROWS = 60
@@ -43,7 +41,7 @@ def building_pages(record: RunRecord) -> BuildingPages | None:
     return BuildingPages(building_figures(record.buildings, record.osm, poses), tables)
 
 
-def building_figures(found: CorrectedMap, matches: OsmMatches, poses: NDArray[np.float64]) -> list[Figure]:
+def building_figures(found: CorrectedMap, matches: OsmMatches, poses: Floats) -> list[Figure]:
     """Plans: buildings before and after with the walls seen, and where the map held the trajectory.
 
     poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame

@@ -17,11 +17,12 @@ from lslam.formats.point_files import read_cloud
 from lslam.reports import svg
 from lslam.reports.compare_table import recipes, tables
 from lslam.reports.html import flatten
-from lslam.reports.map_view import Crop, Floats, choose_crops, crop_images
+from lslam.reports.map_view import Crop, choose_crops, crop_images
 from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.shell import render
 from lslam.reports.svg import Track, plane_chart
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 
 WIDEST = 125  # characters of a table that the page shows without scrolling

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.evaluation.timing import StageTime, summarise
+from lslam.types.arrays import Floats
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
 
@@ -108,7 +109,7 @@ def run_facts(record: RunRecord) -> RunFacts:
     )
 
 
-def stage_matrix(results: list[ScanResult]) -> tuple[list[str], NDArray[np.float64]]:
+def stage_matrix(results: list[ScanResult]) -> tuple[list[str], Floats]:
     """Names of all stages in order of appearance, and seconds (N, S); 0 where a scan has no such stage."""
     names: dict[str, int] = {}
     for result in results:

@@ -12,6 +12,7 @@ from lslam.errors import InputError, UsageError, nearest
 from lslam.geometry import geodesy, se3, so3
 from lslam.reports.picture import COLOURS, label, shown_figure
 from lslam.reports.plots import first_available
+from lslam.types.arrays import Floats
 from lslam.types.building import CorrectedMap
 from lslam.types.cloud import ArrayCloud
 from lslam.types.gnss import Georeference
@@ -22,7 +23,6 @@ from lslam.types.trajectory import Trajectory
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
-Floats = NDArray[np.float64]
 
 # mm: a column and the text of two in IEEE's journals.
 WIDTHS = {"column": 88.9, "page": 181.9}

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.formats.atomic import atomic_write
@@ -23,6 +22,7 @@ from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render, template
 from lslam.reports.svg import Track
 from lslam.reports.text import imu_rows, localization_rows
+from lslam.types.arrays import Floats, Longs
 from lslam.types.comparison import Table
 from lslam.types.imu import XYZ
 from lslam.types.run_record import Crispness, RunRecord
@@ -30,8 +30,6 @@ from lslam.types.run_record import Crispness, RunRecord
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
-
-Floats = NDArray[np.float64]
 
 TIME = "s since the first scan"
 BAND_SIGMAS = 3.0
@@ -104,7 +102,7 @@ def _readings(record: RunRecord) -> list[Figure]:
     return figures
 
 
-def _seconds(stamps_ns: NDArray[np.int64], record: RunRecord) -> Floats:
+def _seconds(stamps_ns: Longs, record: RunRecord) -> Floats:
     return np.asarray((stamps_ns - record.results[0].stamp_ns) * 1e-9)
 
 

@@ -13,9 +13,8 @@ from lslam.reports import svg
 from lslam.reports.plots import Figure
 from lslam.reports.png import coloured_png, data_uri, density_png, halved, usual_range
 from lslam.reports.svg import MOST_POINTS, By, Track, plane_chart
+from lslam.types.arrays import Floats, Longs
 from lslam.types.run_record import FeatureView
-
-Floats = NDArray[np.float64]
 
 SIZE_M = 20.0
 MOST_CROPS = 3
@@ -82,7 +81,7 @@ def crop_images(clouds: Sequence[NDArray[Any] | None], crop: Crop) -> tuple[list
     return images, max([1.0, *tops])
 
 
-def _structure(points: NDArray[Any]) -> tuple[NDArray[np.int64], Floats]:
+def _structure(points: NDArray[Any]) -> tuple[Longs, Floats]:
     """Columns with relief on a grid (x, y), 0 or 1, and the grid's lower corner."""
     xyz = np.asarray(points, np.float64)
     xyz = xyz[np.isfinite(xyz).all(1)]
@@ -100,7 +99,7 @@ def _structure(points: NDArray[Any]) -> tuple[NDArray[np.int64], Floats]:
     return (top - bottom > _RELIEF).astype(np.int64).reshape(shape), low
 
 
-def _window_sums(counts: NDArray[np.int64], window: int, step: int) -> NDArray[np.int64]:
+def _window_sums(counts: Longs, window: int, step: int) -> Longs:
     """Sums over squares of `window` cells whose corners are `step` cells apart."""
     padded = np.pad(counts, ((0, max(window - counts.shape[0], 0)), (0, max(window - counts.shape[1], 0))))
     table = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int64)

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lslam.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.printable import metres
@@ -20,10 +17,10 @@ from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render
 from lslam.reports.svg import Track, plane_chart
+from lslam.types.arrays import Floats, Longs
 from lslam.types.cloud import ArrayCloud
 from lslam.types.comparison import Table
 
-Floats = NDArray[np.float64]
 MOST_POSES = 5000  # of a session that the script draws
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
 
@@ -36,7 +33,7 @@ class SessionView:
     name: str
     before: Floats
     after: Floats
-    scans: NDArray[np.int64]
+    scans: Longs
 
 
 def write_page(

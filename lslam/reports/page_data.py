@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.geometry import se3, so3
 from lslam.reports.plots import first_available
 from lslam.reports.png import VIRIDIS, usual_range
+from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud
 from lslam.types.run_record import RunRecord
 from lslam.types.scan_result import ScanResult
@@ -19,7 +20,6 @@ from lslam.types.trajectory import Trajectory
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation
 
-Floats = NDArray[np.float64]
 
 STATUSES = ("registered", "standing", "bridged", "skipped", "not known")
 FLAGS = {"degenerate": 8, "lost": 16}  # beside the status in one byte

@@ -16,11 +16,11 @@ from lslam.formats.atomic import atomic_write
 from lslam.printable import printable
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from lslam.evaluation.results import AbsoluteError, Evaluation
     from lslam.formats.osm_buildings import BuildingExtract
+    from lslam.types.arrays import Floats
 
 
 FORMATS = ("png", "svg", "pdf")
@@ -220,7 +220,7 @@ def write_buildings_png(path: Path, extract: BuildingExtract, along: NDArray[Any
         figure.savefig(stream, format="png", dpi=110, metadata={"Software": None})
 
 
-def _outline(rings: tuple[NDArray[np.float64], ...]) -> Any:
+def _outline(rings: tuple[Floats, ...]) -> Any:
     import numpy as np
     from matplotlib.path import Path as Outline
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lslam.reports import svg
 from lslam.reports.facts import RunFacts, stage_matrix
 from lslam.reports.svg import By, Track, plane_chart
+from lslam.types.arrays import Floats
 from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
@@ -31,7 +32,6 @@ ALIGNED = {
     "origin": "moved so that the first poses coincide (origin)",
     "none": "not aligned",
 }
-Floats = NDArray[np.float64]
 SHADES = 8  # of the style sheet that are all different
 PLAN_HEIGHT = 340  # of one beside a chart
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
@@ -233,11 +233,11 @@ def _lines(title: str, lines: list[svg.Line], x_label: str, y_label: str, captio
     return Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)
 
 
-def _three(names: tuple[str, str, str], x: NDArray[Any], values: NDArray[np.float64]) -> list[svg.Line]:
+def _three(names: tuple[str, str, str], x: NDArray[Any], values: Floats) -> list[svg.Line]:
     return [svg.Line(name, x, values[:, i], f"s{i + 1}") for i, name in enumerate(names)]
 
 
-def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> NDArray[np.float64]:
+def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> Floats:
     """(K, 2) where bridged and skipped scans are drawn: moved like the estimate."""
     places = np.array([r.T_world_lidar[:3, 3] for r in record.results if r.status != "ok"]).reshape(-1, 3)
     if absolute is not None:
@@ -245,7 +245,7 @@ def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> NDAr
     return np.asarray(places[:, :2])
 
 
-def _covariances(record: RunRecord) -> NDArray[np.float64] | None:
+def _covariances(record: RunRecord) -> Floats | None:
     """The trajectory's covariances, else those of the scans; NaN where a scan has none."""
     if record.trajectory.covariances is not None:
         return record.trajectory.covariances

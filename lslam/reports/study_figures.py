@@ -13,7 +13,8 @@ from lslam.config.config import unit_of, with_unit
 from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
-from lslam.types.study import CurveResult, Floats, Law, StudyResult, StudyRow
+from lslam.types.arrays import Floats
+from lslam.types.study import CurveResult, Law, StudyResult, StudyRow
 
 POINTS = ("o", ".", "x")  # markers; lines without say nothing
 LOST = "x"

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 # What of a scan an abscissa is: its number, distance along ground truth or travelled, s since the first; or both axes of a
 # plane its place in the run's own world or as aligned to ground truth. Empty: nothing of a scan.
@@ -340,7 +340,7 @@ def _fitted(x_span: tuple[float, float], y_span: tuple[float, float], width: int
     return Frame((low[0], high[0]), (low[1], high[1]), width, round(plot_height) + margins_y)
 
 
-def _mark_ends(frame: Frame, xy: NDArray[np.float64]) -> None:
+def _mark_ends(frame: Frame, xy: Floats) -> None:
     """A circle where the path starts and a square where it ends; the circle lies on top of a closed loop's square."""
     finite = xy[np.isfinite(xy).all(1)]
     if not len(finite):

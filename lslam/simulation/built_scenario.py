@@ -38,8 +38,7 @@ from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
 SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.ROOF)

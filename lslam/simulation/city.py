@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from lslam.config.section import Section
@@ -17,8 +16,7 @@ from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 KERB = 0.12  # m
 MARGIN = 60.0  # m of ground beyond the street on every side

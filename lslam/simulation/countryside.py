@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation import furniture
@@ -12,8 +11,7 @@ from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 RAIL = (0.45, 0.75)  # m, the lower and the upper edge of a guard rail
 VERGE = -0.06  # m, of grass beside a road without kerbs

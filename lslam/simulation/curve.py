@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import portable
+from lslam.types.arrays import Floats
 
 DEGREE = 5
 _REACH = 60  # points from one end after which nothing of it is left: an influence falls by 0.43 from knot to knot
@@ -40,7 +41,7 @@ def interpolating_spline(x: NDArray[Any], y: NDArray[Any], closed: bool = False)
     return BSpline(knots, coefficients.reshape(y.shape), DEGREE)
 
 
-def smoothed(values: NDArray[Any], sigma: float, mode: Literal["reflect", "wrap"] = "reflect") -> NDArray[np.float64]:
+def smoothed(values: NDArray[Any], sigma: float, mode: Literal["reflect", "wrap"] = "reflect") -> Floats:
     """`values` (N, ...) convolved along their first axis by a Gaussian of `sigma` steps; `mode` as scipy.ndimage's."""
     from scipy.ndimage import correlate1d
 
@@ -48,8 +49,6 @@ def smoothed(values: NDArray[Any], sigma: float, mode: Literal["reflect", "wrap"
     weights = portable.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return np.asarray(correlate1d(np.asarray(values, np.float64), weights / weights.sum(), axis=0, mode=mode))
 
-
-Floats = NDArray[np.float64]
 
 SPACING = 0.5  # m between the spline's knots
 

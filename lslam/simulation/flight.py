@@ -13,8 +13,7 @@ from lslam.geometry import portable, se3, so3
 from lslam.simulation.curve import RouteCurve, interpolating_spline, smoothed
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.terrain import Terrain, flat
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 GRAVITY = 9.81  # m/s2, for the bank of a turn
 

@@ -6,10 +6,10 @@ Local frames: z = 0 is the ground, the object's middle at x = y = 0, its long si
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, tube
+from lslam.types.arrays import Floats
 
 BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
 
@@ -45,7 +45,7 @@ def _leafy(rng: np.random.Generator) -> SceneMesh:
     return builder.build()
 
 
-def _add_crown(builder: MeshBuilder, rng: np.random.Generator, size: NDArray[np.float64], height: float) -> None:
+def _add_crown(builder: MeshBuilder, rng: np.random.Generator, size: Floats, height: float) -> None:
     """The bumpy envelope of leaves, an ellipsoid with half axes `size` (3,), m, wound outwards."""
     rows, columns = 8, 12
     polar, round_ = np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, columns + 1)
@@ -144,7 +144,7 @@ def parked_car(rng: np.random.Generator) -> SceneMesh:
     return builder.build()
 
 
-def _extrude(builder: MeshBuilder, outline: NDArray[np.float64], half_width: float, surface: int) -> None:
+def _extrude(builder: MeshBuilder, outline: Floats, half_width: float, surface: int) -> None:
     """A convex side view (K, 2) of x and z drawn out over y, closed on all sides."""
     count = len(outline)
     sides = [np.column_stack([outline[:, 0], np.full(count, y), outline[:, 1]]) for y in (-half_width, half_width)]

@@ -8,12 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
+from lslam.types.arrays import Floats
 
-Floats = NDArray[np.float64]
 Quad = list[tuple[float, float, float]]
 
 FOUNDATION = -1.5  # m, walls reach below uneven ground

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from lslam.config.section import Section
 from lslam.errors import UsageError, nearest
 from lslam.geometry import portable, se3, so3
 from lslam.simulation.kinematics import Kinematics, Motion
+from lslam.types.arrays import Floats
 from lslam.types.imu import ImuStream
-
-Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665  # m/s2, downwards along the city's -z
 
@@ -140,7 +138,7 @@ def imu_named(name: str) -> ImuModel:
 
 
 def simulate_imu(
-    motion: Motion, model: ImuModel, T_lidar_imu: NDArray[np.float64], end: float, rng: np.random.Generator
+    motion: Motion, model: ImuModel, T_lidar_imu: Floats, end: float, rng: np.random.Generator
 ) -> SimulatedImu:
     """Readings of `model` at `T_lidar_imu` (4, 4), from 0 to `end` s of `motion`.
 

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation.city import City
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.simulation.terrain import Terrain
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 SIDE = 12.0  # m from the middle line to the walls
 END = 1.0  # m that the hall is longer than its line at either end

@@ -14,6 +14,7 @@ from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
 from lslam.simulation.scene_mesh import Surface
+from lslam.types.arrays import Bools, Floats
 from lslam.types.scan import Scan
 
 # Share of the light of a 905 nm laser that comes back from each surface met squarely.
@@ -73,10 +74,10 @@ class MovingMesh:
     """
 
     scene: RayScene
-    poses: Callable[[NDArray[Any]], NDArray[np.float64]]
+    poses: Callable[[NDArray[Any]], Floats]
     radius: float
     speed: float
-    centre: NDArray[np.float64]
+    centre: Floats
 
 
 def trace(
@@ -178,9 +179,7 @@ def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hit
             _meet_body(body, near, rays[near], hits, stamp)
 
 
-def _by_column(
-    centres: NDArray[np.float64], swept: NDArray[np.float64], rays: Rays, rings: int
-) -> Iterator[NDArray[np.intp]]:
+def _by_column(centres: Floats, swept: Floats, rays: Rays, rings: int) -> Iterator[NDArray[np.intp]]:
     """For each body, within `swept` (B,), m, of its centre (B, 3), the rays of a scan that may meet it."""
     # Bearings of whole columns first: a body is met by few of them, and then by few of their rings.
     bearing = portable.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
@@ -203,9 +202,7 @@ def _by_column(
         yield columns[at] * rings + ring
 
 
-def _by_ray(
-    centres: NDArray[np.float64], swept: NDArray[np.float64], rays: Rays, hits: Hits
-) -> Iterator[NDArray[np.intp]]:
+def _by_ray(centres: Floats, swept: Floats, rays: Rays, hits: Hits) -> Iterator[NDArray[np.intp]]:
     """As `_by_column`, for rays that start anywhere."""
     # Relative to their middle single precision is good for centimetres, which `reach` allows.
     middle = rays.origins.mean(axis=0, dtype=np.float64)
@@ -259,7 +256,7 @@ def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi)), np.float32)
 
 
-def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: NDArray[np.bool_], returns: Returns | None) -> None:
+def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: Bools, returns: Returns | None) -> None:
     """Some rays on panes are mirrored, and what they meet seems to lie behind the pane; of the others the `lucky` pass it.
 
     They go on to what stands or moves there; a second pane stops them.
@@ -311,9 +308,9 @@ def _unit(azimuth: NDArray[np.float32], elevation: NDArray[np.float32]) -> NDArr
 def _into_city(
     model: LidarModel,
     directions: NDArray[np.float32],
-    poses: NDArray[np.float64],
+    poses: Floats,
     period: float,
-    fired: NDArray[np.float64],
+    fired: Floats,
 ) -> Rays:
     """Rays of the LiDAR's frame (N, 3), fired from one pose (4, 4) or from a pose (columns, 4, 4) for every column."""
     by_column = directions.reshape(model.columns, model.rings, 3)
@@ -331,14 +328,14 @@ def _into_city(
     return Rays(spread.reshape(-1, 3), towards.reshape(-1, 3), fired)
 
 
-def _on(steps: NDArray[np.float64]) -> NDArray[np.float32]:
+def _on(steps: Floats) -> NDArray[np.float32]:
     """Steps from each pose to the next, the last one once more."""
     return np.concatenate([steps, steps[-1:]]).astype(np.float32)
 
 
 def _detect(
     model: LidarModel, hits: Hits, rng: np.random.Generator, returns: Returns | None, wrong: Errors | None
-) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
+) -> tuple[Bools, NDArray[np.float32], NDArray[np.float32]]:
     """Which rays return, their measured ranges and intensities.
 
     The echo's peak is that of a diffuse surface: reflectivity times the cosine of incidence over the range squared. The

@@ -13,8 +13,7 @@ from pydantic import Field
 from lslam.config.section import Section
 from lslam.errors import UsageError, nearest
 from lslam.geometry import portable, se3, so3
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from lslam.simulation.lidar import MovingMesh
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, tube
 from lslam.simulation.terrain import Terrain
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 MODELS = 6  # different cars and different people
 BUS = (11.0, 2.5, 3.3)  # m

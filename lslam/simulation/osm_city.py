@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.geometry import portable
@@ -16,9 +15,8 @@ from lslam.simulation.curve import RouteCurve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
-
-Floats = NDArray[np.float64]
 
 CELL = 1.0  # m, of the ground
 MOST_CELLS = 1_500_000

@@ -18,6 +18,7 @@ from lslam.geometry.geodesy import from_local
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_perturb import MapFaults, Perturbation, draw_perturbation, perturb, write_perturbation
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, footprints_of
 
 EXACT, PERTURBED = "map.osm", "map_perturbed.osm"
@@ -105,7 +106,7 @@ def city_buildings(city: City) -> list[Building]:
     ]
 
 
-def _places(ring: NDArray[np.float64], origin: NDArray[Any]) -> list[Place]:
+def _places(ring: Floats, origin: NDArray[Any]) -> list[Place]:
     """Corners (K, 2), m, in degrees as a file has them."""
     fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
     return [(round(lat, DECIMALS), round(lon, DECIMALS)) for lat, lon, _ in fixes.tolist()]

@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.geometry import portable
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, Footprint, footprint_polygon, footprints_of
 from lslam.untrusted import MISFIT, parse_json
-
-Floats = NDArray[np.float64]
 
 SCHEMA = "lslam-osm-perturbation-1"
 

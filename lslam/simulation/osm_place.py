@@ -23,11 +23,11 @@ from lslam.simulation.routes import TIGHTEST, Route, beside, given_route
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.waypoints import WayPoints
+from lslam.types.arrays import Floats, Longs
 from lslam.types.building import Building, footprint_polygon
 
 log = logging.getLogger("lslam")
 
-Floats = NDArray[np.float64]
 
 REACH = 150.0  # m from the path: what stands farther away, no LiDAR here sees
 SIDE_ROADS = 100.0  # m from the path
@@ -202,9 +202,7 @@ def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float3
     return bounds[0], np.asarray(CELL * distance_transform_edt(~inside), np.float32)
 
 
-def _free_shifts(
-    line: Floats, low: Floats, distance: NDArray[np.float32], margin: float
-) -> tuple[Floats, NDArray[np.int64]]:
+def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margin: float) -> tuple[Floats, Longs]:
     """Shifts (M, 2) on a grid that bring all of `line` (N, 2) on free ground, and how many of its points see walls there."""
     size = CELL * np.array(distance.shape)
     x, y = (np.arange(low[k], low[k] + size[k], SHIFT) for k in (0, 1))

@@ -13,9 +13,8 @@ from lslam.formats.osm_buildings import is_underground
 from lslam.formats.osm_data import OsmData
 from lslam.geometry.geodesy import to_local
 from lslam.simulation.curve import RouteCurve, smooth_curve
+from lslam.types.arrays import Floats
 from lslam.types.building import Building, footprint_polygon, is_canopy
-
-Floats = NDArray[np.float64]
 
 _ROADS = ("motorway", "trunk", "primary", "secondary", "tertiary")
 DRIVABLE = (

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lslam.geometry import portable, se3, so3
 from lslam.simulation.curve import RouteCurve, interpolating_spline
 from lslam.simulation.terrain import Terrain
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 
 @dataclass(frozen=True)

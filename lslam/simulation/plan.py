@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lslam.simulation.city import City
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scene_mesh import Surface
+from lslam.types.arrays import Floats, Longs
 
 Image = NDArray[np.uint8]
 
@@ -50,8 +51,8 @@ class ScenePlan:
     """
 
     image: Image
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    low: Floats
+    high: Floats
     pixel: float
     surfaces: tuple[Surface, ...]
     has_path: bool
@@ -62,7 +63,7 @@ class ScenePlan:
         return [(int(metre), int(at)) for metre, at in zip(*lines, strict=True)]
 
 
-def plan_of(scene: RayScene, city: City, line: NDArray[np.float64]) -> ScenePlan:
+def plan_of(scene: RayScene, city: City, line: Floats) -> ScenePlan:
     """The top view of `city` with the path `line` (M, 3), m, in the city frame, or none (0, 3)."""
     low, high = _extent(city, line)
     pixel = max(float((high - low).max()) / LARGEST, FINEST)
@@ -73,14 +74,12 @@ def plan_of(scene: RayScene, city: City, line: NDArray[np.float64]) -> ScenePlan
     return ScenePlan(image, low, high, pixel, surfaces, bool(len(line)))
 
 
-def _extent(city: City, line: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extent(city: City, line: Floats) -> tuple[Floats, Floats]:
     places = np.concatenate([line[:, :2], *city.footprints])
     return np.floor(places.min(axis=0) - BORDER), np.ceil(places.max(axis=0) + BORDER)
 
 
-def _view(
-    scene: RayScene, low: NDArray[np.float64], high: NDArray[np.float64], pixel: float
-) -> tuple[Image, tuple[Surface, ...]]:
+def _view(scene: RayScene, low: Floats, high: Floats, pixel: float) -> tuple[Image, tuple[Surface, ...]]:
     """What rays from far above meet, lit from the north-west; row 0 is the north; with the surfaces that they met."""
     width, height = (int(n) for n in np.ceil((high - low) / pixel))
     image = np.full((height, width, 3), 255, np.uint8)
@@ -101,14 +100,14 @@ def _view(
     return image, tuple(map(Surface, sorted(seen)))
 
 
-def _lines(low: float, count: int, pixel: float, every: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _lines(low: float, count: int, pixel: float, every: int) -> tuple[Longs, Longs]:
     """Metres and pixels of the grid lines along one axis."""
     first = int(np.ceil(low / every)) * every
     metres = np.arange(first, low + count * pixel, every).astype(np.int64)
     return metres, np.clip(np.floor((metres - low) / pixel), 0, count - 1).astype(np.int64)
 
 
-def _draw_grid(image: Image, low: NDArray[np.float64], pixel: float) -> None:
+def _draw_grid(image: Image, low: Floats, pixel: float) -> None:
     height, width, _ = image.shape
     for every, strength in ((FINE, 0.12), (COARSE, 0.45)):
         columns = _lines(float(low[0]), width, pixel, every)[1]
@@ -117,7 +116,7 @@ def _draw_grid(image: Image, low: NDArray[np.float64], pixel: float) -> None:
         image[rows] = (image[rows] * (1 - strength)).astype(np.uint8)
 
 
-def _draw_path(image: Image, line: NDArray[np.float64], low: NDArray[np.float64], pixel: float) -> None:
+def _draw_path(image: Image, line: Floats, low: Floats, pixel: float) -> None:
     height, width, _ = image.shape
     steps = np.maximum(np.ceil(np.linalg.norm(np.diff(line, axis=0), axis=1) / (0.5 * pixel)).astype(int), 1)
     dense = [

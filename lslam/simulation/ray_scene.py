@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation.scene_mesh import SceneMesh
+from lslam.types.arrays import Floats
 
 
 class RayScene:
@@ -40,7 +41,7 @@ class RayScene:
         return distances, faces
 
     @cached_property
-    def _planes(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _planes(self) -> tuple[Floats, Floats]:
         """Normals (F, 3) of any length and offsets (F,) of the planes of the faces."""
         a, b, c = (self.mesh.vertices[self.mesh.faces[:, k]].astype(np.float64) for k in range(3))
         normals = np.cross(b - a, c - a)

@@ -18,6 +18,7 @@ from lslam.config.section import Section
 from lslam.geometry import portable
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.scene_mesh import SceneMesh, Surface
+from lslam.types.arrays import Bools, Floats
 
 Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
 LAYERS = 8  # surfaces of volumes that a beam passes, at most
@@ -41,7 +42,7 @@ class Rays:
 
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
-    fired: NDArray[np.float64]
+    fired: Floats
 
     def __getitem__(self, which: NDArray[np.intp]) -> Rays:
         return Rays(self.origins[which], self.directions[which], self.fired[which])
@@ -113,7 +114,7 @@ def penetrate(
     _leaf(hits, which, at, facing)
 
 
-def _enters(mesh: SceneMesh, face: NDArray[np.int32], directions: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _enters(mesh: SceneMesh, face: NDArray[np.int32], directions: NDArray[np.float32]) -> Bools:
     """Whether rays go into a volume, not out of it, at its faces (N,)."""
     return np.asarray(np.einsum("ij,ij->i", mesh.normals[face], directions) < 0)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import portable
@@ -15,8 +14,7 @@ from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
 from lslam.simulation.terrain import flat
 from lslam.simulation.waypoints import WayPoints
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 SPARE = 60.0  # m of street before the start and after the end of an open line
 TURN = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.config.section import Section
@@ -23,9 +22,9 @@ from lslam.simulation.imu import ImuFaults
 from lslam.simulation.kinematics import Vibration
 from lslam.simulation.lidar_models import LIDARS, LidarMount
 from lslam.simulation.returns import Returns
+from lslam.types.arrays import Floats
 from lslam.untrusted import parse_toml
 
-Floats = NDArray[np.float64]
 Shape = Callable[[np.random.Generator], Floats]
 
 STEP = 1.0  # m between the points of arcs

@@ -26,6 +26,7 @@ from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
 from lslam.simulation.waypoints import WayPoints, read_way_points
+from lslam.types.arrays import Floats, Longs
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
@@ -44,9 +45,9 @@ class Mounted:
     """The motion of what sits at `T_lidar_other` (4, 4) of the LiDAR that `motion` moves."""
 
     motion: Motion
-    T_lidar_other: NDArray[np.float64]
+    T_lidar_other: Floats
 
-    def poses(self, times: NDArray[Any]) -> NDArray[np.float64]:
+    def poses(self, times: NDArray[Any]) -> Floats:
         """(M, 4, 4) T_city_other at `times` (M,), s."""
         return portable.product(self.motion.poses(times), self.T_lidar_other)
 
@@ -74,7 +75,7 @@ class SimulatedDrive(Scans):
         sensors: Sensors | None = None,
         movers: Sequence[Mover] = (),
         scene: RayScene | None = None,
-        origin: NDArray[np.float64] = ORIGIN,
+        origin: Floats = ORIGIN,
         visit: Visit = FIRST_VISIT,
     ) -> None:
         self.scenario, self.city, self.lidar, self.movers = scenario, city, lidar, list(movers)
@@ -87,7 +88,7 @@ class SimulatedDrive(Scans):
         self.path = Path(self.name)
         self.rate_hz = scenario.rate_hz
         self.motion_compensated: bool | None = motion_compensated
-        self.stamps_ns: NDArray[np.int64] = np.round(np.arange(count) * (1e9 / self.rate_hz)).astype(np.int64)
+        self.stamps_ns: Longs = np.round(np.arange(count) * (1e9 / self.rate_hz)).astype(np.int64)
         poses = self.vehicle.poses(self.stamps_ns / 1e9)
         self.T_city_world = poses[0]
         self.ground_truth: Trajectory | None = Trajectory(
@@ -118,7 +119,7 @@ class SimulatedDrive(Scans):
         return (self.scan(index) for index in range(len(self)))
 
     @property
-    def city_poses(self) -> NDArray[np.float64]:
+    def city_poses(self) -> Floats:
         """(N, 4, 4) T_city_lidar at the scans' stamps."""
         return self._motion.poses(self.stamps_ns / 1e9)
 
@@ -250,7 +251,7 @@ def simulate(
     return SimulatedDrive(chosen, place.city, path, model, scans, seed, still, sensors, movers, scene, at, visit)
 
 
-def checked_origin(origin: Iterable[float]) -> NDArray[np.float64]:
+def checked_origin(origin: Iterable[float]) -> Floats:
     """(3,) lat, lon (deg), height (m) of two or three numbers; raises UsageError when they are no place on the Earth."""
     values = [float(value) for value in origin]
     if len(values) not in (2, 3) or not np.isfinite(values).all():
@@ -263,7 +264,7 @@ def checked_origin(origin: Iterable[float]) -> NDArray[np.float64]:
     return np.array([*values, 0.0][:3])
 
 
-def kitti_like_cam0() -> NDArray[np.float64]:
+def kitti_like_cam0() -> Floats:
     """(4, 4) T_cam0_lidar: camera 0 looks ahead (x right, y down, z forward), turned by under a degree, as on KITTI's car."""
     axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     return se3.make(

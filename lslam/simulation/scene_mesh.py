@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import portable
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats, Longs
 
 
 class Surface(IntEnum):
@@ -98,7 +97,7 @@ class MeshBuilder:
         )
 
 
-def box(low: Any, high: Any) -> tuple[Floats, NDArray[np.int64]]:
+def box(low: Any, high: Any) -> tuple[Floats, Longs]:
     """Vertices (8, 3) and faces (12, 3) of the axis-aligned box between two corners."""
     pair = np.array([low, high], np.float64)
     corners = np.array([[pair[i, 0], pair[j, 1], pair[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
@@ -106,9 +105,7 @@ def box(low: Any, high: Any) -> tuple[Floats, NDArray[np.int64]]:
     return corners, np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
 
 
-def tube(
-    radius_low: float, radius_high: float, bottom: float, top: float, sides: int
-) -> tuple[Floats, NDArray[np.int64]]:
+def tube(radius_low: float, radius_high: float, bottom: float, top: float, sides: int) -> tuple[Floats, Longs]:
     """Vertices and faces of an open vertical tube round the z axis, possibly conical."""
     angle = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
@@ -121,7 +118,7 @@ def tube(
     return np.concatenate([low, high]), faces
 
 
-def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
+def grid_faces(rows: int, columns: int) -> Longs:
     """Faces of a (rows x columns) grid of vertices stored row by row: two per cell, cell after cell."""
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.formats.atomic import write_text
@@ -16,10 +15,9 @@ from lslam.geometry import geodesy, portable, se3
 from lslam.printable import toml_text
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
 from lslam.simulation.kinematics import Motion
+from lslam.types.arrays import Floats, Longs
 from lslam.types.gnss import GnssStream
 from lslam.types.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 # lat, lon (deg), height (m) of the city's origin unless a scenario has its own: open ground at Karlsruhe.
 ORIGIN = np.array([49.0, 8.4, 115.0])
@@ -74,8 +72,8 @@ class SimulatedGnss:
 def simulate_gnss(
     motion: Motion,
     model: GnssModel,
-    T_lidar_gnss: NDArray[np.float64],
-    origin: NDArray[np.float64],
+    T_lidar_gnss: Floats,
+    origin: Floats,
     end: float,
     rng: np.random.Generator,
 ) -> SimulatedGnss:
@@ -186,9 +184,7 @@ def write_readings(folder: Path, readings: Readings) -> None:
         write_gnss_csv(folder / GNSS_FILE, readings.gnss.stream)
 
 
-def write_truth(
-    folder: Path, motion: Motion, scan_stamps_ns: NDArray[np.int64], end: float, readings: Readings
-) -> None:
+def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float, readings: Readings) -> None:
     """Write the exact truth into `folder`: nothing that reads the sequence needs it.
 
     The world is the LiDAR at the first scan. `trajectory.tum` holds the LiDAR's poses at the scans' starts,

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.geometry import portable
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from lslam.simulation.city import (
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-
-Floats = NDArray[np.float64]
+from lslam.types.arrays import Floats
 
 SHORTEST = 30.0  # m of a side street
 LONGEST = 110.0

@@ -15,9 +15,8 @@ from lslam.errors import InputError, cause, nearest
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import portable
 from lslam.geometry.geodesy import to_local
+from lslam.types.arrays import Floats
 from lslam.untrusted import MISFIT, parse_json, parse_toml
-
-Floats = NDArray[np.float64]
 
 APART = 3.0  # m between the way-points taken from a trajectory
 LONGEST = 50_000.0  # m between neighbours

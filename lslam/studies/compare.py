@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
 from lslam.errors import InterruptedRunError, LslamError
@@ -29,6 +28,7 @@ from lslam.studies.results import IMU, collect_run, metrics_of
 from lslam.studies.runner import StudyProgress
 from lslam.studies.scenes import Scene, simulate_once
 from lslam.studies.subjects import Subject, scans_needed, with_range
+from lslam.types.arrays import Floats
 from lslam.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
 from lslam.types.sequence import Sequence as Recording
 from lslam.types.trajectory import Trajectory
@@ -111,7 +111,7 @@ def _in_world_of_truth(
     return Drawing(sequence, seed, scores[-1].gt_positions, drawn, f"moved onto the ground truth, {recipe}")
 
 
-def _turn_about_path(error: AbsoluteError, gt_positions: NDArray[np.float64]) -> float:
+def _turn_about_path(error: AbsoluteError, gt_positions: Floats) -> float:
     """What an alignment of positions leaves of the rotation about the path, rad: errors over the path's width."""
     width = np.linalg.svd(gt_positions - gt_positions.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(gt_positions))
     return np.inf if error.translation is None or width == 0 else float(error.translation.rmse / width)

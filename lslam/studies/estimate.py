@@ -10,7 +10,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import RunFailedError
 from lslam.printable import lasting
@@ -24,8 +23,8 @@ from lslam.studies.scenes import drive_of, simulate_once
 from lslam.studies.subjects import used
 from lslam.studies.sweep import write_study_report
 from lslam.studies.variants import Variant
+from lslam.types.arrays import Floats
 
-Floats = NDArray[np.float64]
 # Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
 _SHORT, _LONG = 12, 36
 # Scans of a recording that are simulated for pilots from the first one used, at most.

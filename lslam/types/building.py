@@ -8,12 +8,11 @@ from math import erf, sqrt
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import se2
+from lslam.types.arrays import Floats, Longs
 from lslam.types.constraint import Verdict
 
-Floats = NDArray[np.float64]
 MatchKind = Literal["edges", "lines", "none"]
 # `seen`: scans hold it; `unseen`: no scan says anything, it follows the map; `absent`: scans look through where it should be.
 BuildingStatus = Literal["seen", "unseen", "absent"]
@@ -143,7 +142,7 @@ class KeyframeMatch:
     fitness: float = float("nan")
     coverage: float = float("nan")
     rms: float = float("nan")
-    pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    pairs: Longs = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     verdict: Verdict = Verdict.REJECTED
     reason: str = ""
 
@@ -173,7 +172,7 @@ class BuildingMatch:
     fitness: float
     coverage: float
     rms: float
-    pairs: NDArray[np.int64]
+    pairs: Longs
     verdict: Verdict = Verdict.ACCEPTED
     reason: str = ""
 
@@ -202,7 +201,7 @@ class OsmMatches:
     origin: Floats
     buildings: tuple[Building, ...]
     map_walls: Floats
-    owners: NDArray[np.int64]
+    owners: Longs
     keyframes: tuple[KeyframeMatch, ...]
     local: tuple[BuildingMatch, ...]
     shift: Floats = field(default_factory=lambda: np.zeros(2))

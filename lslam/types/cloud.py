@@ -9,6 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.arrays import Floats
+
 BLOCK = 1 << 18
 
 
@@ -16,7 +18,7 @@ BLOCK = 1 << 18
 class CloudBlock:
     """Some points of a cloud: points (N, 3) float64, m; intensity (N,) float32 or None."""
 
-    points: NDArray[np.float64]
+    points: Floats
     intensity: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
@@ -48,7 +50,7 @@ class ArrayCloud:
     [[1.0, 2.0, 3.0]]
     """
 
-    points: NDArray[np.float64]
+    points: Floats
     intensity: NDArray[np.float32] | None = None
 
     @classmethod
@@ -84,7 +86,7 @@ def in_memory(cloud: Cloud) -> ArrayCloud:
     return ArrayCloud(points, np.concatenate(values) if values else np.zeros(0, np.float32))
 
 
-def bounds(cloud: Cloud) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def bounds(cloud: Cloud) -> tuple[Floats, Floats]:
     """Smallest and largest x, y, z, m, of its finite points; NaN when there are none."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for block in cloud.blocks():

@@ -7,7 +7,8 @@ from enum import StrEnum
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from lslam.types.arrays import Floats
 
 ConstraintKind = Literal["odometry", "loop"]
 
@@ -43,8 +44,8 @@ class Constraint:
 
     a: int
     b: int
-    T_a_b: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    T_a_b: Floats
+    covariance: Floats
     kind: ConstraintKind = "loop"
     is_held: bool = False
 
@@ -55,7 +56,7 @@ class Turn:
 
     a: int
     b: int
-    R_a_b: NDArray[np.float64]
+    R_a_b: Floats
     sigma: float
 
 
@@ -85,9 +86,6 @@ class LoopCandidate:
     def is_accepted(self) -> bool:
         """Whether its constraint holds the poses."""
         return self.verdict == Verdict.ACCEPTED
-
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -184,8 +182,8 @@ class MapFix:
     is_doubted : held, but by fewer of its points than elsewhere in the run: something there has changed
     """
 
-    T_map_lidar: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    T_map_lidar: Floats
+    covariance: Floats
     status: FixStatus = "held"
     overlap: float = 0.0
     inlier_share: float = 0.0

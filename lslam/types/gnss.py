@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from lslam.types.arrays import Bools, Floats, Longs
 
 
 @dataclass(frozen=True)
@@ -16,15 +17,15 @@ class GnssStream:
     stamps_ns : (M,) int64; lat_lon_alt : (M, 3) float64, deg, deg, m (WGS84); sigma : (M,) float64 one-sigma, m
     """
 
-    stamps_ns: NDArray[np.int64]
-    lat_lon_alt: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    stamps_ns: Longs
+    lat_lon_alt: Floats
+    sigma: Floats
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
 
     @property
-    def is_place(self) -> NDArray[np.bool_]:
+    def is_place(self) -> Bools:
         """(M,) whether each fix is a place on the Earth; receivers without one write zeros."""
         lat, lon = self.lat_lon_alt[:, 0], self.lat_lon_alt[:, 1]
         finite = np.isfinite(self.lat_lon_alt).all(axis=1)
@@ -56,8 +57,8 @@ class Georeference:
     rmse_horizontal, rmse_vertical : m, of the inliers against the trajectory's antenna
     """
 
-    origin: NDArray[np.float64]
-    T_enu_world: NDArray[np.float64]
+    origin: Floats
+    T_enu_world: Floats
     epsg: int | None = None
     method: Literal["fit", "graph", "osm", "control"] = "fit"
     fixes: int = 0

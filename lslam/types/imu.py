@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-from numpy.typing import NDArray
+from lslam.types.arrays import Floats, Longs
 
 
 @dataclass(frozen=True)
@@ -17,10 +16,10 @@ class ImuStream:
     hidden : (M, 6) one sigma of what readings at the end of the range lack, of accel and gyro; None where none do
     """
 
-    stamps_ns: NDArray[np.int64]
-    accel: NDArray[np.float64]
-    gyro: NDArray[np.float64]
-    hidden: NDArray[np.float64] | None = None
+    stamps_ns: Longs
+    accel: Floats
+    gyro: Floats
+    hidden: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -37,7 +36,7 @@ class GravityDirection:
     graph with a factor per keyframe should count those of one such stretch as one measurement.
     """
 
-    direction: NDArray[np.float64]
+    direction: Floats
     sigma: float
 
 
@@ -57,8 +56,8 @@ class ImuState:
     rotation vector from the IMU's axes to those of the T_lidar_imu that was given, rad; s to add to its stamps
     """
 
-    values: NDArray[np.float64]
-    sigmas: NDArray[np.float64]
+    values: Floats
+    sigmas: Floats
 
 
 @dataclass(frozen=True)
@@ -77,9 +76,6 @@ class ImuDiagnostics:
     steady_norm: float | None = None
     steady_iterations: int | None = None
     saved_s: float | None = None
-
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry.se3 import poses_at
+from lslam.types.arrays import Floats, Longs
 from lslam.types.imu import SweepLink
 
 
@@ -24,25 +24,25 @@ class MotionPrior:
     change : (6, 6) covariance of the motion from begin to end, world axes, which later scans told as well; None elsewhere
     """
 
-    times: NDArray[np.float64]
-    poses: NDArray[np.float64]
-    covariance: NDArray[np.float64] | None = None
+    times: Floats
+    poses: Floats
+    covariance: Floats | None = None
     link: SweepLink | None = None
     is_felt: bool = False
-    change: NDArray[np.float64] | None = None
+    change: Floats | None = None
 
     @classmethod
-    def at_once(cls, pose: NDArray[np.float64]) -> MotionPrior:
+    def at_once(cls, pose: Floats) -> MotionPrior:
         """The pose (4, 4) at the stamp, and nothing of the motion about it."""
         return cls(np.zeros(1), pose[None])
 
     @property
-    def pose(self) -> NDArray[np.float64]:
+    def pose(self) -> Floats:
         """(4, 4) predicted T_world_lidar at the stamp."""
         if self.times[0] == 0 or len(self.times) == 1:
-            first: NDArray[np.float64] = self.poses[0]
+            first: Floats = self.poses[0]
             return first
-        at: NDArray[np.float64] = poses_at(self.times_ns, self.poses, np.zeros(1, np.int64))[0]
+        at: Floats = poses_at(self.times_ns, self.poses, np.zeros(1, np.int64))[0]
         return at
 
     @property
@@ -51,7 +51,7 @@ class MotionPrior:
         return self.is_felt or self.change is not None
 
     @property
-    def times_ns(self) -> NDArray[np.int64]:
+    def times_ns(self) -> Longs:
         """(K,) `times` in whole ns."""
         return np.round(1e9 * self.times).astype(np.int64)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.arrays import Floats, Longs
 from lslam.types.building import CorrectedMap, OsmMatches
 from lslam.types.cloud import ArrayCloud
 from lslam.types.constraint import LoopCandidate, MapFix, Turn
@@ -16,8 +17,6 @@ from lslam.types.gnss import Georeference
 from lslam.types.imu import ImuStream, InertialChain
 from lslam.types.scan_result import MotionCheck, ScanResult
 from lslam.types.trajectory import Trajectory
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -114,9 +113,9 @@ class FeatureView:
     around: Floats
     map_edges: Floats
     map_planes: Floats
-    scans: NDArray[np.int64]
-    edge_counts: NDArray[np.int64]
-    plane_counts: NDArray[np.int64]
+    scans: Longs
+    edge_counts: Longs
+    plane_counts: Longs
 
 
 @dataclass
@@ -168,11 +167,11 @@ class RunRecord:
     problems: list[str] = field(default_factory=list)
     unscored: str = ""
     odometry: Trajectory | None = None
-    T_final_odometry: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    T_final_odometry: Floats = field(default_factory=lambda: np.eye(4))
     turns: list[Turn] = field(default_factory=list)
     inertial: InertialChain | None = None
     loops: list[LoopCandidate] = field(default_factory=list)
-    keyframe_scans: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    keyframe_scans: Longs = field(default_factory=lambda: np.zeros(0, np.int64))
     back_end_seconds: dict[int, dict[str, float]] = field(default_factory=dict)
     georeference: Georeference | None = None
     loop_view: LoopView | None = None

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.types.arrays import Bools
+
 # m along each axis: no LiDAR that is carried along the ground or a little above sees as far.
 FARTHEST_M = 10_000.0
 # m; half the points of a scan are nearer: where a turn is counted in metres.
@@ -17,7 +19,7 @@ LEVER_M = 10.0
 NO_RING = 65535
 
 
-def is_measured(points: NDArray[Any]) -> NDArray[np.bool_]:
+def is_measured(points: NDArray[Any]) -> Bools:
     """(N,) whether points (N, 3), m, are somewhere a LiDAR sees: NaN, zeros and numbers beyond reason stand for no return."""
     with np.errstate(invalid="ignore"):
         return np.asarray((np.abs(points) < FARTHEST_M).all(axis=1) & (points != 0).any(axis=1))

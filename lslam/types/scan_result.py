@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.geometry import portable, so3
+from lslam.types.arrays import Floats
 from lslam.types.imu import ImuDiagnostics
 from lslam.types.scan import LEVER_M
 
@@ -22,9 +22,9 @@ class ScanEquations:
     """
 
     stamp_ns: int
-    T_world_lidar: NDArray[np.float64]
-    H: NDArray[np.float64]
-    g: NDArray[np.float64]
+    T_world_lidar: Floats
+    H: Floats
+    g: Floats
 
 
 # What explains less than this part of what is usual, or less than a share of the points, is rejected.
@@ -51,14 +51,14 @@ class MotionCheck:
     first: int
     last: int
     seconds: float
-    claimed: NDArray[np.float64]
-    found: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    claimed: Floats
+    found: Floats
+    sigma: Floats
     agreement: float
     claimed_agreement: float
     usual: float
     is_after_break: bool = False
-    rival: NDArray[np.float64] | None = None
+    rival: Floats | None = None
     emptied: float = 0.0
 
     @property
@@ -72,12 +72,12 @@ class MotionCheck:
         return not self.is_conclusive or float(np.max(self.sigma[:3])) > OPEN_M
 
     @property
-    def apart(self) -> NDArray[np.float64]:
+    def apart(self) -> Floats:
         """(6,) by how much the scans say the motion was more than claimed."""
         return motion_apart(self.claimed, self.found)
 
 
-def motion_apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def motion_apart(a: Floats, b: Floats) -> Floats:
     """(6,) by how much a motion `b` (4, 4) is more than another, `a`: m, then rad, in the axes of where both begin."""
     turn = so3.log(portable.product(b[:3, :3], a[:3, :3].T))
     return np.concatenate([b[:3, 3] - a[:3, 3], turn])
@@ -119,12 +119,12 @@ class ScanResult:
 
     index: int
     stamp_ns: int
-    T_world_lidar: NDArray[np.float64]
+    T_world_lidar: Floats
     status: Status = "ok"
     reason: str = ""
-    covariance: NDArray[np.float64] | None = None
-    registration_covariance: NDArray[np.float64] | None = None
-    points_covariance: NDArray[np.float64] | None = None
+    covariance: Floats | None = None
+    registration_covariance: Floats | None = None
+    points_covariance: Floats | None = None
     map_age: float = 1.0
     converged: bool = True
     iterations: int = 0
@@ -138,11 +138,11 @@ class ScanResult:
     segment: int = 0
     frame: int = 0
     is_lost: bool = False
-    degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    degenerate: Floats = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0
     imu: ImuDiagnostics = field(default_factory=ImuDiagnostics)
-    stamp_offset: NDArray[np.float64] | None = None
+    stamp_offset: Floats | None = None
     fault: str = ""
     stages: dict[str, float] = field(default_factory=dict)
 

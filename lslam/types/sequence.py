@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.errors import InputError, UsageError
+from lslam.types.arrays import Floats, Longs
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 from lslam.types.scan import Scan
@@ -27,9 +27,9 @@ class Calibration:
     T_cam0_lidar : KITTI's `Tr`; T_lidar_imu and T_lidar_gnss : IMU and antenna in the LiDAR frame
     """
 
-    T_cam0_lidar: NDArray[np.float64] | None = None
-    T_lidar_imu: NDArray[np.float64] | None = None
-    T_lidar_gnss: NDArray[np.float64] | None = None
+    T_cam0_lidar: Floats | None = None
+    T_lidar_imu: Floats | None = None
+    T_lidar_gnss: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Sequence(Protocol):
     name: str
     path: Path
     kind: str
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     rate_hz: float
     motion_compensated: bool | None
     calibration: Calibration
@@ -144,7 +144,7 @@ class SequenceView(Scans):
 class Selection(SequenceView):
     """Every `step`-th scan of a sequence; scans keep their index of the recording, all else is the sequence's own."""
 
-    def __init__(self, whole: Sequence, indices: NDArray[np.int64]) -> None:
+    def __init__(self, whole: Sequence, indices: Longs) -> None:
         super().__init__(whole, stamps_ns=whole.stamps_ns[indices])
         self.indices = indices
 

@@ -7,8 +7,8 @@ from math import nan
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.types.arrays import Bools, Floats, Longs
 from lslam.types.comparison import USABLE
 
 Value = bool | int | float | str
@@ -97,8 +97,6 @@ def series_of(method: str, uses_imu: bool) -> str:
     return f"{method}+imu" if uses_imu else method
 
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Outcome = Literal["confirmed", "refuted", "undecided"]
 # And the numbers that say so.
 Judged = tuple[Outcome, str]
@@ -180,7 +178,7 @@ class Interval:
     mean: Floats
     low: Floats
     high: Floats
-    n: NDArray[np.int64]
+    n: Longs
     std: Floats
 
 

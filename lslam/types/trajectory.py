@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from lslam.types.arrays import Floats, Longs
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,11 @@ class Trajectory:
     notes : what the reader chose and left out
     """
 
-    stamps_ns: NDArray[np.int64]
-    poses: NDArray[np.float64]
+    stamps_ns: Longs
+    poses: Floats
     frame: str = "lidar"
     has_stamps: bool = True
-    covariances: NDArray[np.float64] | None = None
+    covariances: Floats | None = None
     source: str = ""
     has_rotations: bool = True
     notes: tuple[str, ...] = ()
@@ -34,12 +35,12 @@ class Trajectory:
         return len(self.stamps_ns)
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Floats:
         """(N, 3) positions, m."""
         return self.poses[:, :3, 3]
 
     @property
-    def path_lengths(self) -> NDArray[np.float64]:
+    def path_lengths(self) -> Floats:
         """(N,) distance travelled up to each pose, m; starts at 0."""
         steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
         return np.concatenate([np.zeros(min(len(self), 1)), np.cumsum(steps)])
@@ -68,8 +69,8 @@ class Keyframe:
     number: int
     scan: int
     stamp_ns: int
-    T_world_lidar: NDArray[np.float64]
-    covariance: NDArray[np.float64] | None = None
+    T_world_lidar: Floats
+    covariance: Floats | None = None
     distance: float = 0.0
 
 

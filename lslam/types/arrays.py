@@ -1,0 +1,10 @@
+"""Types of arrays, named once: what an element is."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Points = NDArray[np.float32]
+Longs = NDArray[np.int64]
+Stamps = NDArray[np.int64]  # ns
+Bools = NDArray[np.bool_]
