@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.kernels import jit  # noqa: F401  # which tells numba where its cache is
-from lslam.locks import lock
+from lslam.machine import lock
 from lslam.pipeline import precompile
 
 # isort: split

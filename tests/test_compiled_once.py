@@ -7,7 +7,7 @@ from threading import Thread
 from typing import Any
 
 from lslam.kernels.jit import kernel
-from lslam.locks import lock
+from lslam.machine import lock
 
 results = []
 

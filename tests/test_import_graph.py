@@ -27,7 +27,7 @@ LAYERS = [
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["locks", "machine", "plugins", "printable", "remote", "stopping"],
+    ["machine", "plugins", "printable", "remote", "stopping"],
     ["extras"],
     ["errors", "untrusted", "version"],
 ]

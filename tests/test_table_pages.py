@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pages import Page, page
 
-from lslam.backend.manual_files import write_control
+from lslam.backend.manual import write_control
 from lslam.pipeline.merged_folder import COLUMNS
 from lslam.pipeline.outputs import write_localization, write_scans
 from lslam.pipeline.run_folder import OURS

@@ -13,8 +13,8 @@ from lslam.backend.manual import stamp_of
 from lslam.config import Config
 from lslam.errors import UsageError
 from lslam.geometry import geodesy, se3, so3
+from lslam.geometry.noise import quantile
 from lslam.geometry.se3 import poses_at
-from lslam.graph.chi_square import quantile
 from lslam.graph.consistency import Drift
 from lslam.graph.problem import PositionFix
 from lslam.maps.georeference import Projection, to_wgs84

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.fix_faults import Fixes
 from lslam.geometry import geodesy, se3
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.keyframes.store import KeyframeStore
 from lslam.maps.crispness import plane_variances
 from lslam.types.arrays import Floats

@@ -22,8 +22,8 @@ from lslam.config.backend import GnssConfig, GraphConfig
 from lslam.config.config import Config
 from lslam.errors import InputError
 from lslam.geometry import geodesy, noise, se3, so3
+from lslam.geometry.noise import quantile
 from lslam.geometry.se3 import poses_at
-from lslam.graph.chi_square import quantile
 from lslam.graph.drift import chains, drift_covariance
 from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
 from lslam.graph.gnss_alignment import GnssAlignment

@@ -15,7 +15,7 @@ from lslam.config import Config
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.kernels import jit
-from lslam.locks import one_at_a_time
+from lslam.machine import one_at_a_time
 from lslam.preprocessing.ground import levelling, up_of
 from lslam.preprocessing.up import NEAR_Z
 from lslam.types.arrays import Floats

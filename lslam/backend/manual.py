@@ -1,23 +1,192 @@
-"""What a person knows of a recording, as the back end takes it: resolved to scans and keyframes."""
+"""What a person knows of a recording, pairs of scans and control points: read from CSV, resolved to scans and keyframes."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Many
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 
 from lslam.backend.georeferencing import require_crs
-from lslam.backend.manual_files import read_control_points, read_named_pairs
 from lslam.config import Config
-from lslam.errors import InputError
+from lslam.errors import InputError, UsageError, cause, nearest
+from lslam.formats.atomic import write_text
+from lslam.formats.stamp_texts import seconds_to_ns
+from lslam.formats.text_tables import separator_of, split_cells
+from lslam.geometry.geodesy import parse_crs
 from lslam.geometry.se3 import poses_at
 from lslam.maps.georeference import to_wgs84
-from lslam.types.constraint import Instant, KnownPair, Manual, NamedPair
+from lslam.types.arrays import Floats
+from lslam.types.constraint import ControlPoint, ControlResidual, Instant, KnownPair, Manual, NamedPair
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Selection, Sequence
 from lslam.types.trajectory import Keyframe
+from lslam.untrusted import whole_number
+
+# What a run writes into the column is its own verdict, and says nothing here: its loops.csv can be edited and given back.
+VERDICTS, OWN_VERDICTS = ("known", "forbidden"), ("accepted", "rejected")
+# Names of the columns of a position.
+X, Y, Z = ("x", "easting", "east", "lon", "longitude"), ("y", "northing", "north", "lat", "latitude"), ("z", "height")
+
+
+@dataclass(frozen=True)
+class _Row:
+    """One line of a table: its cells by column, and where it stands."""
+
+    path: Path
+    line: int
+    cells: dict[str, str]
+
+    @property
+    def said(self) -> str:
+        """The place, for messages."""
+        return f"{self.path.name}, line {self.line}"
+
+    def error(self, what: str) -> InputError:
+        return InputError(f"{self.path}, line {self.line}: {what}")
+
+    def text(self, *names: str) -> str:
+        """The first of these columns that is not empty."""
+        return next((self.cells[name] for name in names if self.cells.get(name)), "")
+
+    def number(self, *names: str) -> float | None:
+        """Its finite number; None where it is empty. Raises InputError."""
+        text = self.text(*names)
+        if not text:
+            return None
+        try:
+            value = float(text)
+        except ValueError:
+            value = float("nan")
+        if not np.isfinite(value):
+            raise self.error(f"{names[0]} = {text!r} is no number")
+        return value
+
+    def needed(self, *names: str) -> float:
+        """Likewise, where it must not be empty."""
+        value = self.number(*names)
+        if value is None:
+            raise self.error(f"{' or '.join(names)} is empty")
+        return value
+
+    def size(self, *names: str) -> float | None:
+        """Likewise, of what is above zero."""
+        value = self.number(*names)
+        if value is not None and value <= 0:
+            raise self.error(f"{names[0]} = {value:g} must be above 0")
+        return value
+
+    def instant(self, suffix: str = "") -> Instant:
+        """A scan's number, or a stamp, s or ns."""
+        scan, seconds, ns = (self.text(name + suffix) for name in ("scan", "stamp", "stamp_ns"))
+        if scan:
+            number = whole_number(scan)
+            if number is None:
+                raise self.error(f"scan{suffix} = {scan!r} is no number of a scan")
+            return Instant(self.said, scan=number)
+        if not (seconds or ns):
+            raise self.error(f"scan{suffix} or stamp{suffix} is empty")
+        return Instant(self.said, stamp_ns=seconds_to_ns(seconds or ns, self.path, self.line, 10**9 if seconds else 1))
+
+
+def read_named_pairs(path: Path) -> list[NamedPair]:
+    """Pairs by `scan_a` and `scan_b`, or `stamp_a` and `stamp_b`, s, whose `verdict` is known or forbidden.
+
+    `x_m`, `y_m` : where the second is seen from the first, roughly; `within_m` : how far from there at most. Rows with a run's
+    own verdict are passed over. Raises InputError naming file and line.
+    """
+    pairs = []
+    for row in _rows(path, (("scan_a", "stamp_a", "stamp_ns_a"), ("scan_b", "stamp_b", "stamp_ns_b"), ("verdict",))):
+        verdict = row.text("verdict").lower()
+        if verdict in OWN_VERDICTS:
+            continue
+        if verdict not in VERDICTS:
+            raise row.error(f"verdict {verdict!r}: known or forbidden; {nearest(verdict, VERDICTS)}")
+        place = np.array([row.number("x_m", "x") or 0.0, row.number("y_m", "y") or 0.0])
+        kind = cast(Literal["known", "forbidden"], verdict)
+        pairs.append(NamedPair(row.instant("_a"), row.instant("_b"), kind, place, row.size("within_m", "within")))
+    if not pairs:
+        raise InputError(f"{path} names no pair: write known or forbidden into its column verdict")
+    return pairs
+
+
+def read_control_points(path: Path) -> list[ControlPoint]:
+    """Points by `scan` or `stamp`, s, with `x`, `y`, `z`, `sigma`, m, and `crs`, as EPSG:25832.
+
+    `sigma_z` : of the height where it is another; `lidar_x`, `lidar_y`, `lidar_z` : the point as the LiDAR saw it, m, where it
+    is not the sensor itself. Raises InputError naming file and line.
+    """
+    points = []
+    for row in _rows(path, (("scan", "stamp", "stamp_ns"), X, Y, Z, ("sigma", "sigma_m"), ("crs",))):
+        try:
+            epsg, height_epsg = parse_crs(row.text("crs"))
+        except UsageError:
+            raise row.error(
+                f"crs = {row.text('crs')!r}: EPSG and a number, for example EPSG:25832, or EPSG:25832+7837 with heights"
+            ) from None
+        sigma = row.size("sigma", "sigma_m")
+        if sigma is None:
+            raise row.error("sigma is empty: a point without it holds nothing")
+        spread = np.array([sigma, sigma, row.size("sigma_z", "sigma_z_m") or sigma])
+        position = np.array([row.needed(*X), row.needed(*Y), row.needed(*Z)])
+        points.append(ControlPoint(row.instant(), position, spread, epsg, _seen(row), height_epsg))
+    if not points:
+        raise InputError(f"{path} has no control points below its header")
+    return points
+
+
+def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
+    """What is left of each control point, m, east, north and up, surveyed minus solved; raises OutputError."""
+    rows = ["point,stamp_ns,east_m,north_m,up_m,sigma_m,sigma_up_m,sigmas"]
+    for one in residuals:
+        (east, north, up), (sigma, _, sigma_up) = one.residual.tolist(), one.point.sigma.tolist()
+        said = one.point.at.said.replace(",", "")
+        rows.append(f"{said},{one.stamp_ns},{east:.4f},{north:.4f},{up:.4f},{sigma:g},{sigma_up:g},{one.size:.2f}")
+    write_text(path, "\n".join(rows) + "\n")
+
+
+def _seen(row: _Row) -> Floats:
+    seen = [row.number(f"lidar_{axis}", f"lidar_{axis}_m") for axis in "xyz"]
+    if any(value is None for value in seen) and any(value is not None for value in seen):
+        raise row.error("lidar_x, lidar_y and lidar_z go together")
+    return np.array([value or 0.0 for value in seen])
+
+
+def _is_comment(line: str, names: set[str]) -> bool:
+    """Whether a line begins with # and is no header that does."""
+    text = line.strip()
+    return text.startswith("#") and not names & {word.strip().lower() for word in re.split("[;,\\s]", text.lstrip("#"))}
+
+
+def _rows(path: Path, needed: Many[tuple[str, ...]]) -> Iterator[_Row]:
+    """The lines below the header, which has one column of each of the `needed`."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
+    names = {name for one in needed for name in one}
+    numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not _is_comment(line, names)]
+    if not numbered:
+        raise InputError(f"{path} is empty")
+    separator = separator_of(numbered[0][1])
+    table = [split_cells(line.strip(), separator) for _, line in numbered]
+    header = [name.strip().lstrip("#").strip().lower() for name in table[0]]
+    missing = [names for names in needed if not any(name in header for name in names)]
+    if missing:
+        raise InputError(
+            f"{path}, line {numbered[0][0]}: no column {' or '.join(missing[0])}; the file has {', '.join(header)}"
+        )
+    if len(set(header)) < len(header):
+        raise InputError(f"{path}, line {numbered[0][0]}: a column stands there twice: {', '.join(header)}")
+    for (number, _), cells in zip(numbered[1:], table[1:], strict=True):
+        if len(cells) > len(header):
+            raise InputError(f"{path}, line {number}: {len(cells)} columns where the header has {len(header)}")
+        yield _Row(path, number, dict(zip(header, cells, strict=False)))
+
 
 # Beyond the first and the last scan a control point's stamp is that of a pose only as far as seconds are rounded.
 ROUNDING_NS = 5_000_000

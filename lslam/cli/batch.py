@@ -57,7 +57,7 @@ def command(jobs_file: Path, **given: Any) -> None:
     if given["dry_run"]:
         _print_plan(expanded, given["as_json"])
         return
-    from lslam.cli.study_screen import bars
+    from lslam.cli.console import bars
     from lslam.studies.expanded_study import make_runs
 
     with options.engine_of(given, "runs", is_persistent=False) as engine, ExitStack() as stack:

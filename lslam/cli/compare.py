@@ -73,7 +73,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     """
     setup_logging(given["verbose"], given["quiet"])
     plan = _plan(sequences, given)
-    from lslam.cli.study_screen import bars
+    from lslam.cli.console import bars
     from lslam.errors import GateError, RunFailedError
     from lslam.studies.compare import compare
 

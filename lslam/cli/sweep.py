@@ -73,7 +73,7 @@ def command(study: str | None, **given: Any) -> None:
     from lslam.studies.sweep import run_sweep
 
     with options.engine_of(given, "studying") as engine, ExitStack() as stack:
-        from lslam.cli.study_screen import bars, best_so_far
+        from lslam.cli.console import bars, best_so_far
 
         if given["dry_run"]:
             _print_plan(sweep, engine.at_once, given["pilot"], stack, given["as_json"])
@@ -159,7 +159,7 @@ def _print_list(as_json: bool) -> None:
 
 def _print_plan(sweep: Sweep, at_once: int, is_piloted: bool, stack: ExitStack, as_json: bool) -> None:
     """Print every run, their number, and the estimated time of those that are not finished."""
-    from lslam.cli.study_screen import bars
+    from lslam.cli.console import bars
     from lslam.studies.estimate import estimate, from_finished
     from lslam.studies.expanded_study import left_to_do
     from lslam.studies.sweep import expand_study

@@ -8,10 +8,9 @@ import numpy as np
 
 from lslam.config.input import PreprocessConfig
 from lslam.doctor.examine_bag import examine_bag
-from lslam.doctor.examine_gnss import examine_gnss
 from lslam.doctor.examine_imu import examine_imu
+from lslam.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps
 from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times, rings_rule
-from lslam.doctor.examine_truth import examine_gaps, examine_jumps
 from lslam.doctor.examine_turns import examine_turns
 from lslam.doctor.examine_units import examine_units
 from lslam.doctor.findings import Facts, Finding

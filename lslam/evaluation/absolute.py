@@ -20,7 +20,7 @@ from lslam.evaluation.metric import (
 )
 from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
-from lslam.geometry import se3, so3, umeyama
+from lslam.geometry import se3, so3
 from lslam.printable import fixed, metres, significant
 from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
@@ -76,7 +76,7 @@ def align(estimate: Floats, truth: Floats, alignment: str) -> tuple[Floats, floa
         return np.eye(4), 1.0, f"n/a ({len(p)} poses)"
     if alignment == "posyaw":
         return _position_and_yaw(p, q)
-    T, scale, is_determined = umeyama.align(p, q, with_scale=alignment == "sim3")
+    T, scale, is_determined = se3.umeyama(p, q, with_scale=alignment == "sim3")
     return (T, scale, "") if is_determined else (np.eye(4), 1.0, "n/a (collinear)")
 
 

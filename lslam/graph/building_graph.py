@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se2, se3
+from lslam.geometry.noise import quantile
 from lslam.graph import factors
-from lslam.graph.chi_square import quantile
 from lslam.graph.pose_graph import check_graph
 from lslam.graph.problem import PlanarPrior, PoseGraph
 from lslam.graph.solve import (

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.problem import PoseGraph
 from lslam.stopping import check_stop
 from lslam.types.arrays import Floats

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.graph.chi_square import chance_of_median, quantile
+from lslam.geometry.noise import chance_of_median, quantile
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint

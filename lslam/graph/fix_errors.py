@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.types.arrays import Bools, Floats
 
 # s; offsets that are tried, their step, and the time over which displacements are compared.

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.fix_errors import NO_HEIGHT
 from lslam.types.arrays import Bools, Floats
 

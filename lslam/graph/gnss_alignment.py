@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.geometry import se3, so3
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.types.arrays import Bools, Floats
 
 # RANSAC samples, and the least distance of a pair as a share of the largest.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.consistency import Ends, judge_loops, moved
 from lslam.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basis, rate_roots
 from lslam.graph.pose_graph import check_graph, with_distances

@@ -11,7 +11,7 @@ import numpy as np
 from lslam.config.backend import GraphConfig
 from lslam.errors import GraphError
 from lslam.geometry import noise
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.factors import FIX_NOISE
 from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
 from lslam.graph.selected_inverse import selected_inverse

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.geometry import noise, se3, so3
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.drift import drift_covariance
 from lslam.graph.odometry_constraints import growth
 from lslam.localization.prior_map import LocalView

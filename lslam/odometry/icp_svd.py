@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from lslam.config.config import Config
 from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3, umeyama
+from lslam.geometry import se3, so3
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
 from lslam.preprocessing.prepare import PreparedPoints, prepare_points
@@ -121,9 +121,7 @@ def align_closed_form(
         reach = np.inf if inlier_distance is None else inlier_distance
         distance, partner = (np.asarray(a) for a in last.tree.query(moved, distance_upper_bound=reach))
         kept = keep_pairs(distance, inlier_ratio, inlier_distance)
-        step, _, is_determined = (
-            umeyama.align(moved[kept], last.points[partner[kept]]) if len(kept) else (T, 1.0, False)
-        )
+        step, _, is_determined = se3.umeyama(moved[kept], last.points[partner[kept]]) if len(kept) else (T, 1.0, False)
         if not is_determined:
             return RegistrationResult(T_prior, source_points=len(source), converged=False, iterations=rounds)
         T = step @ T

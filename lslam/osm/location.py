@@ -19,7 +19,7 @@ from lslam.config import Config
 from lslam.config.backend import GraphConfig, OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3, so3
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.problem import PlanarPrior, Solution
 from lslam.keyframes.store import KeyframeStore
 from lslam.keyframes.submaps import neighbours, submap

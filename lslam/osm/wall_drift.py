@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.config.backend import GraphConfig
-from lslam.graph.chi_square import quantile
+from lslam.geometry.noise import quantile
 from lslam.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import EstimatedDrift, PoseGraph

@@ -13,8 +13,7 @@ import numpy as np
 from lslam.backend import added_drift
 from lslam.backend.held_first import doubts, where_held
 from lslam.backend.levelling import find_level, level_results
-from lslam.backend.manual import KeyframePairs, keyframe_pairs
-from lslam.backend.manual_files import write_control
+from lslam.backend.manual import KeyframePairs, keyframe_pairs, write_control
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config

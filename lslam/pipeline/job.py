@@ -13,7 +13,7 @@ import numpy as np
 from lslam.backend.georeferencing import require_gnss
 from lslam.backend.manual import read_manual
 from lslam.config import Config
-from lslam.doctor.examine_truth import examine_jumps
+from lslam.doctor.examine_positions import examine_jumps
 from lslam.doctor.examine_units import examine_units
 from lslam.errors import InputError, InterruptedRunError
 from lslam.evaluation.frames import main_axis

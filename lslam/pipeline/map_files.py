@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.config.outputs import MapConfig
 from lslam.errors import OutputError, cause
 from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.geojson import write_line
@@ -19,6 +20,7 @@ from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
+from lslam.pipeline.map_pass import BuiltMap
 from lslam.reports.evaluations import strict
 from lslam.reports.png import grey_png
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory
@@ -113,6 +115,29 @@ class MapNote:
     voxel: float
     done: tuple[str, ...] = ()
     world: str = LOCAL
+
+    @classmethod
+    def of(cls, sequence: str, config: MapConfig, built: BuiltMap, world: str) -> MapNote:
+        """Of the map that a run made, by its configuration, in its `world`."""
+        return cls(sequence, config.voxel, built.done, f"{LOCAL}: {world}")
+
+
+def write_built(
+    path: Path, built: BuiltMap, config: MapConfig, sequence: str, trajectory: Trajectory, world: str,
+    georeference: Georeference | None,
+) -> None:  # fmt: skip
+    """The map of a run, and beside it what its configuration asks for: a surface, the occupancy, the way on the Earth.
+
+    Raises as `write_map`.
+    """
+    note = MapNote.of(sequence, config, built, world)
+    write_map(path, built.merged, note, georeference)
+    if config.mesh:
+        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, trajectory)
+    if built.occupancy is not None:
+        write_occupancy(path.parent, built.occupancy, note.world)
+    if georeference is not None:
+        write_geojson(path.parent / "trajectory.geojson", trajectory, georeference, sequence)
 
 
 def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.point_files import read_cloud, write_cloud
 from lslam.maps.georeference import ProjectedCloud, Projection
-from lslam.pipeline.map_files import LOCAL, MapNote, georeference_note, read_json, write_json
+from lslam.pipeline.map_files import MapNote, georeference_note, read_json, write_json
 from lslam.pipeline.map_pass import INTERRUPTED, build_map
 from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
 from lslam.pipeline.run_folder import SPOOL
@@ -41,7 +41,7 @@ def rebuild_in_tiles(
     built = build_map(sequence, results_of(run), run.config, on_step, should_stop, folder)
     if should_stop():
         raise InterruptedRunError(INTERRUPTED)
-    note = MapNote(sequence.name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
+    note = MapNote.of(sequence.name, run.config.map, built, run.world)
     return write_tiles(folder, built.merged, note, size, run.config.map.format, georeference)
 
 

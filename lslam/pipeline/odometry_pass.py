@@ -30,8 +30,8 @@ from lslam.inertial.smoothing import SmootherMotion
 from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
-from lslam.locks import one_at_a_time
 from lslam.loops import find_loops
+from lslam.machine import one_at_a_time
 from lslam.maps import crispness, merge
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Deskewing, Odometry, Resumable

@@ -16,7 +16,7 @@ from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.geometry import se3
 from lslam.pipeline import map_files
 from lslam.pipeline.feature_pass import FeatureCloud
-from lslam.pipeline.map_files import LOCAL, MapNote
+from lslam.pipeline.map_files import LOCAL
 from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
 from lslam.pipeline.run_tables import imu_states_text, timing_text
@@ -129,17 +129,10 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
     """map.ply, .pcd, .las or .laz with map.json beside, in map coordinates where the run knows where it is."""
-    shown = BYTES_PER_POINT_SHOWN * len(built.sample)
-    folder.require_space(BYTES_PER_POINT * len(built.merged) + shown, "the map")
-    note = MapNote(record.name, config.voxel, built.done, f"{LOCAL}: {record.world}")
-    map_files.write_map(folder.path / f"map.{config.format}", built.merged, note, record.georeference)
-    if config.mesh:
-        map_files.write_mesh(folder.path / "map_mesh.ply", built.merged, note, record.trajectory)
-    if built.occupancy is not None:
-        folder.require_space(BYTES_PER_POINT * len(built.occupancy), "the occupancy map")
-        map_files.write_occupancy(folder.path, built.occupancy, note.world)
-    if record.georeference is not None:
-        map_files.write_geojson(folder.path / "trajectory.geojson", record.trajectory, record.georeference, record.name)
+    points = len(built.merged) + (0 if built.occupancy is None else len(built.occupancy))
+    folder.require_space(BYTES_PER_POINT * points + BYTES_PER_POINT_SHOWN * len(built.sample), "the map")
+    path = folder.path / f"map.{config.format}"
+    map_files.write_built(path, built, config, record.name, record.trajectory, record.world, record.georeference)
 
 
 def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:

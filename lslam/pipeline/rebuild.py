@@ -24,8 +24,6 @@ from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
 from lslam.maps.mesh import require_open3d
 from lslam.pipeline.map_files import (
-    LOCAL,
-    MapNote,
     drop_note,
     georeference_of,
     in_own_world,
@@ -34,11 +32,8 @@ from lslam.pipeline.map_files import (
     note_with,
     noted_last,
     read_json,
-    write_geojson,
+    write_built,
     write_json,
-    write_map,
-    write_mesh,
-    write_occupancy,
 )
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
@@ -202,7 +197,9 @@ def rebuild(
             raise InterruptedRunError(INTERRUPTED)
         score = crispness(built.merged)
         with _staged(path.parent) as stage:
-            _write(stage / path.name, run, built, sequence.name, georeference)
+            write_built(
+                stage / path.name, built, run.config.map, sequence.name, run.trajectory, run.world, georeference
+            )
             if is_own:
                 write_renewed(stage, run.folder, _record(run, built, path.name, score))
             _publish(stage, path)
@@ -236,18 +233,6 @@ def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
     georeference = replace(georeference, geoid=crs.geoid or georeference.geoid)
     Projection(georeference).check()
     return georeference
-
-
-def _write(path: Path, run: EarlierRun, built: BuiltMap, name: str, georeference: Georeference | None) -> None:
-    """The map and all that is asked for beside it."""
-    note = MapNote(name, run.config.map.voxel, built.done, f"{LOCAL}: {run.world}")
-    write_map(path, built.merged, note, georeference)
-    if run.config.map.mesh:
-        write_mesh(path.with_name(f"{path.stem}_mesh.ply"), built.merged, note, run.trajectory)
-    if built.occupancy is not None:
-        write_occupancy(path.parent, built.occupancy, note.world)
-    if georeference is not None:
-        write_geojson(path.parent / "trajectory.geojson", run.trajectory, georeference, name)
 
 
 def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> RunRecord:

@@ -14,7 +14,7 @@ from typing import IO, Any
 
 from lslam.errors import InputError, OutputError, OutputExistsError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.locks import lock
+from lslam.machine import lock
 from lslam.printable import file_safe
 
 log = logging.getLogger("lslam")

@@ -18,7 +18,7 @@ from lslam.backend.outcome import BackEnd
 from lslam.config import Config, load_config
 from lslam.formats.g2o import write_g2o
 from lslam.geometry import geodesy, se3, so3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.keyframes.store import KeyframeStore
 from lslam.types.constraint import Constraint, LoopCandidate
 from lslam.types.gnss import GnssStream
@@ -224,7 +224,7 @@ def test_a_constant_drift_is_corrected_before_fixes_are_used() -> None:
         done = run_back_end(recording(), results, store_of(results), config(*words), LOOPS)
         assert "steady_drift" in done.facts
         p = np.stack([r.T_world_lidar[:3, 3] for r in done.results])
-        off = se3.apply(align(p, CITY[:, :3, 3])[0], p) - CITY[:, :3, 3]
+        off = se3.apply(umeyama(p, CITY[:, :3, 3])[0], p) - CITY[:, :3, 3]
         shapes.append(float(np.sqrt((off**2).sum(1).mean())))
     assert shapes[1] < 1.3 * shapes[0]
     assert done.georeference.used >= done.georeference.fixes - 2
@@ -245,7 +245,7 @@ def test_what_fixes_bend_in_hdl_depends_on_how_the_clouds_of_keyframes_fit() -> 
         given = config("odometry.preset=hdl", "graph.floor=false", "gnss.mode=graph", *words)
         done = run_back_end(recording(), results, store, given, [])
         p, real = np.stack([r.T_world_lidar[:3, 3] for r in done.results]), REAL[:150, :3, 3]
-        off = se3.apply(align(p, real)[0], p) - real
+        off = se3.apply(umeyama(p, real)[0], p) - real
         bent.append(float(np.sqrt((off**2).sum(1).mean())))
     assert bent[0] < 0.15
     assert bent[0] < 0.6 * bent[1]

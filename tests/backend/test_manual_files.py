@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.backend.manual_files import read_control_points, read_named_pairs
+from lslam.backend.manual import read_control_points, read_named_pairs
 from lslam.errors import InputError
 
 PAIRS = "scan_a,scan_b,verdict\n"

@@ -16,7 +16,7 @@ from lslam.backend.manual import KeyframePairs
 from lslam.backend.optimise import run_back_end
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.geometry import geodesy, se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.keyframes.store import KeyframeStore
 from lslam.pipeline import back_end_pass
 from lslam.simulation.sensors import GnssModel
@@ -48,7 +48,7 @@ def test_covariances_include_the_common_error_of_fixes() -> None:
         spread = np.stack([r.covariance[:2, :2] for r in done.results])
         nees.append(float(np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off).mean() / 2))
         p = np.stack([r.T_world_lidar[:3, 3] for r in done.results])
-        shape = se3.apply(align(p, CITY[:, :3, 3])[0], p) - CITY[:, :3, 3]
+        shape = se3.apply(umeyama(p, CITY[:, :3, 3])[0], p) - CITY[:, :3, 3]
         assert np.sqrt((shape**2).sum(1).mean()) < 0.05
     assert 0.3 < np.mean(nees) < 3
 

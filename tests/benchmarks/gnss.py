@@ -20,7 +20,7 @@ from scipy.signal import savgol_filter
 from traced import Traced, run_on, traced
 
 from lslam.geometry import geodesy, se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.simulation.sensors import ORIGIN, GnssModel
 
 Floats = NDArray[np.float64]
@@ -48,7 +48,7 @@ def judged(drive: Traced, settings: list[str], mode: str) -> tuple[float, float]
     real = (drive.T_city_world @ drive.ground_truth.poses)[:, :3, 3]
     there = poses if place.method == "graph" else place.T_enu_world @ poses
     found = geodesy.to_local(geodesy.from_local(there[:, :3, 3], place.origin), ORIGIN)
-    T, _, _ = align(found, real)
+    T, _, _ = umeyama(found, real)
     return horizontal(found, real), horizontal(se3.apply(T, found), real)
 
 

@@ -26,7 +26,7 @@ import lslam
 from lslam.config import load_config
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.keyframes.store import KeyframeStore
 from lslam.localization.place_search import PlaceSearch
 from lslam.localization.start import PlaceFinder
@@ -79,7 +79,7 @@ def one_seed(root: Path, scenario: str, seed: int, starts: int) -> dict[str, lis
     record_of = lslam.run(new, load_config(None, settings), out=located, overwrite=True).record
     cpu = time.process_time() - began
     est = read_trajectory(map_run / "trajectory.tum", "tum").poses
-    T_town_map, _, _ = align(est[:, :3, 3], old_true[: len(est), :3, 3])
+    T_town_map, _, _ = umeyama(est[:, :3, 3], old_true[: len(est), :3, 3])
     truth = se3.inverse(T_town_map) @ new_true[: len(record_of.results)]
     away = np.linalg.norm(record_of.trajectory.positions - truth[:, :3, 3], axis=1)
     held = sum(fix.is_held for fix in record_of.map_fixes) / len(away)

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 import lslam
 from lslam.config import Config
 from lslam.config.load import load_config
-from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.evaluation.thesis import planar
 from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.osm_buildings import read_buildings
@@ -41,6 +40,7 @@ from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.studies.scenes import Scene, simulate_once
+from tests.building_errors import BuildingError, building_errors
 
 Floats = NDArray[np.float64]
 

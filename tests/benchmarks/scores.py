@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3, umeyama
+from lslam.geometry import se3, so3
 
 Floats = NDArray[np.float64]
 
@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 def ate(estimate: Floats, truth: Floats) -> float:
     """ATE, m, rmse, rotation and translation aligned over positions."""
     p, q = estimate[:, :3, 3], truth[:, :3, 3]
-    T, _, _ = umeyama.align(p, q)
+    T, _, _ = se3.umeyama(p, q)
     return float(np.sqrt(np.mean(np.sum((se3.apply(T, p) - q) ** 2, axis=1))))
 
 

@@ -23,7 +23,7 @@ import lslam
 from lslam.config import load_config
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.pipeline.merged_folder import merge_into
 from lslam.pipeline.watch import Watch
 from lslam.simulation.record import record
@@ -54,7 +54,7 @@ def run_of(root: Path, name: str, scenario: str, seed: int, lidar: str, visit: V
 def ate(est: list[Floats], true: list[Floats]) -> float:
     """m, se3, of positions (N, 3) of all sessions together."""
     p, q = np.concatenate(est), np.concatenate(true)
-    T, _, _ = align(p, q)
+    T, _, _ = umeyama(p, q)
     return float(np.sqrt(((se3.apply(T, p) - q) ** 2).sum(axis=1).mean()))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.simulation.record import record
 from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -61,4 +61,4 @@ def town_poses(root: Path, name: str) -> Floats:
 def frame_from_town(root: Path, trajectory: Path, name: str) -> Floats:
     """(4, 4) by which the poses of a trajectory lie best on their truth."""
     est = read_trajectory(trajectory, "tum").positions
-    return se3.inverse(align(est, town_poses(root, name)[: len(est), :3, 3])[0])
+    return se3.inverse(umeyama(est, town_poses(root, name)[: len(est), :3, 3])[0])

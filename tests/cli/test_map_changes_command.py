@@ -16,7 +16,7 @@ from revisits import place_visits, town_poses, visit_drive
 from lslam.formats.point_files import read_points
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.record import record
@@ -55,7 +55,7 @@ def drives(tmp_path_factory: pytest.TempPathFactory, made_once: MadeOnce) -> Pat
         done = lslam("localize", root / name, "--map", root / "old", "--out", root / f"{name}-run", "-q")
         assert done.returncode == 0, done.stderr
     est = read_trajectory(root / "old" / "trajectory.tum", "tum").positions
-    T, _, _ = align(town_poses(root, "monday")[:, :3, 3], est)
+    T, _, _ = umeyama(town_poses(root, "monday")[:, :3, 3], est)
     np.save(root / "foot.npy", se3.apply(T, foot[None])[0])
     return root
 

@@ -18,7 +18,7 @@ from lslam.errors import InterruptedRunError
 from lslam.formats.point_files import read_cloud
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
-from lslam.geometry.umeyama import align
+from lslam.geometry.se3 import umeyama
 from lslam.localization.sessions import by_georeference
 from lslam.maps.georeference import Projection
 from lslam.pipeline.merge_runs import read_session
@@ -51,7 +51,7 @@ def town(runs: Path) -> Path:
 def test_all_sessions_lie_in_one_frame(runs: Path, town: Path) -> None:
     est = [read_trajectory(town / "sessions" / f"{name}-run.tum", "tum").positions for name in ("monday", "tuesday")]
     true = [town_poses(runs, name)[:, :3, 3] for name in ("monday", "tuesday")]
-    T, _, _ = align(np.concatenate(est), np.concatenate(true))
+    T, _, _ = umeyama(np.concatenate(est), np.concatenate(true))
     away = np.linalg.norm(se3.apply(T, np.concatenate(est)) - np.concatenate(true), axis=1)
     # One alignment for both: what holds them together is the loops between them.
     assert away.max() < 0.02

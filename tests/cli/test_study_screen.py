@@ -12,9 +12,8 @@ from contextlib import ExitStack
 import pytest
 from rich.console import Console
 
-from lslam.cli import study_screen
-from lslam.cli.console import TimeLeft
-from lslam.cli.study_screen import BestTable, bars, best_so_far
+from lslam.cli import console
+from lslam.cli.console import BestTable, TimeLeft, bars, best_so_far
 from lslam.types.study import StudyRow
 
 ROWS = [
@@ -50,11 +49,11 @@ def test_the_best_so_far_is_a_table_once_there_are_rows() -> None:
 
 def test_it_is_live_on_a_terminal_and_nothing_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     # The handlers of a quiet command that ran in this process before.
-    monkeypatch.setattr(study_screen.log, "handlers", [])
+    monkeypatch.setattr(console.log, "handlers", [])
     for stream, shown in ((Terminal(), True), (io.StringIO(), False)):
         monkeypatch.setattr(sys, "stderr", stream)
-        console = Console(file=stream, width=120, force_terminal=True)
-        monkeypatch.setattr(study_screen, "terminal", lambda console=console: console)
+        screen = Console(file=stream, width=120, force_terminal=True)
+        monkeypatch.setattr(console, "terminal", lambda screen=screen: screen)
         with best_so_far() as table:
             table(ROWS)
         assert ("voxel 0.5" in stream.getvalue()) is shown
@@ -100,8 +99,8 @@ def test_a_plain_line_says_how_long_is_left(caplog: pytest.LogCaptureFixture, mo
     now = [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     monkeypatch.setattr(TimeLeft.__init__, "__defaults__", (1, lambda: now[0]))
-    monkeypatch.setattr(study_screen.log, "propagate", True)
-    monkeypatch.setattr(study_screen.log, "handlers", [])
+    monkeypatch.setattr(console.log, "propagate", True)
+    monkeypatch.setattr(console.log, "handlers", [])
     with caplog.at_level(logging.INFO, "lslam"), ExitStack() as stack:
         progress = bars(stack)
         progress.on_start("studying", 6, "runs", 2)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.doctor.examine_gnss import examine_gnss
 from lslam.doctor.examine_imu import examine_imu
+from lslam.doctor.examine_positions import examine_gnss
 from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times
 from lslam.doctor.examine_turns import compare, examine_turns
 from lslam.doctor.findings import Facts, Finding

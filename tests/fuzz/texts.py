@@ -10,7 +10,7 @@ import numpy as np
 from formats.osm_builders import ExtractMaker
 from fuzz.cases import Files, Parser
 
-from lslam.backend.manual_files import read_control_points, read_named_pairs
+from lslam.backend.manual import read_control_points, read_named_pairs
 from lslam.config import load_config
 from lslam.config.load import to_toml
 from lslam.config.study import read_batch, read_study

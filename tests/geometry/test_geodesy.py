@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lslam.geometry import geodesy, se3, so3, umeyama
+from lslam.geometry import geodesy, se3, so3
 
 # m; the sphere of the KITTI devkit (convertOxtsToPose.m).
 DEVKIT_RADIUS = 6378137.0
@@ -84,7 +84,7 @@ def test_devkit_projection_gives_the_official_ground_truth(recordings: Callable[
     estimate = (se3.make(so3.from_euler_rpy(oxts.values[:, ROLL : YAW + 1]), positions) @ T_imu_cam0)[
         : len(truth), :3, 3
     ]
-    T, _, determined = umeyama.align(estimate, truth)
+    T, _, determined = se3.umeyama(estimate, truth)
     assert determined
     error = np.linalg.norm(se3.apply(T, estimate) - truth, axis=1)
     assert error.mean() < 0.06

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from lslam.graph.chi_square import chance_of_median, quantile
+from lslam.geometry.noise import chance_of_median, quantile
 
 
 @pytest.mark.parametrize("dim", [1, 3, 6])

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 import lslam
 from lslam.config import Config
 from lslam.config.load import load_config
-from lslam.evaluation.buildings import BuildingError, building_errors
 from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.osm_buildings import buildings_of, read_buildings
 from lslam.formats.osm_files import read_osm
@@ -27,6 +26,7 @@ from lslam.osm.track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.types.building import CorrectedMap, KeyframeMatch
 from lslam.types.stage_clock import KeyframeClocks
+from tests.building_errors import BuildingError, building_errors
 
 Floats = NDArray[np.float64]
 
