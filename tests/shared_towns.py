@@ -14,10 +14,9 @@ import numpy as np
 from lslam.simulation import built_scenario
 from lslam.simulation.city import City
 from lslam.simulation.curve import RouteCurve
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.scenarios import SimulatedDrive
-from lslam.simulation.scene_mesh import SceneMesh
+from lslam.simulation.scene_mesh import RayScene, SceneMesh
 from lslam.simulation.terrain import Terrain
 from lslam.studies.worker import ScanStore
 from lslam.types.scan import Scan

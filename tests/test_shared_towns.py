@@ -7,8 +7,8 @@ import pytest
 from shared_towns import HELD, Towns, TracedScans
 
 from lslam.simulation import built_scenario, scenarios
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenarios import simulate
+from lslam.simulation.scene_mesh import RayScene
 from lslam.types.scan import Scan
 
 

@@ -13,9 +13,15 @@ from pages import Page, page
 
 from lslam.backend.manual import write_control
 from lslam.pipeline.merged_folder import COLUMNS
-from lslam.pipeline.outputs import write_localization, write_scans
+from lslam.pipeline.outputs import (
+    imu_states_text,
+    timing_text,
+    write_localization,
+    write_loops,
+    write_osm_matches,
+    write_scans,
+)
 from lslam.pipeline.run_folder import OURS
-from lslam.pipeline.run_tables import imu_states_text, timing_text, write_loops, write_osm_matches
 from lslam.types.building import KeyframeMatch, OsmMatches
 
 SECTION = page("docs/conventions.md").text.split("\n## Tables of a run\n")[1].split("\n## ")[0]

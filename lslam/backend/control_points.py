@@ -1,4 +1,4 @@
-"""Control points: surveyed positions as factors of the pose graph, and what is left of them in the solution."""
+"""Control points, surveyed positions as factors of the pose graph: what they hold first, and what is left of them."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement
+from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
 from lslam.backend.manual import stamp_of
 from lslam.config import Config
-from lslam.errors import UsageError
-from lslam.geometry import geodesy, se3, so3
+from lslam.errors import GraphError, UsageError
+from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.noise import quantile
 from lslam.geometry.se3 import poses_at
-from lslam.graph.consistency import Drift
-from lslam.graph.problem import PositionFix
+from lslam.graph.consistency import Drift, judge_loops
+from lslam.graph.odometry_constraints import odometry_constraints
+from lslam.graph.pose_graph import from_held
+from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.preprocessing.ground import world_up_of
 from lslam.printable import counted
 from lslam.types.arrays import Floats, Longs
-from lslam.types.constraint import ControlPoint, ControlResidual
+from lslam.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
 from lslam.types.gnss import Georeference
 from lslam.types.scan_result import ScanResult
 from lslam.types.trajectory import Keyframe
@@ -206,3 +208,60 @@ def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Conf
     except UsageError:
         return configured
     return given
+
+
+def where_held(
+    keyframes: list[Keyframe], known: list[LoopCandidate], points: Many[ControlPoint], results: list[ScanResult],
+    config: Config,
+) -> list[Keyframe]:  # fmt: skip
+    """The keyframes where odometry, known pairs and control points put them: further loop closures are searched from there."""
+    loops = [c.constraint for c in known if c.is_accepted and c.constraint is not None]
+    if len(keyframes) < 2 or not (loops or points):
+        return keyframes
+    graph, R = _graph_of(keyframes, loops, results, config), np.eye(3)
+    if points:
+        placement = with_control(Placement(), points, results, keyframes, None, config)
+        if placement.georeference is not None:
+            graph, R = on_earth(graph, placement), placement.georeference.T_enu_world[:3, :3]
+    try:
+        poses = from_held(graph, config.graph).poses
+    except (GraphError, np.linalg.LinAlgError) as error:
+        log.debug("known pairs and control points alone: %s", error)  # said where all of it is solved
+        return keyframes
+    return [
+        replace(k, T_world_lidar=T, covariance=None if k.covariance is None else noise.rotated(k.covariance, R))
+        for k, T in zip(keyframes, poses, strict=True)
+    ]
+
+
+def doubts(
+    keyframes: list[Keyframe], known: list[LoopCandidate], pairs: Many[KnownPair], results: list[ScanResult],
+    config: Config,
+) -> list[str]:  # fmt: skip
+    """A sentence for each known pair that does not register, and for each that odometry contradicts, which holds all the same."""
+    said = [
+        f"{pair.said}: the scans of the known pair do not close a loop: {candidate.reason}"
+        for pair, candidate in zip(pairs, known, strict=True)
+        if not candidate.is_accepted
+    ]
+    held = [(p, c.constraint) for p, c in zip(pairs, known, strict=True) if c.is_accepted and c.constraint is not None]
+    if held:
+        graph = _graph_of(keyframes, [constraint for _, constraint in held], results, config)
+        reasons = judge_loops(graph, config.graph)
+        said += [
+            f"{pair.said}: the known pair holds, though {reason}"
+            for (pair, _), reason in zip(held, reasons, strict=True)
+            if reason
+        ]
+    return said
+
+
+def _graph_of(
+    keyframes: list[Keyframe], loops: list[Constraint], results: list[ScanResult], config: Config
+) -> PoseGraph:
+    return PoseGraph(
+        poses=np.stack([k.T_world_lidar for k in keyframes]),
+        odometry=odometry_constraints(keyframes, results, config.graph, None),
+        loops=loops,
+        distances=np.array([k.distance for k in keyframes]),
+    )

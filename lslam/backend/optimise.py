@@ -24,7 +24,7 @@ from lslam.backend.control_points import (
 )
 from lslam.backend.final_checks import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
-from lslam.backend.inputs import floor_planes, on_one_plane, up_directions, world_up
+from lslam.backend.levelling import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.config import Config
 from lslam.errors import GraphError

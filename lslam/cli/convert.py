@@ -135,7 +135,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     import logging
 
     from lslam.cli.console import progress
-    from lslam.convert.output import check_output
+    from lslam.convert import check_output
 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
     options.require_there(given["deskewed"])
@@ -164,7 +164,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
 
 def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any]) -> None:
     from lslam.cli.console import progress
-    from lslam.convert.output import check_output
+    from lslam.convert import check_output
 
     out = folder / f"run{BAGS[kind]}" if out is None else out
     check_output(kind, out, given["is_zstd"], given["overwrite"])
@@ -214,7 +214,7 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
 
     how = {"frame": given["frame"], "overwrite": given["overwrite"]}
     if kind in EARTH:
-        from lslam.convert.on_earth import convert_to_earth, georeference_beside
+        from lslam.convert.convert_trajectory import convert_to_earth, georeference_beside
 
         options.require_there(Path(source))
         georeference = georeference_beside(Path(source).expanduser(), kind)

@@ -9,7 +9,7 @@ import click
 
 from lslam.cli import options
 from lslam.errors import UsageError, nearest
-from lslam.evaluation.recipes import ALIGNMENTS, check_words, parse_delta
+from lslam.evaluation import ALIGNMENTS, check_words, parse_delta
 from lslam.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:

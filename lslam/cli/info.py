@@ -138,7 +138,7 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
         find_folder(name, data_root)
     except LslamError:
         return  # there is nothing: no need to import what would look into it
-    from lslam.doctor.examine_bag import bag_at
+    from lslam.doctor.inspect import bag_at
 
     bag = bag_at(name, data_root)
     if bag is None:

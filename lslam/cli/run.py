@@ -170,7 +170,7 @@ def _check_folder(given: dict[str, Any]) -> None:
 
 def _flags(given: dict[str, Any]) -> dict[str, Any]:
     """Values of the flags by configuration key, None for flags that are not given. Raises UsageError for unknown words."""
-    from lslam.evaluation.recipes import check_words
+    from lslam.evaluation import check_words
     from lslam.odometry import require_method
 
     check_words(options.metrics_of(given["metrics"]))

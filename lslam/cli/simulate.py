@@ -142,7 +142,7 @@ def command(
     if plan is not None and plan.suffix.lower() != ".png":
         raise click.UsageError(f"--plan {plan}: the scene is drawn as PNG, name a file FILE.png")
     console.setup_logging(verbose, quiet)
-    from lslam.simulation.target import check_target
+    from lslam.simulation import check_target
 
     if out is not None:
         check_target(out, overwrite, resume)
@@ -215,9 +215,9 @@ def _draw_map(
     from lslam.simulation.built_scenario import whole_map
     from lslam.simulation.osm_place import read_extract
     from lslam.simulation.plan import plan_of
-    from lslam.simulation.ray_scene import RayScene
     from lslam.simulation.scenario_files import scenario_named
     from lslam.simulation.scenarios import checked_origin
+    from lslam.simulation.scene_mesh import RayScene
 
     extract = read_extract(osm, None if origin is None else checked_origin(origin))
     city, line = whole_map(scenario_named(scenario, settings), seed, extract)

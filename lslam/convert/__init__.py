@@ -1,1 +1,56 @@
-"""Recordings and trajectories into other formats and frames."""
+"""Sequences, trajectories and runs in other formats; here, whether an output suits what is written there, seen early."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from lslam.errors import OutputError, OutputExistsError, UsageError, cause
+
+SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
+
+
+def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
+    """Raise UsageError when `out` does not suit `kind`, OutputExistsError when it is there already."""
+    if kind not in (*SUFFIXES, "kitti"):
+        raise UsageError(f"no layout {kind!r} for sequences: {', '.join(SUFFIXES)} and kitti are")
+    if is_zstd and kind in ("bag", "kitti"):
+        raise UsageError(f"--zstd is for mcap and sqlite, not for {kind}")
+    fitting = SUFFIXES.get(kind, "")
+    if out.suffix in SUFFIXES.values() and out.suffix != fitting:
+        raise UsageError(f"--out {out}: a name in {out.suffix} is not for --to {kind}")
+    if kind == "bag" and out.suffix != ".bag":
+        raise UsageError(f"--out {out}: a ROS 1 bag is one file, its name ends in .bag")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+
+
+def check_beside(out: Path, source: Path, what: str) -> None:
+    """Raise UsageError when `out` is `source`, in words `what`, or a folder that holds it."""
+    here, there = source.resolve(), out.resolve()
+    if there == here or there in here.parents:
+        raise UsageError(f"--out {out} holds {what} itself: choose another")
+
+
+@contextmanager
+def staged(out: Path) -> Iterator[Path]:
+    """Where to make what becomes the file or folder `out`, in place of what is there, when the block ends well.
+
+    Raises OutputError naming what cannot be written.
+    """
+    stage = out.with_name(out.name + ".new")
+    try:
+        shutil.rmtree(stage, ignore_errors=True)
+        stage.mkdir(parents=True)
+        made = stage / out.name
+        yield made
+        if out.exists():
+            out.rename(stage / "old")
+        os.replace(made, out)
+    except OSError as error:
+        raise OutputError(f"{error.filename or out} cannot be written: {cause(error)}") from None
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)

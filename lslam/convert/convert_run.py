@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.convert import bag_messages
+from lslam.convert import bag_messages, check_beside, check_output, staged
 from lslam.convert.bag_writer import MAP_TOPIC, PATH_TOPIC, BagWriter
-from lslam.convert.output import check_beside, check_output, staged
 from lslam.errors import InputError, UsageError
 from lslam.formats.point_files import read_cloud
 from lslam.frontend.register_scans import read_ahead

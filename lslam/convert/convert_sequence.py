@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from lslam.convert import bag_messages
+from lslam.convert import bag_messages, check_beside, check_output, staged
 from lslam.convert.bag_writer import BagWriter
 from lslam.convert.convert_trajectory import change_frame
-from lslam.convert.output import check_beside, check_output, staged
 from lslam.errors import InputError, UsageError
 from lslam.formats.bag_files import INFO_TOPIC
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times

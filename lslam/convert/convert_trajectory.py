@@ -1,17 +1,29 @@
-"""A trajectory in another format, and of another body: LiDAR, camera 0 or IMU."""
+"""A trajectory in another format, of another body (LiDAR, camera 0 or IMU), or for map programs: KML by fastkml, GPX by gpxpy."""
 
 from __future__ import annotations
 
 import logging
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
+import numpy as np
+
 from lslam.errors import InputError, OutputExistsError, UsageError
+from lslam.extras import importing, install_hint
+from lslam.formats.atomic import write_text
 from lslam.formats.sequence_toml import FRAMES
+from lslam.formats.stamp_texts import utc_of
 from lslam.formats.trajectory_formats import FORMATS, WRITTEN
 from lslam.geometry import se3
+from lslam.maps.georeference import to_lat_lon
+from lslam.pipeline.map_files import georeference_of, read_json
+from lslam.types.gnss import Georeference
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
+from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 
@@ -90,3 +102,121 @@ def _known(calibration: Calibration, name: str, trajectory: Trajectory, frame: s
             f"--frame {trajectory.frame} to leave them as they are"
         )
     return T
+
+
+Place = tuple[float, float, float]
+
+
+def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
+    """Write a way of lat, lon (deg), height (m), WGS84, as a line, and as a track in time where `times` (UTC) are known.
+
+    The line lies on the ground: KML counts heights from the sea, ours are above the ellipsoid. They stand in the coordinates.
+    Raises OutputError when the file cannot be written, InputError without fastkml.
+    """
+    with importing("fastkml", install_hint("geo")), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # without lxml it does not indent
+        from fastkml import KML, Document, Placemark, gx
+        from fastkml.enums import AltitudeMode
+        from fastkml.geometry import LineString
+        from fastkml.times import KmlDateTime
+        from pygeoif import geometry
+    coordinates = [(lon, lat, height) for lat, lon, height in places]
+    # KML asks for two points of a line.
+    line = geometry.LineString(coordinates if len(coordinates) > 1 else coordinates * 2)
+    marks = [Placemark(name=name, description=about, kml_geometry=LineString(
+        geometry=line, tessellate=True, altitude_mode=AltitudeMode.clamp_to_ground,
+    ))]  # fmt: skip
+    if times is not None:
+        track = gx.Track(
+            altitude_mode=AltitudeMode.clamp_to_ground, whens=[KmlDateTime(t) for t in times], coords=coordinates
+        )
+        marks.append(Placemark(name=f"{name}, in time", kml_geometry=track))
+    document = KML(features=[Document(name=name, description=about, features=marks)])
+    write_text(path, '<?xml version="1.0" encoding="UTF-8"?>\n' + document.to_string() + "\n")
+
+
+def write_gpx(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
+    """Write a way of lat, lon (deg), height (m), WGS84, as one segment, with `times` (UTC) where they are known.
+
+    Raises OutputError when the file cannot be written, InputError without gpxpy.
+    """
+    with importing("gpxpy", install_hint("geo")):
+        from gpxpy.gpx import GPX, GPXTrack, GPXTrackPoint, GPXTrackSegment
+    points = [
+        GPXTrackPoint(lat, lon, elevation=height, time=None if times is None else times[k])
+        for k, (lat, lon, height) in enumerate(places)
+    ]
+    document = GPX()
+    document.creator = f"lslam {__version__}"
+    track = GPXTrack(name=name, description=about)
+    track.segments.append(GPXTrackSegment(points))
+    document.tracks.append(track)
+    write_text(path, document.to_xml(version="1.1") + "\n")
+
+
+WRITERS = {"kml": write_kml, "gpx": write_gpx}
+TRAJECTORY, MANIFEST = "trajectory.tum", "manifest.json"
+
+
+def georeference_beside(source: Path, kind: str) -> Georeference:
+    """Where on the Earth the trajectory of a run folder, or its `trajectory.tum`, lies, as its manifest says.
+
+    Raises UsageError with the way out when that is unknown.
+    """
+    folder = source if source.is_dir() else source.parent
+    is_of_run = (folder / MANIFEST).is_file() and (source.is_dir() or source.name == TRAJECTORY)
+    if not is_of_run:
+        raise UsageError(
+            f"--to {kind} needs to know where on the Earth the poses lie: {source} is neither the folder of a run nor its "
+            f"{TRAJECTORY}"
+        )
+    georeference = georeference_of(read_json(folder / MANIFEST).get("georeference"))
+    if georeference is None:
+        raise UsageError(
+            f"--to {kind} needs to know where on the Earth the poses lie, and {folder} is not georeferenced: run the sequence "
+            "again with --gnss or --georeference where it has fixes, or with --osm"
+        )
+    return georeference
+
+
+def convert_to_earth(
+    trajectory: Trajectory,
+    kind: str,
+    out: Path,
+    georeference: Georeference,
+    calibration: Calibration,
+    *,
+    frame: str | None = None,
+    overwrite: bool = False,
+) -> Trajectory:
+    """Write the places of `trajectory` to `out` as `kind`, `kml` or `gpx`; what was written.
+
+    Degrees have 7 decimals (1 cm), heights above the WGS84 ellipsoid 3. Times are UTC, and left out where stamps are not
+    Unix time.
+
+    Raises
+    ------
+    OutputExistsError : `out` is there and `overwrite` is not set. UsageError : unknown `kind`, or the `frame` of a camera.
+    InputError : no pose is finite, or the change of body needs an extrinsic that `calibration` does not have.
+    """
+    if kind not in WRITERS:
+        raise UsageError(f"no format {kind!r} of map programs: {', '.join(WRITERS)} are")
+    if frame == "cam0":
+        raise UsageError(f"--frame cam0: poses of the camera have a world of their own, --to {kind} takes lidar or imu")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+    moved = change_frame(trajectory, frame or trajectory.frame, calibration)
+    moved = moved.select(np.isfinite(moved.positions).all(axis=1))
+    if not len(moved):
+        raise InputError(f"{trajectory.source} has no pose that is finite")
+    places = [
+        (round(lat, 7), round(lon, 7), round(h, 3))
+        for lat, lon, h in to_lat_lon(moved.positions, georeference).tolist()
+    ]
+    name = out.stem
+    about = f"poses of {moved.frame} by lslam, heights in m above the WGS84 ellipsoid"
+    if georeference.method == "osm":
+        about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    WRITERS[kind](out, places, utc_of(moved.stamps_ns) if moved.has_stamps else None, name, about)
+    return moved

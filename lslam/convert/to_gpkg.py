@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lslam.convert.on_earth import georeference_beside
-from lslam.convert.output import staged
+from lslam.convert import staged
+from lslam.convert.convert_trajectory import georeference_beside
 from lslam.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.extras import importing, install_hint
 from lslam.formats.stamp_texts import utc_of

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.doctor.findings import Facts, Finding, plural
+from lslam.doctor import Facts, Finding, plural
 from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
 from lslam.inertial.initialise import STILL_FORCE, STILL_RATE
 from lslam.types.arrays import Floats

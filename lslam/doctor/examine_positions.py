@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.doctor.findings import Facts, Finding, plural
+from lslam.doctor import Facts, Finding, plural
 from lslam.geometry.geodesy import to_local
 from lslam.types.arrays import Floats, Longs
 from lslam.types.sequence import Sequence, no_shared_time

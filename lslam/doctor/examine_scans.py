@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.doctor.findings import Facts, Finding, plural
+from lslam.doctor import Facts, Finding, plural
 from lslam.errors import InputError
 from lslam.integrity.directions import MOST_EMPTIED, emptied, filled_directions
 from lslam.preprocessing.rings import RingRule

@@ -9,7 +9,7 @@ from itertools import permutations, product
 import numpy as np
 
 from lslam.config import Config
-from lslam.doctor.findings import Facts, Finding
+from lslam.doctor import Facts, Finding
 from lslam.frontend.inertial_start import first_poses
 from lslam.geometry import so3
 from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns

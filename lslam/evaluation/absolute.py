@@ -8,6 +8,7 @@ import numpy as np
 
 from lslam.config.outputs import EvalConfig
 from lslam.errors import UsageError, nearest
+from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
     Document,
@@ -18,7 +19,6 @@ from lslam.evaluation.metric import (
     statistics_document,
     two,
 )
-from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
 from lslam.geometry import se3, so3
 from lslam.printable import fixed, metres, significant

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
+from lslam.evaluation import parse_delta
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
     Document,
@@ -19,7 +20,6 @@ from lslam.evaluation.metric import (
     statistics_document,
     two,
 )
-from lslam.evaluation.recipes import parse_delta
 from lslam.evaluation.results import Evaluation, RelativeError, describe
 from lslam.geometry import se3, so3
 from lslam.printable import metres

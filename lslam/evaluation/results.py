@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.evaluation.recipes import ALIGNMENTS
+from lslam.evaluation import ALIGNMENTS
 from lslam.types.arrays import Floats, Longs
 
 # A path this short, m, is the rounding of poses that do not move.

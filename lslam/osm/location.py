@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lslam.backend.inputs import floor_planes
-from lslam.backend.levelling import UP
+from lslam.backend.levelling import floor_planes
 from lslam.config import Config
 from lslam.config.backend import GraphConfig, OsmConfig
 from lslam.formats.osm_buildings import BuildingExtract
@@ -27,7 +26,7 @@ from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildings, match_keyframe, shares
 from lslam.osm.walls import OsmMap, find_walls
-from lslam.preprocessing.ground import up_of, world_up_of
+from lslam.preprocessing.ground import Z, up_of, world_up_of
 from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
@@ -83,7 +82,7 @@ def locate(
     osm = OsmMap(extract.buildings)
     odometry = np.stack([k.T_world_lidar for k in store.keyframes]) if odometry is None else odometry
     up = _up_by_ground(store, odometry, config) if up is None else up
-    T_level = se3.make(so3.least_rotation(up, UP), np.zeros(3)) if placed is None else placed
+    T_level = se3.make(so3.least_rotation(up, Z), np.zeros(3)) if placed is None else placed
     poses = T_level @ odometry
     start = _start(store, poses, osm, config, placed)
     if start.problem:

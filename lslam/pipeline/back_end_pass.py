@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.backend import added_drift
-from lslam.backend.held_first import doubts, where_held
+from lslam.backend.control_points import doubts, where_held
 from lslam.backend.levelling import find_level, level_results
 from lslam.backend.manual import KeyframePairs, keyframe_pairs, write_control
 from lslam.backend.optimise import run_back_end
@@ -30,7 +30,7 @@ from lslam.osm.hold import hold_by_buildings
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.run_tables import write_loops, write_osm_matches
+from lslam.pipeline.outputs import write_loops, write_osm_matches
 from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference

@@ -6,7 +6,7 @@ from lslam.config import Config
 from lslam.config.load import read_preset
 from lslam.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.errors import UsageError
-from lslam.evaluation.recipes import check_words, parse_delta
+from lslam.evaluation import check_words, parse_delta
 from lslam.loops import require_descriptor
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.osm import matcher_named

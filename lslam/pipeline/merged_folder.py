@@ -24,10 +24,9 @@ from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.map_files import MapNote, write_map
 from lslam.pipeline.map_pass import BuiltMap, MapMaker, scan_poser
 from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
-from lslam.pipeline.outputs import config_text
+from lslam.pipeline.outputs import config_text, write_loops
 from lslam.pipeline.rebuild import EarlierRun, open_scans
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
-from lslam.pipeline.run_tables import write_loops
 from lslam.pipeline.watch import Watch
 from lslam.reports.merge_html import SessionView, write_page
 from lslam.types.arrays import Floats

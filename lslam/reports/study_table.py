@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from lslam.config.config import with_unit
+from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.curves import normalise
-from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.evaluations import strict

@@ -1,1 +1,36 @@
-"""The virtual environment: a city, a path, a LiDAR, exact ground truth."""
+"""The virtual environment; here, whether the folder of a simulation may be written, seen before anything heavy is imported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lslam.errors import OutputError, OutputExistsError, cause
+
+NUMBER = "00"  # of the one sequence in the folder
+
+
+def check_target(out: Path, overwrite: bool, resume: bool = False) -> None:
+    """Raise OutputExistsError when `out` is a file, or holds something and neither `overwrite` nor `resume` allows that."""
+    try:
+        if out.exists() and not out.is_dir():
+            raise OutputExistsError(f"{out} is a file: give --out a folder that does not exist yet")
+        if overwrite or not out.is_dir() or not any(out.iterdir()):
+            return
+        begun = part_of(out).is_dir()
+        if resume and begun:
+            return
+        if begun:
+            raise OutputExistsError(
+                f"{out} holds a simulation that was interrupted: --resume goes on, --overwrite begins anew"
+            )
+        raise OutputExistsError(
+            f"{out} exists already{' and nothing in it was interrupted' if resume else ''}: choose another --out, or "
+            "--overwrite to replace the sequence in it"
+        )
+    except OSError as error:
+        raise OutputError(f"{out} cannot be read: {cause(error)}") from None
+
+
+def part_of(out: Path) -> Path:
+    """Where the scans of a simulation lie that is not whole yet."""
+    return out / "sequences" / f"{NUMBER}.part"

@@ -21,7 +21,6 @@ from lslam.simulation.kinematics import PosePath
 from lslam.simulation.moving import Mover, add_queue, add_traffic
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import MapExtract, city_of_map, keep_out_of_walls, route_in_map
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.routes import (
     FIRST_VISIT,
     SPARE,
@@ -34,7 +33,7 @@ from lslam.simulation.routes import (
     visited,
 )
 from lslam.simulation.scenario_files import INDOORS, Scenario
-from lslam.simulation.scene_mesh import Surface
+from lslam.simulation.scene_mesh import RayScene, Surface
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from lslam.geometry import portable
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
-from lslam.simulation.scene_mesh import Surface
+from lslam.simulation.scene_mesh import RayScene, Surface
 from lslam.types.arrays import Bools, Floats
 from lslam.types.scan import Scan
 

@@ -14,8 +14,7 @@ from lslam.simulation import furniture
 from lslam.simulation.city import KERB
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.lidar import MovingMesh
-from lslam.simulation.ray_scene import RayScene
-from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, tube
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface, tube
 from lslam.simulation.terrain import Terrain
 from lslam.types.arrays import Floats
 

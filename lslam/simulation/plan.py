@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.simulation.city import City
-from lslam.simulation.ray_scene import RayScene
-from lslam.simulation.scene_mesh import Surface
+from lslam.simulation.scene_mesh import RayScene, Surface
 from lslam.types.arrays import Floats, Longs
 
 Image = NDArray[np.uint8]

@@ -23,11 +23,11 @@ from lslam.formats.atomic import write_text
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, scan_files, write_calib, write_scan, write_times
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.formats.trajectory_files import write_kitti
+from lslam.simulation import NUMBER, check_target, part_of
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
-from lslam.simulation.target import NUMBER, check_target, part_of
 from lslam.types.scan import Scan
 from lslam.untrusted import parse_json
 from lslam.version import __version__

@@ -13,8 +13,8 @@ import numpy as np
 
 from lslam.config.outputs import EvalConfig
 from lslam.errors import InterruptedRunError, LslamError
+from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.recipes import ALIGNMENTS
 from lslam.evaluation.results import AbsoluteError
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.readers import open_sequence
@@ -26,8 +26,7 @@ from lslam.studies.paired import TIE_M, compare_pairs, summarise
 from lslam.studies.plan import Plan, check_plan
 from lslam.studies.results import IMU, collect_run, metrics_of
 from lslam.studies.runner import StudyProgress
-from lslam.studies.scenes import Scene, simulate_once
-from lslam.studies.subjects import Subject, scans_needed, with_range
+from lslam.studies.subjects import Scene, Subject, scans_needed, simulate_once, with_range
 from lslam.types.arrays import Floats
 from lslam.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
 from lslam.types.sequence import Sequence as Recording

@@ -19,8 +19,7 @@ from lslam.studies.jobs import Local
 from lslam.studies.results import Results
 from lslam.studies.results_csv import FINAL, read_state
 from lslam.studies.runner import StudyProgress
-from lslam.studies.scenes import drive_of, simulate_once
-from lslam.studies.subjects import used
+from lslam.studies.subjects import drive_of, simulate_once, used
 from lslam.studies.sweep import write_study_report
 from lslam.studies.variants import Variant
 from lslam.types.arrays import Floats

@@ -20,8 +20,7 @@ from lslam.readers.lookup import find_folder
 from lslam.readers.raw_drive import with_imu
 from lslam.remote import RemotePath, as_path
 from lslam.studies.output import SIMULATED, OutputOptions
-from lslam.studies.scenes import Scene, drive_of, scene_digest, scene_folder
-from lslam.studies.subjects import check_range, scans_needed, with_range
+from lslam.studies.subjects import Scene, check_range, drive_of, scans_needed, scene_digest, scene_folder, with_range
 from lslam.studies.variants import Variant, free_name
 from lslam.untrusted import parse_toml
 

@@ -17,8 +17,7 @@ from lslam.remote import RemotePath
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state
 from lslam.studies.runner import StudyProgress, Task, WorkerPool, run_tasks
-from lslam.studies.scenes import simulate_once
-from lslam.studies.subjects import used
+from lslam.studies.subjects import simulate_once, used
 from lslam.studies.worker import WorkerContext, execute
 
 log = logging.getLogger("lslam")

@@ -238,7 +238,7 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
 
 def _opening(job: Job) -> Callable[[], Sequence]:
     from lslam.readers import open_sequence
-    from lslam.studies.scenes import simulate_once
+    from lslam.studies.subjects import simulate_once
 
     def opening() -> Sequence:
         if job.scene is not None:

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lslam.backend.control_points import contradicting, control_residuals, with_control
+from lslam.backend.control_points import contradicting, control_residuals, where_held, with_control
 from lslam.backend.georeferencing import Placement
-from lslam.backend.held_first import where_held
 from lslam.config import Config
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.backend.inputs import floor_planes, up_directions, world_up
+from lslam.backend.levelling import floor_planes, up_directions, world_up
 from lslam.config.backend import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.keyframes.store import KeyframeStore

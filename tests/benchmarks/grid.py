@@ -39,10 +39,10 @@ from lslam.geometry import se3
 from lslam.geometry.se3 import poses_at
 from lslam.pipeline.run import RunOutcome, Watch, run
 from lslam.readers import open_sequence
+from lslam.simulation import NUMBER
 from lslam.simulation.record import record
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import simulate
-from lslam.simulation.target import NUMBER
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
 

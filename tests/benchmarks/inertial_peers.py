@@ -27,7 +27,7 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.formats.trajectory_files import read_trajectory
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence
-from lslam.studies.scenes import Scene, simulate_once
+from lslam.studies.subjects import Scene, simulate_once
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory

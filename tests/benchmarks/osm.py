@@ -39,7 +39,7 @@ from lslam.geometry import geodesy, se2
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
-from lslam.studies.scenes import Scene, simulate_once
+from lslam.studies.subjects import Scene, simulate_once
 from tests.building_errors import BuildingError, building_errors
 
 Floats = NDArray[np.float64]

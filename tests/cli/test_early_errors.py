@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from lslam.evaluation import WORDS
 from lslam.evaluation.evaluate import METRICS
-from lslam.evaluation.recipes import WORDS
 
 SAMPLE = str(Path(__file__).resolve().parents[2] / "sample_data")
 TRUTH = f"{SAMPLE}/poses/00.txt"

@@ -16,7 +16,7 @@ from bag_builders import KINDS, START_NS, SUFFIX, bag, clouds, imu, together, tr
 
 from lslam.convert import bag_messages
 from lslam.convert.bag_writer import BagWriter
-from lslam.doctor.examine_bag import examine_bag
+from lslam.doctor.inspect import examine_bag
 from lslam.formats.bag_files import Bag, open_bag
 
 

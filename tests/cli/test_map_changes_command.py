@@ -18,10 +18,9 @@ from lslam.formats.trajectory_files import read_trajectory
 from lslam.geometry import se3
 from lslam.geometry.se3 import umeyama
 from lslam.maps.georeference import Projection, to_wgs84
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive
-from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.types.gnss import Georeference
 
 # Length, width and height of the box, m: well below a whole number of cells of 0.4 m, so that noise fills no further one.

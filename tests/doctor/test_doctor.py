@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.doctor import Facts, Finding
 from lslam.doctor.examine_imu import examine_imu
 from lslam.doctor.examine_positions import examine_gnss
 from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times
 from lslam.doctor.examine_turns import compare, examine_turns
-from lslam.doctor.findings import Facts, Finding
 from lslam.doctor.inspect import inspect
 from lslam.geometry import so3
 from lslam.inertial.imu_cleaning import ImuFault, ImuRefusedError, clean

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lslam.doctor import Finding
 from lslam.doctor.examine_units import examine_units
-from lslam.doctor.findings import Finding
 from lslam.doctor.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.scan import Span

@@ -9,7 +9,7 @@ import pytest
 
 from lslam.errors import InputError
 from lslam.evaluation.timing import read_timing, read_timing_rows
-from lslam.pipeline.run_tables import timing_text
+from lslam.pipeline.outputs import timing_text
 
 GOOD = "index,stamp_ns,read,register,total\n" + "".join(
     f"{k},{k * 10**8},0.01,{0.001 * k},{0.01 + 0.001 * k}\n" for k in range(101)

@@ -7,8 +7,8 @@ import pytest
 from evaluation_drives import drive
 
 from lslam.errors import UsageError
+from lslam.evaluation import parse_delta
 from lslam.evaluation.kitti_drift import kitti_drift
-from lslam.evaluation.recipes import parse_delta
 from lslam.evaluation.relative import by_index, by_path, by_time, relative_error
 from lslam.evaluation.thesis import axis_errors, planar
 from lslam.geometry import se3, so3

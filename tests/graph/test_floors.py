@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lslam.backend.inputs import on_one_plane
+from lslam.backend.levelling import on_one_plane
 from lslam.config.backend import GraphConfig
 from lslam.geometry import se3, so3
 from lslam.graph.problem import FloorPlane

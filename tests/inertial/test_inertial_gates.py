@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from stub_sequences import Stub
 
+from lslam.doctor import Finding
 from lslam.doctor.examine_imu import examine_imu
-from lslam.doctor.findings import Finding
 from lslam.errors import InputError
 from lslam.frontend.inertial_start import _require_rate
 from lslam.geometry import se3, so3

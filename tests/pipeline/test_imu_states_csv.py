@@ -7,7 +7,7 @@ import io
 
 import numpy as np
 
-from lslam.pipeline.run_tables import imu_states_text
+from lslam.pipeline.outputs import imu_states_text
 from lslam.types.imu import IMU_STATES, ImuDiagnostics, ImuState
 from lslam.types.scan_result import ScanResult
 

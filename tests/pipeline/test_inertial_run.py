@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from stub_sequences import Standstill, Stub
 
 from lslam.config import Config, load_config
+from lslam.doctor import Finding
 from lslam.doctor.examine_turns import examine_turns
-from lslam.doctor.findings import Finding
 from lslam.errors import GateError, InputError
 from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory

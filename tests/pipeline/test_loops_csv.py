@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lslam.errors import OutputError
-from lslam.pipeline.run_tables import LOOP_COLUMNS, write_loops
+from lslam.pipeline.outputs import LOOP_COLUMNS, write_loops
 from lslam.types.constraint import Constraint, LoopCandidate
 
 SCANS = [0, 3, 6, 9, 12]

@@ -16,8 +16,7 @@ from lslam.preprocessing.features import extract_features
 from lslam.preprocessing.petals import petal_features, walk_lines
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LIDARS
-from lslam.simulation.ray_scene import RayScene
-from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.types.scan import Scan
 
 GATE = PreprocessConfig(range_min=0.5, range_max=200.0)

@@ -12,8 +12,7 @@ from lslam.errors import UsageError
 from lslam.geometry import se3, so3
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel, lidar_named
-from lslam.simulation.ray_scene import RayScene
-from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface
 
 # A LiDAR without faults, so that answers are exact.
 PERFECT = LidarModel("perfect", (10.0, 2.0, -5.0, -15.0, -30.0), 360, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)

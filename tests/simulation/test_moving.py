@@ -15,9 +15,8 @@ from lslam.simulation.curve import smooth_curve
 from lslam.simulation.lidar import MovingMesh, Roof, trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel
 from lslam.simulation.moving import NEAREST, Mover, add_traffic, moving_meshes, pedestrian
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenarios import simulate
-from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface
 from lslam.simulation.terrain import flat, rolling
 
 PERFECT = LidarModel("perfect", (2.0, 0.0, -2.0), 3600, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)

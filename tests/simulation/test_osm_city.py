@@ -17,8 +17,7 @@ from lslam.errors import InputError
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.osm_city import OsmCity, build_osm_city, extrude
 from lslam.simulation.osm_place import read_extract
-from lslam.simulation.ray_scene import RayScene
-from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.simulation.terrain import flat, rolling
 from lslam.types.building import Building, Footprint, footprint_polygon
 

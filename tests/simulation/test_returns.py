@@ -11,11 +11,10 @@ from scipy import stats
 
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.returns import Hits, Rays, Returns, errors, mixed, range_walk, texture
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import simulate
-from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 
 Floats = NDArray[np.float64]
 

@@ -116,7 +116,7 @@ def test_cities_differ_by_seed() -> None:
 
 def off_the_surface(drive: SimulatedDrive, scan: Scan, T_city_lidar: NDArray[np.float64]) -> NDArray[np.float64]:
     """Distance of points to the planes of the faces that exact rays through them meet, m."""
-    from lslam.simulation.ray_scene import RayScene
+    from lslam.simulation.scene_mesh import RayScene
 
     poses = np.broadcast_to(T_city_lidar, (len(scan), 4, 4))
     points = np.einsum("nij,nj->ni", poses[:, :3, :3], scan.points.astype(float)) + poses[:, :3, 3]

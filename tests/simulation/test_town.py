@@ -11,10 +11,9 @@ import pytest
 from lslam.errors import UsageError
 from lslam.simulation.built_scenario import check_bends, check_path
 from lslam.simulation.city import KERB, City
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import Network
 from lslam.types.scan import Scan

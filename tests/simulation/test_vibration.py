@@ -10,10 +10,9 @@ from lslam.geometry import se3
 from lslam.simulation.kinematics import Vibration, shaking
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.ray_scene import RayScene
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import simulate
-from lslam.simulation.scene_mesh import MeshBuilder, Surface
+from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 
 SHARES_TOWNS = True
 

@@ -18,8 +18,7 @@ from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
 from lslam.studies.grid import Cell, Job, expand
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state
-from lslam.studies.scenes import Scene, simulate_once
-from lslam.studies.subjects import find_subjects, scans_needed
+from lslam.studies.subjects import Scene, find_subjects, scans_needed, simulate_once
 from lslam.studies.variants import Variant, find_variants
 from lslam.types.trajectory import Trajectory
 
