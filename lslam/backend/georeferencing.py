@@ -130,7 +130,7 @@ def place(
     fix_noise, walk = None, 0.0
     if config.gnss.mode == "graph":
         fix_noise, walk = _fix_noise(fixes, found, keyframes, graph, config)
-    factors = _as_factors(fixes, found, shift, results, keyframes, arm, fix_noise)
+    factors = _as_factors(fixes, found, shift, results, keyframes, fix_noise)
     problem = _elsewhere(found) or contradicted(found, fixes)
     return Placement(georeference, factors, fix_noise, walk, problem, faults=faults)
 
@@ -309,7 +309,7 @@ def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
 
 
 def _as_factors(
-    fixes: Fixes, found: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe], arm: Floats,
+    fixes: Fixes, found: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe],
     fix_noise: GaussMarkovNoise | None,
 ) -> tuple[PositionFix, ...]:  # fmt: skip
     """Position factors, each from the keyframe before the fix; gross outliers are left out."""

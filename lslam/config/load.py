@@ -6,6 +6,7 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Mapping
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.printable import toml_text
 from lslam.untrusted import is_file, parse_toml
 
-FOLDER = "presets"
 # A preset may say what it is, and on which other one it stands, on a line each beside its sections.
 SUMMARY, BASE = "summary", "base"
 Tree = dict[str, Any]
@@ -33,7 +33,7 @@ REMOVED = {
 
 def known_presets() -> dict[str, str]:
     """Names and one-line summaries of the presets that ship with lslam."""
-    return {name: str(parse_toml(text).get(SUMMARY, "")) for name, text in _shipped().items()}
+    return {name: str(parse_toml(text).get(SUMMARY, "")) for name, text in _presets().items()}
 
 
 def read_preset(name: str) -> dict[str, Any]:
@@ -41,15 +41,19 @@ def read_preset(name: str) -> dict[str, Any]:
 
     Raises UsageError with the nearest name when there is none, InputError or ConfigError for an unusable file.
     """
-    shipped = _shipped()
-    if name in shipped:
-        tree = parse_toml(shipped[name])
+    presets = _presets()
+    if name in presets:
+        tree = parse_toml(presets[name])
     elif name.endswith(".toml") or is_file(name):
         tree = read_toml(Path(name), "preset")
     else:
-        raise UsageError(f"no preset {name!r} and no TOML file; {nearest(name, shipped)}")
+        raise UsageError(f"no preset {name!r} and no TOML file; {nearest(name, presets)}")
     tree.pop(SUMMARY, None)
     return tree
+
+
+def _presets() -> dict[str, str]:
+    return shipped("lslam.config", "presets")
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -64,13 +68,11 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         raise ConfigError(f"{what} {path} is not valid TOML: {error}") from None
 
 
-def _shipped() -> dict[str, str]:
-    """Text of each shipped preset by name, in alphabetical order."""
-    folder = resources.files("lslam.config") / FOLDER
-    files = sorted(
-        (f for f in (folder.iterdir() if folder.is_dir() else ()) if f.name.endswith(".toml")), key=lambda f: f.name
-    )
-    return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files}
+@cache
+def shipped(package: str, folder: str) -> dict[str, str]:
+    """Text of each TOML file that ships in a folder of a package of ours by name, in the order of the files."""
+    files = sorted(resources.files(package).joinpath(folder).iterdir(), key=lambda file: file.name)
+    return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files if f.name.endswith(".toml")}
 
 
 def load_config(
@@ -156,7 +158,7 @@ def _from_environment(environ: Mapping[str, str]) -> Tree:
             continue
         section, _, key = name.removeprefix("LSLAM_").lower().partition("_")
         if section in Config.model_fields and key:
-            tree.setdefault(section, {})[key] = _value(environ[name])
+            tree.setdefault(section, {})[key] = setting_value(environ[name])
     return tree
 
 
@@ -165,10 +167,10 @@ def _parse_setting(setting: str) -> Tree:
     section, dot, key = name.strip().partition(".")
     if not equals or not dot:
         raise ConfigError(f"--set {setting}: expected section.key=value, for example map.voxel=0.1")
-    return {section: {key: _value(value.strip())}}
+    return {section: {key: setting_value(value.strip())}}
 
 
-def _value(text: str) -> Any:
+def setting_value(text: str) -> Any:
     """A TOML value, or the text itself when it is none: `--set odometry.method=icp` needs no quotes."""
     try:
         return parse_toml(f"v = {text}")["v"]

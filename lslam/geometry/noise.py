@@ -1,4 +1,4 @@
-"""Covariances of poses, from this house's order into gtsam's and back.
+"""Covariances of poses, from this house's order into gtsam's and back, and chi-square distances and their quantiles.
 
 Here a pose is disturbed as t' = t + d[:3], R' = exp(d[3:]) R: translation first, in the axes of the parent frame.
 gtsam disturbs it as T' = T exp(xi): rotation first, in the axes of the body. To first order xi = J d.
@@ -50,6 +50,11 @@ def into_body(T: NDArray[Any]) -> Floats:
     J = np.zeros((*Rt.shape[:-2], 6, 6))
     J[..., :3, 3:] = J[..., 3:, :3] = Rt
     return J
+
+
+def squared_distances(error: NDArray[Any], covariance: NDArray[Any]) -> Floats:
+    """(P,) squared Mahalanobis distances of `error` (P, n) with its `covariance` (P, n, n) or (n, n)."""
+    return np.asarray(np.einsum("ij,ij->i", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
 
 
 def quantile(probability: float, dim: int) -> float:

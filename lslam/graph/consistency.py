@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.geometry.noise import quantile
+from lslam.geometry.noise import quantile, squared_distances
 from lslam.graph.problem import PoseGraph
 from lslam.stopping import check_stop
 from lslam.types.arrays import Floats
@@ -68,7 +68,7 @@ def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
     drift = drift_of(graph, config)
     limit = quantile(config.probability, 6)
     twists, covariances = _against_odometry(graph, ends, drift)
-    errors = _squared(twists, covariances)
+    errors = squared_distances(twists, covariances)
     near = errors <= limit
     for i in np.flatnonzero(~near).tolist():
         off = float(np.linalg.norm(twists[i, :3]))
@@ -155,7 +155,7 @@ def _cycle_errors(
     S = ends.covariances[i] + _carried(by_b, ahead, to_bi)
     S += moved(ends.covariances[j], to_aj) + _carried(by_a, home, to_aj)
     sharpness = 1.0 / (SLACK_M**2 + by_b[:, 0, 0] + by_a[:, 0, 0])
-    return _squared(se3.log(to_aj @ home), S + _slack(len(i))), sharpness
+    return squared_distances(se3.log(to_aj @ home), S + _slack(len(i))), sharpness
 
 
 def _carried(covariance: Floats, T: Floats, to: Floats) -> Floats:
@@ -166,10 +166,6 @@ def moved(covariance: Floats, to: Floats) -> Floats:
     """Covariances of twists before `to` (..., 4, 4) as those of twists after it."""
     A = se3.adjoint(to)
     return np.asarray(A @ covariance @ np.swapaxes(A, -1, -2))
-
-
-def _squared(twists: Floats, covariances: Floats) -> Floats:
-    return np.asarray(np.einsum("ij,ij->i", twists, np.linalg.solve(covariances, twists[..., None])[..., 0]))
 
 
 def _slack(count: int) -> Floats:

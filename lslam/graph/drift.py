@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
 from lslam.geometry import noise, se3, so3
-from lslam.geometry.noise import chance_of_median, quantile
+from lslam.geometry.noise import chance_of_median, quantile, squared_distances
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
@@ -136,7 +136,7 @@ def _of_fixes(
     noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(dim)
     moved, grown = (_between(chain, poses, a, b)[:, :dim, :dim] for chain in (known, drift))
     error, known_of_pair = off[first + half] - off[first], moved + noise_of_pair
-    median = float(np.median(_squared(error, known_of_pair)))
+    median = float(np.median(squared_distances(error, known_of_pair)))
     if chance_of_median(median, dim, len(first)) < probability:
         return 0.0
     return _fitting(error, known_of_pair, grown)
@@ -185,7 +185,7 @@ def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
     typical = quantile(0.5, error.shape[1])
 
     def is_enough(factor: float) -> bool:
-        return bool(np.median(_squared(error, factor * grown + own)) <= typical)
+        return bool(np.median(squared_distances(error, factor * grown + own)) <= typical)
 
     if is_enough(0.0):
         return 0.0
@@ -194,11 +194,6 @@ def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if is_enough(float(np.exp(middle))) else (middle, high)
     return float(np.exp(high))
-
-
-def _squared(error: Floats, covariance: Floats) -> Floats:
-    """(P,) squared Mahalanobis distances of error (P, n)."""
-    return np.asarray(np.einsum("ij,ij->i", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
 
 
 def _length(constraint: Constraint) -> float:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
+from lslam.config.load import setting_value, shipped
 from lslam.config.section import Section
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.formats.kitti_layout import PER_POINT, POINTS
@@ -45,7 +44,6 @@ _RESIDENTIAL = [
 _URBAN = [(0, 0), (150, 0), (162, 88), (60, 112), (-8, 100)]
 _MOTORWAY = [(0, 0), (380, 0), (760, 95), (1150, 60)]
 _WALK = [(0, 0), (38, 2), (52, 24), (36, 48), (4, 44), (-10, 20)]
-FOLDER = "ready"
 
 
 def rounded(corners: Sequence[tuple[float, float]], radius: float, closed: bool) -> Floats:
@@ -262,11 +260,9 @@ class Scenario(Section):
         return self
 
 
-@cache
 def scenario_names() -> tuple[str, ...]:
     """Names of the scenarios that ship with the package."""
-    files = resources.files(__package__).joinpath(FOLDER).iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+    return tuple(sorted(shipped("lslam.simulation", "ready")))
 
 
 def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
@@ -291,7 +287,7 @@ def scenario_text(scenario: Scenario) -> str:
 def _ready(name: str) -> dict[str, Any]:
     if name not in scenario_names():
         raise UsageError(f"no scenario {name!r} and no file NAME.toml; {nearest(name, scenario_names())}")
-    return parse_toml(resources.files(__package__).joinpath(FOLDER, f"{name}.toml").read_text(encoding="utf-8"))
+    return parse_toml(shipped("lslam.simulation", "ready")[name])
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -314,7 +310,7 @@ def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()
         key, equals, value = setting.partition("=")
         if not equals:
             raise ConfigError(f"--set {setting}: expected key=value, for example world.relief=1")
-        leaf: Any = _value(value.strip())
+        leaf: Any = setting_value(value.strip())
         for part in reversed(key.strip().split(".")):
             leaf = {part: leaf}
         _merge(merged, leaf, Scenario, f"--set {setting}", "")
@@ -351,11 +347,3 @@ def _merge(tree: dict[str, Any], more: dict[str, Any], model: type[BaseModel], w
             raise ConfigError(f"{where}: {prefix + key!r} is a value, not a section")
         else:
             tree[key] = value
-
-
-def _value(text: str) -> Any:
-    """A TOML value, or the text itself when it is none: `--set lidar=vlp16` needs no quotes."""
-    try:
-        return parse_toml(f"v = {text}")["v"]
-    except tomllib.TOMLDecodeError:
-        return text

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
+from lslam.config.load import shipped
 from lslam.config.study import StudyConfig, StudySequence, parse_study, read_study
 from lslam.errors import InputError, UsageError, nearest
 from lslam.formats.bag_listing import stem_of
@@ -232,14 +232,9 @@ def _simulated(
     return [scene_cell(scene, seed, output.scenes or output.out / SIMULATED, own) for seed in seeds]
 
 
-# Studies that ship with lslam.
-FOLDER = "ready"
-
-
 def study_names() -> tuple[str, ...]:
     """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
-    files = resources.files(__package__).joinpath(FOLDER).iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+    return tuple(sorted(shipped("lslam.studies", "ready")))
 
 
 def find_study(word: str) -> StudyConfig:
@@ -251,5 +246,4 @@ def find_study(word: str) -> StudyConfig:
         return read_study(Path(word))
     if word not in study_names():
         raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
-    text = resources.files(__package__).joinpath(FOLDER, f"{word}.toml").read_text(encoding="utf-8")
-    return parse_study(parse_toml(text), f"study {word!r}", word)
+    return parse_study(parse_toml(shipped("lslam.studies", "ready")[word]), f"study {word!r}", word)

@@ -79,7 +79,7 @@ def test_a_resolved_configuration_repeats_itself_and_names_its_preset(
 
 def test_an_unknown_preset_is_answered_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = {"thesis-icp": "", "thesis-loam": ""}
-    monkeypatch.setattr("lslam.config.load._shipped", lambda: shipped)
+    monkeypatch.setattr("lslam.config.load._presets", lambda: shipped)
     with pytest.raises(
         UsageError, match=r"no preset 'thesis-ipc' and no TOML file; did you mean 'thesis-icp'"
     ) as caught:
