@@ -36,9 +36,7 @@ _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
 @options.studied
 @options.engine
 @options.data_root
-@click.option(
-    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
-)
+@options.set_in_all_runs
 @click.option("--strict", is_flag=True, help="Exit 4 when a run was degraded.")
 @options.as_json
 @options.verbosity

@@ -31,19 +31,15 @@ from lslam.errors import RunFinishedError, UsageError
     "--control", type=click.Path(path_type=Path), metavar="FILE",
     help="CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs.",
 )  # fmt: skip
-@click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph.")
-@click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result.")
+@options.fixes_as_factors
+@options.fixes_at_the_end
 @options.coordinates
-@click.option(
-    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
-)
-@click.option(
-    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
-)
+@options.truth
+@options.moved_sequence
 @click.option("--no-map", is_flag=True, help="Only trajectory and report.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="Run folder [default: RUN-graph].")
 @click.option("--resume", is_flag=True, help="Go on where it was killed or interrupted.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+@options.replaced
 @options.reading
 @click.option(
     "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE",

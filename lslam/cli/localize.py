@@ -27,18 +27,11 @@ from lslam.cli import run as main_job
     help="Place of the first scan in the map, m, and heading, deg counter-clockwise from its x axis [default: searched].",
 )  # fmt: skip
 @click.option("--gnss", is_flag=True, help="Search the start about the first satellite fix, in a georeferenced map.")
-@click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
+@options.method
 @options.preset
-@click.option(
-    "--poses",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Trajectory of another program instead of odometry.",
-)
-@click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
-@click.option(
-    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
-)
+@options.poses
+@options.imu
+@options.truth
 @click.option("--save-map", is_flag=True, help="Write a map of this drive too, in the frame of the old one.")
 @click.option(
     "--out",
@@ -46,14 +39,14 @@ from lslam.cli import run as main_job
     metavar="DIR|URL",
     help="Run folder [default: runs/NAME-METHOD-in-map-TIME].",
 )
-@click.option("--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+@options.resumed
+@options.replaced
 @click.option("--first", type=int, metavar="N", help="First scan used.")
 @click.option("--count", type=int, metavar="N", help="Number of scans used.")
 @click.option("--skip-frames", type=int, metavar="N", help="Use every N-th scan.")
-@click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
+@options.threads
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan that the map does not hold.")
-@click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+@options.dry_run
 @options.reading
 @options.data_root
 @options.configuration

@@ -135,9 +135,7 @@ Examples:
     help="Map file  [RUN/map.FORMAT], or folder of tiles  [RUN/tiles].",
 )
 @click.option("--overwrite", is_flag=True, help="Replace existing files.")
-@click.option(
-    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
-)
+@options.moved_sequence
 @click.option("--score", "is_scored", is_flag=True, help="Only compute the crispness of the map of RUN, or of FILE.")
 @click.option(
     "--against", type=click.Path(path_type=Path), metavar="CLOUD|RUN", help="Only compare with this cloud or run."

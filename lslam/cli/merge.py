@@ -28,7 +28,7 @@ from lslam.stopping import heeded
 @click.option("--voxel", type=float, metavar="M", help="Edge of a voxel of the map.")
 @click.option("--format", "file_format", metavar="NAME", help="Of the map: ply, pcd, las or laz [default: ply].")
 @click.option("--no-map", is_flag=True, help="Poses only.")
-@click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
+@options.threads
 @click.option("--resume", is_flag=True, help="Go on with an interrupted merge; needs its --out.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier result in the folder.")
 @options.configuration

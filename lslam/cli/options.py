@@ -35,18 +35,56 @@ class Place(click.Path):
         return super().convert(value, param, ctx)
 
 
+# Of several commands.
+data_root = click.option(
+    "--data-root",
+    type=click.Path(path_type=Path),
+    envvar="LSLAM_DATA",
+    metavar="DIR",
+    help="Where names like seq07 are looked up [env: LSLAM_DATA].",
+)
+preset = click.option("--preset", metavar="NAME|FILE", help="Configuration to start from, see `lslam config presets`.")
+as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+metrics = click.option(
+    "--metrics", multiple=True, metavar="WORD", help="Show more metrics: thesis for those of the theses."
+)
+set_in_all_runs = click.option(
+    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
+)
+fixes_as_factors = click.option(
+    "--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph."
+)
+fixes_at_the_end = click.option(
+    "--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result."
+)
+truth = click.option(
+    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
+)
+moved_sequence = click.option(
+    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
+)
+replaced = click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+method = click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
+poses = click.option(
+    "--poses",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Trajectory of another program instead of odometry.",
+)
+imu = click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
+resumed = click.option(
+    "--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out."
+)
+threads = click.option(
+    "--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same."
+)
+dry_run = click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+
+
 def verbosity(function: F) -> F:
     """--verbose and --quiet."""
     function = click.option("-v", "--verbose", is_flag=True, help="Log debugging messages on stderr.")(function)
     return click.option("-q", "--quiet", is_flag=True, help="Only warnings and errors on stderr.")(function)
-
-
-def data_root(function: F) -> F:
-    """--data-root."""
-    return click.option(
-        "--data-root", type=click.Path(path_type=Path), envvar="LSLAM_DATA", metavar="DIR",
-        help="Where names like seq07 are looked up [env: LSLAM_DATA].",
-    )(function)  # fmt: skip
 
 
 def scan_range(function: F) -> F:
@@ -172,13 +210,6 @@ def configuration(function: F) -> F:
     )(function)
 
 
-def preset(function: F) -> F:
-    """--preset."""
-    return click.option(
-        "--preset", metavar="NAME|FILE", help="Configuration to start from, see `lslam config presets`."
-    )(function)
-
-
 def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
     """The settings of --set and of the flag --preset, which beats them."""
     return [*settings, *([] if preset is None else [f"odometry.preset={json.dumps(preset)}"])]
@@ -291,23 +322,11 @@ def seeds_of(text: str) -> tuple[int, ...]:
         raise UsageError(f"--seeds {text}: whole numbers with commas between them") from None
 
 
-def as_json(function: F) -> F:
-    """--json."""
-    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")(function)
-
-
 def require_there(*paths: Path | None) -> None:
     """Raise InputError for a path that does not exist, before the modules that read it are imported."""
     for path in paths:
         if path is not None and not os.path.lexists(path):
             raise InputError(f"{path} does not exist")
-
-
-def metrics(function: F) -> F:
-    """--metrics."""
-    return click.option(
-        "--metrics", multiple=True, metavar="WORD", help="Show more metrics: thesis for those of the theses."
-    )(function)
 
 
 def metrics_of(texts: Iterable[str]) -> list[str]:

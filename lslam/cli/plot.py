@@ -22,12 +22,8 @@ from lslam.errors import OutputExistsError
 @click.option("--out", type=click.Path(path_type=Path), metavar="FILE", required=True, help="A .png, .svg or .pdf.")
 @click.option("--width", default="column", metavar="WORD|MM", help="column (89 mm), page (182 mm) or mm  [column].")
 @click.option("--font", type=float, default=8.0, metavar="PT", help="Size of the text  [8].")
-@click.option(
-    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
-)
-@click.option(
-    "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="Sequence of the raw scans, when it has moved."
-)
+@options.truth
+@options.moved_sequence
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @options.reading
 @options.verbosity

@@ -36,28 +36,26 @@ if TYPE_CHECKING:
     "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
 )
 @click.argument("sequence")
-@click.option("--method", metavar="NAME", help="Odometry method, see `lslam methods` [default: icp].")
+@options.method
 @options.preset
 @click.option("--residual", metavar="NAME", help=f"Residual of icp: {', '.join(RESIDUALS)} [default: plane].")
-@click.option(
-    "--gt", type=click.Path(path_type=Path), metavar="FILE", help="Ground truth instead of the sequence's own."
-)
+@options.truth
 @click.option(
     "--out", type=options.Place(path_type=Path), metavar="DIR|URL", help="Run folder [default: runs/NAME-METHOD-TIME]."
 )
-@click.option("--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out.")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in the folder.")
+@options.resumed
+@options.replaced
 @options.scan_range
-@click.option("--threads", type=int, metavar="N", help="0: as many as there are cores; 1: one. Results stay the same.")
+@options.threads
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--clean", is_flag=True, help="Remove moving objects from the map.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
-@click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
+@options.imu
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
 @options.manual
-@click.option("--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph.")
-@click.option("--georeference", "gnss", flag_value="fit", help="Satellite fixes only georeference the result.")
+@options.fixes_as_factors
+@options.fixes_at_the_end
 @click.option("--osm", metavar="FILE|auto", help="Buildings of OpenStreetMap give planar priors; auto fetches them.")
 @click.option("--origin", metavar="LAT,LON[,H]", help="With --osm: place of the first scan, where there are no fixes.")
 @click.option(
@@ -67,12 +65,7 @@ if TYPE_CHECKING:
     help="With --osm: heading of the first scan, clockwise from north [default: searched].",
 )
 @options.coordinates
-@click.option(
-    "--poses",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Trajectory of another program instead of odometry.",
-)
+@options.poses
 @click.option("--strict", is_flag=True, help="Exit 4 when anything was degraded: a scan skipped or bridged.")
 @click.option(
     "--profile",
@@ -80,7 +73,7 @@ if TYPE_CHECKING:
     metavar="FILE.json",
     help="Write a profile of the run's time, for speedscope.",
 )
-@click.option("--dry-run", is_flag=True, help="Resolve everything, write nothing.")
+@options.dry_run
 @options.metrics
 @options.reading
 @options.data_root

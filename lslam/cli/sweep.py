@@ -40,9 +40,7 @@ if TYPE_CHECKING:
 @options.engine
 @click.option("--seeds", metavar="N,N,...", help="Seeds instead of the study's.")
 @options.data_root
-@click.option(
-    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
-)
+@options.set_in_all_runs
 @click.option("--strict", is_flag=True, help="Exit 4 when any run failed or diverged.")
 @options.as_json
 @options.verbosity
