@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from lslam.machine import pin_blas
+from lslam.core.machine import pin_blas
 
 pin_blas()

@@ -21,8 +21,8 @@ from compiled_once import compile_once
 from hypothesis import settings
 from shared_towns import Towns, TracedScans
 
+from lslam.core.extras import importing_open3d
 from lslam.errors import InputError
-from lslam.extras import importing_open3d
 from lslam.simulation.scenarios import SimulatedDrive
 
 if TYPE_CHECKING:

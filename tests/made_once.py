@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.machine import one_at_a_time
+from lslam.core.machine import one_at_a_time
 
 
 class MadeOnce:

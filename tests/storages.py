@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import fsspec
 from fsspec.implementations.memory import MemoryFileSystem
 
-from lslam.remote import RemotePath
+from lslam.core.remote import RemotePath
 
 
 class Counted(MemoryFileSystem):

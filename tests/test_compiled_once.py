@@ -6,8 +6,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+from lslam.core.machine import lock
 from lslam.kernels.jit import kernel
-from lslam.machine import lock
 
 results = []
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from lslam.config import load_config
+from lslam.core.extras import importing
 from lslam.errors import InputError
-from lslam.extras import importing
 from lslam.odometry import create_odometry
 
 

@@ -22,14 +22,13 @@ LAYERS = [
     ["odometry"],
     ["readers", "inertial", "integrity", "loops", "graph", "maps", "evaluation", "simulation"],
     ["keyframes", "registration"],
-    ["preprocessing", "profiling"],
-    ["formats", "warned"],
+    ["preprocessing"],
+    ["formats"],
     ["types"],
     ["geometry"],
     ["kernels", "config"],
-    ["machine", "plugins", "printable", "remote", "stopping"],
-    ["extras"],
-    ["errors", "untrusted", "version"],
+    ["core"],
+    ["errors", "version"],
 ]
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 
@@ -47,7 +46,7 @@ HOMES = {
     "requests": ["osm/overpass.py"],
     "urllib3": ["osm/overpass.py"],
     "pyproj": ["geometry/geodesy.py", "maps/georeference.py"],
-    "fsspec": ["remote.py"],
+    "fsspec": ["core/remote.py"],
     "fastkml": ["convert/convert_trajectory.py"],
     "pygeoif": ["convert/convert_trajectory.py"],
     "fudgeo": ["convert/to_gpkg.py"],

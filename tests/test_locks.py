@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.machine import lock, one_at_a_time
+from lslam.core.machine import lock, one_at_a_time
 
 
 def test_a_held_lock_makes_others_wait_with_a_message(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

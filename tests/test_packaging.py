@@ -24,7 +24,7 @@ from packaging.markers import Marker
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
-from lslam.extras import install_command
+from lslam.core.extras import install_command
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -182,14 +182,14 @@ def test_the_install_command_names_what_is_installed(
     source: dict[str, object], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """As PEP 610 records where a package came from; sources on the path have no such record."""
-    monkeypatch.setattr("lslam.extras._SOURCES", tmp_path)
+    monkeypatch.setattr("lslam.core.extras._SOURCES", tmp_path)
 
     class Installed:
         def read_text(self, name: str) -> str | None:
             assert name == "direct_url.json"
             return json.dumps(source) if source else None
 
-    monkeypatch.setattr("lslam.extras.distribution", lambda name: Installed())
+    monkeypatch.setattr("lslam.core.extras.distribution", lambda name: Installed())
     pip, install, requirement = shlex.split(install_command("geo"))
     assert (pip, install, requirement) == ("pip", "install", said)
     # As pip reads it.

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from lslam import profiling
+from lslam.cli import profiling
 from lslam.errors import OutputError
 
 

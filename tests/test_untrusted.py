@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from lslam import untrusted
+from lslam.core import untrusted
+from lslam.core.untrusted import JsonItems, is_file, parse_json, parse_toml, whole_number
 from lslam.errors import InputError
-from lslam.untrusted import JsonItems, is_file, parse_json, parse_toml, whole_number
 
 PACKAGE = Path(__file__).resolve().parents[1] / "lslam"
 DIGITS = "9" * 5000
@@ -131,7 +131,7 @@ def test_json_and_toml_are_parsed_here_only() -> None:
         for p in PACKAGE.rglob("*.py")
         if re.search(r"\b(json|tomllib)\.(loads?|JSONDecoder)\(", p.read_text(encoding="utf-8"))
     ]
-    assert found == [PACKAGE / "untrusted.py"]
+    assert found == [PACKAGE / "core/untrusted.py"]
 
 
 def test_a_sentence_quotes_no_flood_and_nothing_a_terminal_obeys() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
 from lslam.backend.manual import stamp_of
 from lslam.config import Config
+from lslam.core.printable import counted
 from lslam.errors import GraphError, UsageError
 from lslam.geometry import geodesy, noise, se3, so3
 from lslam.geometry.noise import quantile
@@ -21,7 +22,6 @@ from lslam.graph.pose_graph import from_held
 from lslam.graph.problem import PoseGraph, PositionFix
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.preprocessing.ground import world_up_of
-from lslam.printable import counted
 from lslam.types.arrays import Floats, Longs
 from lslam.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
 from lslam.types.gnss import Georeference

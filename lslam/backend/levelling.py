@@ -15,15 +15,15 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.config.backend import GraphConfig
+from lslam.core.machine import one_at_a_time
+from lslam.core.stopping import checking
 from lslam.errors import InputError
 from lslam.geometry import se3, so3
 from lslam.graph.problem import FloorPlane, UpDirection
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
-from lslam.machine import one_at_a_time
 from lslam.preprocessing.ground import Z, levelling, up_of
 from lslam.preprocessing.up import NEAR_Z
-from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence

@@ -13,6 +13,7 @@ import numpy as np
 
 from lslam.backend.georeferencing import require_crs
 from lslam.config import Config
+from lslam.core.untrusted import whole_number
 from lslam.errors import InputError, UsageError, cause, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.stamp_texts import seconds_to_ns
@@ -25,7 +26,6 @@ from lslam.types.constraint import ControlPoint, ControlResidual, Instant, Known
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Selection, Sequence
 from lslam.types.trajectory import Keyframe
-from lslam.untrusted import whole_number
 
 # What a run writes into the column is its own verdict, and says nothing here: its loops.csv can be edited and given back.
 VERDICTS, OWN_VERDICTS = ("known", "forbidden"), ("accepted", "rejected")

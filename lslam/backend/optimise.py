@@ -27,6 +27,7 @@ from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
 from lslam.backend.levelling import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
 from lslam.config import Config
+from lslam.core.stopping import checking
 from lslam.errors import GraphError
 from lslam.geometry import se3
 from lslam.graph.consistency import Drift, drift_of
@@ -36,7 +37,6 @@ from lslam.graph.pose_graph import optimise
 from lslam.graph.problem import PoseGraph
 from lslam.keyframes.store import KeyframeStore
 from lslam.preprocessing.ground import up_of, world_up_of
-from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.constraint import ControlPoint, LoopCandidate, Turn
 from lslam.types.gnss import Georeference

@@ -13,8 +13,8 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
+from lslam.core.remote import RemotePath, as_path
 from lslam.errors import GateError, InputError, LslamError, RunFailedError, UsageError
-from lslam.remote import RemotePath, as_path
 from lslam.studies.output import BATCH, require_free
 
 if TYPE_CHECKING:

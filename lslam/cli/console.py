@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any, Protocol
 
-from lslam.printable import lasting
+from lslam.core.printable import lasting
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -11,9 +11,9 @@ from typing import Any, NoReturn
 
 import click
 
+from lslam.core.machine import pin_blas
+from lslam.core.stopping import heeded, is_interrupt, is_too_late
 from lslam.errors import LslamError, cause, nearest, sentence
-from lslam.machine import pin_blas
-from lslam.stopping import heeded, is_interrupt, is_too_late
 from lslam.version import __version__
 
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.

@@ -12,8 +12,8 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import progress, setup_logging, show
+from lslam.core.stopping import heeded
 from lslam.errors import UsageError
-from lslam.stopping import heeded
 
 if TYPE_CHECKING:
     from lslam.maps.changes import ChangedCells

@@ -14,7 +14,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
-from lslam.stopping import heeded
+from lslam.core.stopping import heeded
 
 
 @click.command(
@@ -74,7 +74,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
 
 
 def _summary(out: Path, manifest: dict[str, Any]) -> str:
-    from lslam.printable import counted, metres
+    from lslam.core.printable import counted, metres
 
     lines = [f"merged, {counted(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]
     lines += [f"  {'':<12} {problem}" for problem in manifest["problems"]]

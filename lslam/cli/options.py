@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from lslam.core.remote import RemotePath, as_path
 from lslam.errors import ConfigError, InputError, UsageError, nearest
-from lslam.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from lslam.config.input import ScanRange

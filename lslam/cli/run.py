@@ -14,10 +14,10 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
+from lslam.core.stopping import Stop, heeded
+from lslam.core.untrusted import parse_json
 from lslam.errors import RunFinishedError, UsageError
 from lslam.registration.residuals import RESIDUALS, residual_named
-from lslam.stopping import Stop, heeded
-from lslam.untrusted import parse_json
 
 if TYPE_CHECKING:
     from lslam.config import Config
@@ -87,15 +87,15 @@ def command(sequence: str, **given: Any) -> None:
     a URL of storage: s3://bucket/drive7.bag.
     """
     setup_logging(given["verbose"], given["quiet"])
-    from lslam.warned import hearing
+    from lslam.types.warned import hearing
 
     with hearing():
         _check_folder(given)
         opened, config = opened_with({**given, "sequence": sequence})
         truth = read_truth(given["gt"], opened)
+        from lslam.cli.profiling import profiled
         from lslam.pipeline.run import plan, run
         from lslam.pipeline.run_folder import default_folder
-        from lslam.profiling import profiled
 
         out = given["out"] or default_folder(opened.name, _variant(config))
         if given["dry_run"]:

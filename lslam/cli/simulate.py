@@ -234,8 +234,8 @@ def _write_plan(path: Path, plan: ScenePlan) -> Written:
 
 
 def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool) -> Written:
+    from lslam.core.stopping import heeded
     from lslam.simulation.record import record
-    from lslam.stopping import heeded
 
     with heeded() as stop, console.progress("simulating", len(drive)) as advance:
 

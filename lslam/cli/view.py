@@ -8,7 +8,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
-from lslam.extras import install_command
+from lslam.core.extras import install_command
 
 HELP = f"""Write trajectory, odometry before the pose graph, and map of a run as a recording for the rerun viewer.
 

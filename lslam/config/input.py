@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field, field_validator, model_validator
 
 from lslam.config.section import Section
-from lslam.machine import available_cores
+from lslam.core.machine import available_cores
 
 RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
 

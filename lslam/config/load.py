@@ -14,9 +14,9 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from lslam.config.config import Config
+from lslam.core.printable import toml_text
+from lslam.core.untrusted import is_file, parse_toml
 from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
-from lslam.printable import toml_text
-from lslam.untrusted import is_file, parse_toml
 
 # A preset may say what it is, and on which other one it stands, on a line each beside its sections.
 SUMMARY, BASE = "summary", "base"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.extras import importing, install_hint
 from lslam.errors import InputError, OutputExistsError, UsageError
-from lslam.extras import importing, install_hint
 from lslam.formats.atomic import write_text
 from lslam.formats.sequence_toml import FRAMES
 from lslam.formats.stamp_texts import utc_of

@@ -13,8 +13,8 @@ import numpy as np
 
 from lslam.convert import staged
 from lslam.convert.convert_trajectory import georeference_beside
+from lslam.core.extras import importing, install_hint
 from lslam.errors import InputError, OutputError, OutputExistsError, UsageError, cause
-from lslam.extras import importing, install_hint
 from lslam.formats.stamp_texts import utc_of
 from lslam.geometry.geodesy import from_local
 from lslam.maps.georeference import to_lat_lon

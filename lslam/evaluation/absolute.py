@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lslam.config.outputs import EvalConfig
+from lslam.core.printable import fixed, metres, significant
 from lslam.errors import UsageError, nearest
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.metric import (
@@ -21,7 +22,6 @@ from lslam.evaluation.metric import (
 )
 from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
 from lslam.geometry import se3, so3
-from lslam.printable import fixed, metres, significant
 from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lslam.config.outputs import EvalConfig
+from lslam.core.printable import metres
 from lslam.errors import InputError
 from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset
@@ -20,7 +21,6 @@ from lslam.evaluation.results import Evaluation
 from lslam.evaluation.thesis import DelTufo, Girolimetto
 from lslam.evaluation.time_offset import fit_offset
 from lslam.geometry import se3, so3
-from lslam.printable import metres
 from lslam.types.arrays import Floats
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory

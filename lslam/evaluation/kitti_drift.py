@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
+from lslam.core.printable import counted, significant
 from lslam.evaluation.metric import NO_ROTATIONS, Document, MatchedPoses, MetricRow, TrajectoryMetric
 from lslam.evaluation.results import Evaluation
-from lslam.printable import counted, significant
 from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
 

@@ -10,8 +10,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from lslam.config.outputs import EvalConfig
+from lslam.core.printable import significant
 from lslam.evaluation.results import Evaluation, Statistics
-from lslam.printable import significant
 from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.outputs import EvalConfig
+from lslam.core.printable import metres
 from lslam.evaluation import parse_delta
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
@@ -22,7 +23,6 @@ from lslam.evaluation.metric import (
 )
 from lslam.evaluation.results import Evaluation, RelativeError, describe
 from lslam.geometry import se3, so3
-from lslam.printable import metres
 from lslam.types.arrays import Floats, Longs
 from lslam.types.comparison import Metric, Table
 

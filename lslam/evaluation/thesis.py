@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.config.outputs import EvalConfig
+from lslam.core.printable import fixed, metres, significant
 from lslam.evaluation.absolute import align
 from lslam.evaluation.metric import NO_ROTATIONS, MatchedPoses, MetricRow, TrajectoryMetric, two
 from lslam.evaluation.results import Evaluation, percent_of_length
 from lslam.geometry import so3
-from lslam.printable import fixed, metres, significant
 from lslam.types.arrays import Floats
 from lslam.types.comparison import Metric, Table
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.remote import as_path
 from lslam.errors import InputError, cause
-from lslam.remote import as_path
 from lslam.types.arrays import Floats, Longs
 
 SAVED = "saved_s"

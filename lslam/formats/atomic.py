@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from lslam.core.remote import RemotePath
 from lslam.errors import OutputError, cause
-from lslam.remote import RemotePath
 
 
 @contextmanager

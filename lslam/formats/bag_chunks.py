@@ -19,8 +19,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError, cause
-from lslam.remote import RemotePath
 
 BLOCK = 1 << 15
 # Blocks asked for together, and blocks kept: 2 and 8 MB.

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import shown
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError
 from lslam.formats.bag_chunks import LARGEST, Topic, damage, unpack
 from lslam.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, suffix_of
@@ -25,8 +27,6 @@ from lslam.formats.bag_sqlite import SqliteBag
 from lslam.formats.bag_unpacking import unpacked
 from lslam.formats.mcap_records import McapFile
 from lslam.formats.ros1_records import Ros1Bag
-from lslam.printable import shown
-from lslam.remote import RemotePath
 
 T = TypeVar("T")
 

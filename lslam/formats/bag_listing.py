@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lslam.printable import shown
+from lslam.core.printable import shown
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
 # Endings of files that were compressed as a whole, as recorders and people do.

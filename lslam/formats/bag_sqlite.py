@@ -9,9 +9,9 @@ from urllib.parse import quote
 
 import numpy as np
 
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError, UsageError
 from lslam.formats.bag_chunks import Topic
-from lslam.remote import RemotePath
 
 _TABLES = {"topics", "messages"}
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 from zlib import error as zlib_error
 
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError, OutputError, UsageError, cause, input_errors
 from lslam.formats.bag_chunks import zstd
 from lslam.formats.bag_listing import packing_of
 from lslam.kernels.cache import cache_folder
-from lslam.remote import RemotePath
 
 _MAGIC = {
     b"\x28\xb5\x2f\xfd": "zstd",

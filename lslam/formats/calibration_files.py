@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import as_path
+from lslam.core.untrusted import is_file
 from lslam.errors import InputError, LslamError, UsageError, cause, input_errors
 from lslam.geometry import se3, so3
-from lslam.remote import as_path
-from lslam.untrusted import is_file
 
 Floats = NDArray[np.float64]
 LIDAR_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")

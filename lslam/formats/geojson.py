@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.osm_data import DECIMALS
-from lslam.untrusted import MISFIT, parse_json
 
 Floats = NDArray[np.float64]
 

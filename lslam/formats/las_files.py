@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.extras import importing
 from lslam.errors import InputError, OutputError, cause
-from lslam.extras import importing
 from lslam.formats.atomic import atomic_write
 from lslam.types.cloud import ArrayCloud, Cloud
 from lslam.version import __version__

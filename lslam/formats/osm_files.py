@@ -12,11 +12,11 @@ from typing import IO, Any
 from xml.etree.ElementTree import Element, ParseError
 from xml.sax.saxutils import quoteattr
 
+from lslam.core.untrusted import JsonItems
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_data import DECIMALS, OsmData
 from lslam.formats.osm_outlines import is_geojson, osm_from_outlines
-from lslam.untrusted import JsonItems
 
 GENERATOR = "lslam"
 ELEMENTS = "elements"  # of a reply

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import PointCloud
 from lslam.geometry import se3
 from lslam.types.imu import ImuStream
-from lslam.untrusted import MISFIT, parse_json
 
 IMU_SIZE = 48
 GRAVITY = 9.80665  # m/s2 of the unit g

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import whole_number
 from lslam.errors import InputError
 from lslam.formats.time_columns import read_stamps
-from lslam.untrusted import whole_number
 
 # Columns, in the order of the devkit's dataformat.txt.
 LAT, LON, ALT, ROLL, PITCH, YAW = range(6)

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError, UsageError, cause
-from lslam.remote import RemotePath
 
 Integers = NDArray[np.int64]
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import whole_number
 from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import AXES, beyond, organised, packed_columns, text_columns
-from lslam.untrusted import whole_number
 
 ENCODINGS = ("binary", "ascii", "binary_compressed")
 _KINDS = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}

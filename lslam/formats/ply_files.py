@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import whole_number
 from lslam.errors import InputError, input_errors
 from lslam.formats.atomic import atomic_write
 from lslam.formats.point_cloud import beyond, packed_columns, text_columns
-from lslam.untrusted import whole_number
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",

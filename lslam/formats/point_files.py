@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import RemotePath
+from lslam.core.untrusted import MISFIT
 from lslam.errors import InputError, UsageError, input_errors
 from lslam.formats.atomic import atomic_write
 from lslam.formats.las_files import read_las, write_las
@@ -19,9 +21,7 @@ from lslam.formats.ply_files import ply_columns, ply_header
 from lslam.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
 from lslam.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
 from lslam.formats.state_files import HEADERS
-from lslam.remote import RemotePath
 from lslam.types.cloud import ArrayCloud, Cloud
-from lslam.untrusted import MISFIT
 
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import toml_text
+from lslam.core.untrusted import parse_toml
 from lslam.errors import InputError, input_errors, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.point_records import parse_record
 from lslam.geometry import so3
-from lslam.printable import toml_text
-from lslam.untrusted import parse_toml
 
 FILE_NAME = "sequence.toml"
 INSTANTS = ("scan_start", "scan_middle", "scan_end")

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import shown
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.formats.text_tables import read_table
 from lslam.formats.time_columns import find_clock, unread_columns
-from lslam.printable import shown
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
 

@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.untrusted import MISFIT, parse_json
 
 # What zipfile and NumPy raise; no memory, for arrays that are said to be larger than any machine; a flag of encryption.
 DAMAGE = (*MISFIT, EOFError, SyntaxError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error, struct.error)

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import as_path
 from lslam.errors import InputError
 from lslam.formats.stamp_texts import date_to_ns, seconds_to_ns
 from lslam.formats.text_tables import Row, TextTable, read_rows, text_table
-from lslam.remote import as_path
 
 log = logging.getLogger("lslam")
 Floats = NDArray[np.float64]

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import shown
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.formats.text_tables import TextTable, looks_like_header
 from lslam.formats.time_columns import find_clock, unread_columns
 from lslam.formats.trajectory_columns import named_columns, placed_columns
 from lslam.geometry import se3, so3
-from lslam.printable import shown
 from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]

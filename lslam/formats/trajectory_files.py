@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lslam.core.remote import as_path
 from lslam.errors import InputError, UsageError, nearest
 from lslam.formats.text_tables import read_table
 from lslam.formats.time_columns import read_times
 from lslam.formats.trajectory_csv import write_euroc
 from lslam.formats.trajectory_formats import FORMATS
 from lslam.formats.trajectory_lines import find_times, write_kitti, write_tum
-from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
 
 __all__ = ["find_times", "read_times", "read_trajectory", "write_euroc", "write_kitti", "write_tum"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import as_path
 from lslam.errors import InputError
 from lslam.formats import trajectory_csv
 from lslam.formats.atomic import write_text
@@ -16,7 +17,6 @@ from lslam.formats.stamp_texts import seconds_text
 from lslam.formats.text_tables import TextTable, looks_like_header, separator_of, split_cells
 from lslam.formats.time_columns import find_clock, read_times
 from lslam.geometry import so3
-from lslam.remote import as_path
 from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")

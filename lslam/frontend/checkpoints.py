@@ -17,7 +17,7 @@ from lslam.frontend.windows import WindowTracker
 from lslam.odometry.base import Resumable
 from lslam.types.scan_result import ScanResult
 from lslam.types.state import State
-from lslam.warned import warnings_so_far
+from lslam.types.warned import warnings_so_far
 
 log = logging.getLogger("lslam")
 

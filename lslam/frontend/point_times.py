@@ -9,12 +9,12 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.config.input import PreprocessConfig
+from lslam.core.machine import one_at_a_time
 from lslam.errors import InputError
 from lslam.frontend.clock_agreement import FEWEST_SCANS
 from lslam.frontend.clock_changes import later_choices
 from lslam.frontend.clock_choice import ClockChoice, choose_clock
 from lslam.kernels import jit
-from lslam.machine import one_at_a_time
 from lslam.odometry import create_odometry
 from lslam.preprocessing.clock_proposals import Proposal, azimuth_proposal, columns_clock, order_clock, propose_clock
 from lslam.preprocessing.merged_lidars import MergedLidars

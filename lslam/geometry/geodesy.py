@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import whole_number
 from lslam.errors import UsageError
 from lslam.geometry import se3, so3
-from lslam.untrusted import whole_number
 
 
 def parse_crs(text: str) -> tuple[int, int | None]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
+from lslam.core.stopping import checking
 from lslam.geometry import noise, se2, se3
 from lslam.geometry.noise import quantile
 from lslam.graph import factors
@@ -32,7 +33,6 @@ from lslam.graph.solve import (
     marginals,
     truncated_weights,
 )
-from lslam.stopping import checking
 from lslam.types.arrays import Bools, Floats
 from lslam.types.building import BuildingMatch
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
+from lslam.core.stopping import check_stop
 from lslam.geometry import noise, se3, so3
 from lslam.geometry.noise import quantile, squared_distances
 from lslam.graph.problem import PoseGraph
-from lslam.stopping import check_stop
 from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
 

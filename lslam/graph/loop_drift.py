@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.backend import GraphConfig
+from lslam.core.stopping import checking
 from lslam.geometry import noise, se3, so3
 from lslam.geometry.noise import quantile
 from lslam.graph.consistency import Ends, judge_loops, moved
 from lslam.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basis, rate_roots
 from lslam.graph.pose_graph import check_graph, with_distances
 from lslam.graph.problem import EstimatedDrift, PoseGraph
-from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.constraint import Constraint
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from lslam.config.backend import GraphConfig
+from lslam.core.stopping import check_stop, checking
 from lslam.errors import GraphError
 from lslam.geometry import noise
 from lslam.geometry.noise import quantile
 from lslam.graph.factors import FIX_NOISE
 from lslam.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
 from lslam.graph.selected_inverse import selected_inverse
-from lslam.stopping import check_stop, checking
 from lslam.types.arrays import Floats
 
 # Keyframes that iSAM2 takes in per update.

@@ -105,7 +105,7 @@ def inline_with_arrays(function: F) -> F:
 
 
 def lock_file() -> Path | None:
-    """Lock (`lslam.machine`) of the process that compiles; others wait and then load the kernels. None without a cache."""
+    """Lock (`lslam.core.machine`) of the process that compiles; others wait and then load the kernels. None without a cache."""
     return None if _folder is None else _folder / "compile.lock"
 
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.stopping import check_stop
 from lslam.errors import ConfigError
 from lslam.maps.occupancy import MODEL, Evidence
-from lslam.stopping import check_stop
 from lslam.types.arrays import Bools, Floats, Longs
 
 Keys = NDArray[np.int64]

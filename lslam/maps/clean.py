@@ -9,9 +9,9 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.stopping import checking
 from lslam.geometry import se3, so3
 from lslam.preprocessing.ground import Z
-from lslam.stopping import checking
 from lslam.types.arrays import Bools, Floats, Longs
 from lslam.types.state import State
 

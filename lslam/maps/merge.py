@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.stopping import checking
 from lslam.errors import ConfigError, InputError
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
-from lslam.stopping import checking
 from lslam.types.arrays import Floats, Longs
 from lslam.types.cloud import BLOCK, CloudBlock, in_memory
 from lslam.types.state import State

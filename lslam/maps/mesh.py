@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.extras import importing_open3d
 from lslam.errors import InputError
-from lslam.extras import importing_open3d
 from lslam.types.arrays import Floats
 from lslam.types.cloud import ArrayCloud
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.stopping import checking
 from lslam.errors import InputError, OutputError, cause
-from lslam.stopping import checking
 from lslam.types.arrays import Longs
 from lslam.types.state import State
 

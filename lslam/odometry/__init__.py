@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
+from lslam.core.plugins import factory, known, require
 from lslam.errors import UsageError
-from lslam.plugins import factory, known, require
 
 if TYPE_CHECKING:
     from lslam.config.config import Config

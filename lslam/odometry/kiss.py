@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.config.config import Config
 from lslam.config.input import PreprocessConfig
-from lslam.extras import importing
+from lslam.core.extras import importing
 from lslam.geometry import se3
 from lslam.odometry.base import Traits
 from lslam.preprocessing.prepare import gate_points

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
-from lslam.extras import importing_open3d
+from lslam.core.extras import importing_open3d
 from lslam.geometry import se3
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged

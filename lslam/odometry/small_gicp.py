@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.config.config import Config
 from lslam.config.input import PreprocessConfig
 from lslam.config.odometry import RegistrationConfig
-from lslam.extras import importing, install_hint
+from lslam.core.extras import importing, install_hint
 from lslam.geometry import se3, so3
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lslam.backend.outcome import Given
 from lslam.config import Config
 from lslam.config.odometry import RegistrationConfig
+from lslam.core.stopping import checking
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
 from lslam.graph.building_graph import JointSolution, optimise_jointly
@@ -28,7 +29,6 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
-from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.types.stage_clock import KeyframeClocks, StageClock

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config.backend import OsmConfig
+from lslam.core.untrusted import MISFIT
 from lslam.errors import InputError, LslamError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_buildings import buildings_of
@@ -26,7 +27,6 @@ from lslam.geometry.geodesy import from_local
 from lslam.osm.bounds import Bounds, around
 from lslam.osm.overpass import OverpassReply, from_overpass
 from lslam.types.arrays import Floats
-from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")
 NOTHING = OverpassReply(b"{}")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.osm_data import DECIMALS
@@ -15,7 +16,6 @@ from lslam.geometry import se2
 from lslam.geometry.geodesy import from_local, to_local
 from lslam.types.arrays import Floats
 from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
-from lslam.untrusted import MISFIT, parse_json
 
 SCHEMA = "lslam-buildings-1"
 

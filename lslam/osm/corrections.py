@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.config.backend import OsmConfig
+from lslam.core.stopping import checking
 from lslam.formats.osm_data import OsmData
 from lslam.formats.osm_files import write_osm
 from lslam.geometry import se2
@@ -21,7 +22,6 @@ from lslam.osm.corrected_elements import corrected_osm
 from lslam.osm.overlap import Untangled, remove_overlaps
 from lslam.osm.wall_match import LIKENESS
 from lslam.osm.walls import walls_of
-from lslam.stopping import checking
 from lslam.types.arrays import Bools, Floats
 from lslam.types.building import (
     Building,

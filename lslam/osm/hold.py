@@ -11,6 +11,7 @@ from lslam.backend.georeferencing import Placement, on_earth
 from lslam.backend.outcome import BackEnd, Given, solve
 from lslam.config import Config
 from lslam.config.backend import OsmConfig
+from lslam.core.stopping import checking
 from lslam.errors import GraphError, InputError
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3
@@ -22,7 +23,6 @@ from lslam.osm.location import Located, finish, locate
 from lslam.osm.source import OsmSource
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
 from lslam.osm.wall_match import match_buildings
-from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.gnss import Georeference
 from lslam.types.stage_clock import KeyframeClocks

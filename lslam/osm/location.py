@@ -16,6 +16,7 @@ import numpy as np
 from lslam.backend.levelling import floor_planes
 from lslam.config import Config
 from lslam.config.backend import GraphConfig, OsmConfig
+from lslam.core.stopping import checking
 from lslam.formats.osm_buildings import BuildingExtract
 from lslam.geometry import se2, se3, so3
 from lslam.geometry.noise import quantile
@@ -27,7 +28,6 @@ from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildings, match_keyframe, shares
 from lslam.osm.walls import OsmMap, find_walls
 from lslam.preprocessing.ground import Z, up_of, world_up_of
-from lslam.stopping import checking
 from lslam.types.arrays import Floats
 from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.types.constraint import Verdict

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.stopping import checking
+from lslam.core.stopping import checking
 from lslam.types.arrays import Floats, Longs
 from lslam.types.building import Building, about, footprint_polygon, is_canopy
 

@@ -22,14 +22,14 @@ from typing import IO, Any
 import numpy as np
 
 from lslam.config.backend import OsmConfig
+from lslam.core.machine import one_at_a_time
+from lslam.core.untrusted import JsonItems, parse_json, whole_number
 from lslam.errors import InputError, OutputError, UsageError
 from lslam.formats.atomic import atomic_write
 from lslam.formats.osm_data import OsmData
 from lslam.formats.osm_files import ELEMENTS, GaveUpError, add_elements, check_reply
 from lslam.kernels.cache import cache_folder
-from lslam.machine import one_at_a_time
 from lslam.osm.bounds import Bounds
-from lslam.untrusted import JsonItems, parse_json, whole_number
 from lslam.version import __version__
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from lslam.backend.georeferencing import require_crs
 from lslam.config import Config
 from lslam.config.backend import OsmConfig
+from lslam.core.untrusted import MISFIT
 from lslam.errors import InputError, UsageError, cause
 from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
 from lslam.formats.osm_data import OsmData
@@ -25,7 +26,6 @@ from lslam.osm.walls import OsmMap
 from lslam.types.arrays import Floats, Longs
 from lslam.types.gnss import GnssStream
 from lslam.types.sequence import Sequence
-from lslam.untrusted import MISFIT
 
 log = logging.getLogger("lslam")
 

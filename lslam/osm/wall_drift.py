@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.config.backend import GraphConfig
+from lslam.core.stopping import checking
 from lslam.geometry.noise import quantile
 from lslam.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
 from lslam.graph.factors import PLANAR
 from lslam.graph.problem import EstimatedDrift, PoseGraph
-from lslam.stopping import checking
 from lslam.types.arrays import Floats, Longs
 
 # Degrees of freedom of the residuals (Student's t), against walls matched wrongly.

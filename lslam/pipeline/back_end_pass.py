@@ -17,6 +17,7 @@ from lslam.backend.manual import KeyframePairs, keyframe_pairs, write_control
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config
+from lslam.core.stopping import asking
 from lslam.errors import InterruptedRunError
 from lslam.formats.g2o import write_g2o
 from lslam.formats.state_files import Records
@@ -31,7 +32,6 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.outputs import write_loops, write_osm_matches
-from lslam.stopping import asking
 from lslam.types.constraint import LoopCandidate
 from lslam.types.gnss import Georeference
 from lslam.types.run_record import RunRecord

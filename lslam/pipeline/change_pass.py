@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.stopping import asking
 from lslam.errors import InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.geojson import write_areas
 from lslam.formats.ply_files import write_ply
@@ -24,7 +25,6 @@ from lslam.pipeline.map_pass import scan_poser
 from lslam.pipeline.rebuild import EarlierRun, results_of
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.preprocessing.ground import world_up_of
-from lslam.stopping import asking
 from lslam.types.arrays import Floats
 from lslam.types.gnss import Georeference
 from lslam.types.sequence import Sequence

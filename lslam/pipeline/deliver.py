@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from lslam.backend.outcome import BackEnd
 from lslam.config import Config, load_config
+from lslam.core.remote import RemotePath
 from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
 from lslam.evaluation.evaluate import Evaluation
 from lslam.keyframes.store import KeyframeStore
@@ -24,7 +25,6 @@ from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
 from lslam.pipeline.stages import make_feature_map, make_map, make_report
 from lslam.pipeline.storage import check_place, spool_of, upload
-from lslam.remote import RemotePath
 from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.config import Config
+from lslam.core.stopping import asking
 from lslam.errors import InterruptedRunError, LslamError
 from lslam.frontend.register_scans import read_ahead
 from lslam.geometry import se3
@@ -17,7 +18,6 @@ from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
 from lslam.pipeline.map_pass import MapCheckpoints, motion_within
 from lslam.preprocessing.features import Features
-from lslam.stopping import asking
 from lslam.types.arrays import Floats
 from lslam.types.run_record import FeatureView
 from lslam.types.scan_result import ScanResult

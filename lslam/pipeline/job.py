@@ -13,6 +13,7 @@ import numpy as np
 from lslam.backend.georeferencing import require_gnss
 from lslam.backend.manual import read_manual
 from lslam.config import Config
+from lslam.core.stopping import asking
 from lslam.doctor.examine_positions import examine_jumps
 from lslam.doctor.examine_units import examine_units
 from lslam.errors import InputError, InterruptedRunError
@@ -37,7 +38,6 @@ from lslam.pipeline.watch import Watch
 from lslam.preprocessing.views import with_rings
 from lslam.readers import open_sequence
 from lslam.readers.raw_drive import with_streams
-from lslam.stopping import asking
 from lslam.types.constraint import Manual
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence, select

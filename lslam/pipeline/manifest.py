@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from lslam.config import Config
+from lslam.core.stopping import is_interrupt
 from lslam.errors import InterruptedRunError
 from lslam.reports.facts import describe
-from lslam.stopping import is_interrupt
 from lslam.types.run_record import RunRecord
 from lslam.types.scan import Span
 from lslam.types.scan_result import ScanResult
 from lslam.types.sequence import Sequence
+from lslam.types.warned import Warnings
 from lslam.version import __version__
-from lslam.warned import Warnings
 
 SCHEMA = 1
 # Share of the scans that may leave a direction open before the run counts as degraded.

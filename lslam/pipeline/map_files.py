@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.config.outputs import MapConfig
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import OutputError, cause
 from lslam.formats.atomic import atomic_write, write_text
 from lslam.formats.geojson import write_line
@@ -26,7 +27,6 @@ from lslam.reports.png import grey_png
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import MISFIT, parse_json
 from lslam.version import __version__
 
 Note = dict[str, Any]

@@ -13,6 +13,7 @@ import numpy as np
 
 from lslam.config import Config
 from lslam.config.outputs import MapConfig
+from lslam.core.stopping import asking
 from lslam.errors import InputError, InterruptedRunError
 from lslam.frontend.checkpoints import Checkpoints
 from lslam.frontend.register_scans import read_ahead
@@ -25,7 +26,6 @@ from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.preprocessing.deskew import deskew_points, knots_over
 from lslam.preprocessing.ground import Z, world_up_of
-from lslam.stopping import asking
 from lslam.types.arrays import Floats, Longs
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory, thinned
 from lslam.types.motion_prior import MotionPrior

@@ -12,6 +12,8 @@ import numpy as np
 
 from lslam.backend.outcome import judged_by
 from lslam.config import Config
+from lslam.core.stopping import asking
+from lslam.core.untrusted import parse_json
 from lslam.errors import GraphError, InputError, InterruptedRunError, RunFailedError, UsageError
 from lslam.formats.state_files import Records, read_npz
 from lslam.frontend.checkpoints import Checkpoints
@@ -24,11 +26,9 @@ from lslam.loops.detector import Detector
 from lslam.loops.find_loops import warm_up
 from lslam.pipeline.rebuild import EarlierRun, read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES, MANIFEST
-from lslam.stopping import asking
 from lslam.types.arrays import Floats
 from lslam.types.constraint import LoopCandidate
 from lslam.types.scan_result import ScanResult
-from lslam.untrusted import parse_json
 
 log = logging.getLogger("lslam")
 Stop = Callable[[], bool]

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.config import Config
+from lslam.core.machine import one_at_a_time
 from lslam.errors import InputError
 from lslam.frontend import inertial_start
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
@@ -31,7 +32,6 @@ from lslam.integrity.monitor import IntegrityMonitor
 from lslam.kernels import jit
 from lslam.keyframes.store import KeyframeStore
 from lslam.loops import find_loops
-from lslam.machine import one_at_a_time
 from lslam.maps import crispness, merge
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Deskewing, Odometry, Resumable

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from lslam.config import Config
+from lslam.core.machine import available_cores
 from lslam.kernels import jit
-from lslam.machine import available_cores
 
 
 @contextmanager

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from lslam.config import Config, load_config
+from lslam.core.remote import as_path
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.point_files import MAP_SUFFIXES, read_cloud
@@ -40,7 +42,6 @@ from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.preprocessing.sweep_clock import SweepClock
 from lslam.preprocessing.views import Clocked
 from lslam.readers import open_sequence
-from lslam.remote import as_path
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.reports.recording import ViewedRun
@@ -51,7 +52,6 @@ from lslam.types.run_record import Crispness, RunRecord
 from lslam.types.scan_result import ScanResult, Status
 from lslam.types.sequence import Sequence, select
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import MISFIT, parse_json
 
 log = logging.getLogger("lslam")
 EVALUATION, REPORT = "evaluation.json", "report.html"

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from lslam.config import Config
+from lslam.core.printable import printable_tree, shown
+from lslam.core.remote import RemotePath
+from lslam.core.untrusted import MISFIT, parse_json, parse_toml
 from lslam.errors import GateError, InputError, OutputExistsError, RunFailedError, RunFinishedError, cause
 from lslam.osm.source import extract_digest
 from lslam.pipeline.job import is_open
 from lslam.pipeline.run_folder import MANIFEST
-from lslam.printable import printable_tree, shown
-from lslam.remote import RemotePath
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import MISFIT, parse_json, parse_toml
 from lslam.version import __version__
 
 # Keys that change no byte of the result, or only which of its metrics are shown.

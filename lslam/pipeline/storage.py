@@ -7,10 +7,10 @@ import logging
 import shutil
 from pathlib import Path
 
+from lslam.core.remote import RemotePath
 from lslam.errors import LslamError, OutputError, OutputExistsError
 from lslam.kernels.cache import cache_folder
 from lslam.pipeline.run_folder import CHECKPOINT, KEYFRAMES, LOCK, MANIFEST, OURS, REPLIES
-from lslam.remote import RemotePath
 
 log = logging.getLogger("lslam")
 SPOOL = "spool"

@@ -13,10 +13,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lslam.core.plugins import load, registered
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError, LslamError, UsageError, cause
-from lslam.plugins import load, registered
 from lslam.readers.lookup import find_folder
-from lslam.remote import RemotePath
 
 if TYPE_CHECKING:
     from lslam.formats.sequence_toml import SequenceInfo

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import printable, shown
 from lslam.formats import bag_streams
 from lslam.formats.bag_files import INFO_TOPIC, Bag, BagTopic, open_bag, read_header
 from lslam.formats.bag_listing import list_bag_files, parts_beside, stem_of
@@ -18,7 +19,6 @@ from lslam.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
 from lslam.geometry import portable, se3
 from lslam.preprocessing.merged_lidars import FurtherLidar, MergedLidars
-from lslam.printable import printable, shown
 from lslam.readers.bag_halves import Halves, put_together
 from lslam.readers.bag_lidars import UNNAMED, ScanIndex, choose_lidars
 from lslam.readers.bag_links import Links, places_of

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import printable
 from lslam.errors import InputError, input_errors
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.point_files import read_points
 from lslam.formats.point_records import KITTI, PointRecord
 from lslam.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.formats.state_files import DAMAGE, HEADERS
-from lslam.printable import printable
 from lslam.readers.ground_truth import Voice, load_poses
 from lslam.readers.listing import check_stamps
 from lslam.readers.point_clock import PointClock, open_clock, read_samples

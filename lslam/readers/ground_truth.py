@@ -10,6 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.remote import RemotePath, as_path
+from lslam.core.untrusted import whole_number
 from lslam.errors import InputError
 from lslam.formats.oxts_files import POS_ACC, ROLL, YAW, Oxts
 from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo
@@ -19,10 +21,8 @@ from lslam.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, 
 from lslam.geometry import geodesy, portable, se3, so3
 from lslam.geometry.se3 import poses_at
 from lslam.readers.listing import file_numbers, filled_stamps, rows_of
-from lslam.remote import RemotePath, as_path
 from lslam.types.sequence import Calibration
 from lslam.types.trajectory import Trajectory
-from lslam.untrusted import whole_number
 
 USUAL_NAMES = (
     "gt.tum", "groundtruth.tum", "ground_truth.tum", "gt_poses.tum", "poses.tum", "gt.csv", "groundtruth.csv",

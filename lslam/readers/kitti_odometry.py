@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.printable import printable
 from lslam.errors import InputError
 from lslam.formats.calibration_files import read_odometry_calib
 from lslam.formats.point_records import KITTI
 from lslam.formats.sequence_toml import SequenceInfo
-from lslam.printable import printable
 from lslam.readers.folder_sequence import Folder, FolderSequence
 from lslam.readers.ground_truth import find_ground_truth, to_lidar
 from lslam.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps

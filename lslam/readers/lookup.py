@@ -7,9 +7,9 @@ import os
 import re
 from pathlib import Path
 
+from lslam.core.remote import RemotePath, as_path
 from lslam.errors import InputError
 from lslam.formats.bag_listing import CAPTURES, SUFFIXES, list_bag_files
-from lslam.remote import RemotePath, as_path
 
 _SEQUENCE = re.compile(r"(?:.*/)?(?:seq)?(\d{1,2})$")
 _DRIVE_NAME = re.compile(r"(?:(?P<date>\d{4}_\d\d_\d\d)_)?(?:drive_)?(?P<number>\d{4})(?P<kind>_sync|_extract)?$")

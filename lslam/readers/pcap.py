@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.printable import printable
 from lslam.errors import InputError
 from lslam.formats import velodyne_packets
 from lslam.formats.bag_listing import CAPTURES
 from lslam.formats.packet_makers import maker_by_bytes, not_decoded
 from lslam.formats.pcap_files import Datagrams, read_datagrams
 from lslam.formats.sequence_toml import SequenceInfo
-from lslam.printable import printable
 from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import list_scans
 from lslam.readers.pcap_ouster import open_ouster

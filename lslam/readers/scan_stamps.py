@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.untrusted import whole_number
 from lslam.errors import InputError
 from lslam.formats.point_cloud import PointCloud
 from lslam.formats.text_tables import read_rows
@@ -17,7 +18,6 @@ from lslam.readers.ground_truth import Voice
 from lslam.readers.listing import check_stamps, file_numbers, filled_stamps, load_stamps, rows_of
 from lslam.readers.name_stamps import stamps_in_names
 from lslam.readers.point_stamps import PointStamps, point_stamps
-from lslam.untrusted import whole_number
 
 Stamps = NDArray[np.int64]
 _STEP = 1.5  # median intervals, from which on a gap is held against other clocks

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lslam.core.printable import counted, metres
 from lslam.geometry import se3
-from lslam.printable import counted, metres
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
 from lslam.reports.map_view import PIXELS, Crop, crop_images

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.printable import counted
 from lslam.geometry import se2
-from lslam.printable import counted
 from lslam.reports.plots import Figure
 from lslam.reports.svg import MOST_POINTS, Track, plane_chart
 from lslam.types.arrays import Floats

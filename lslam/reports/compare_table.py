@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from lslam.core.printable import counted, fixed, metres
 from lslam.formats.atomic import write_text
-from lslam.printable import counted, fixed, metres
 from lslam.reports.evaluations import strict
 from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
 from lslam.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lslam.core.printable import metres
 from lslam.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
-from lslam.printable import metres
 from lslam.reports.compare_html import style_of
 from lslam.reports.map_view import MapFigure, map_figure
 from lslam.reports.page_data import cloud_data, packed

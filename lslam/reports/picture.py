@@ -11,9 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lslam.core.printable import printable
 from lslam.errors import UsageError
 from lslam.formats.atomic import atomic_write
-from lslam.printable import printable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.extras import importing, install_hint
 from lslam.errors import OutputError, cause
-from lslam.extras import importing, install_hint
 from lslam.types.cloud import ArrayCloud
 from lslam.types.trajectory import Trajectory
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
+from lslam.core.printable import counted
 from lslam.errors import OutputError, cause
 from lslam.formats.atomic import atomic_write
-from lslam.printable import counted
 from lslam.reports.compare_table import CompareTable, as_text
 from lslam.reports.grid_text import comma_separated
 from lslam.reports.shell import render

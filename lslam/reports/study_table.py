@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from lslam.config.config import with_unit
+from lslam.core.printable import counted, fixed, metres
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.curves import normalise
-from lslam.printable import counted, fixed, metres
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.evaluations import strict
 from lslam.reports.grid_text import Grid

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lslam.core.printable import counted, metres
 from lslam.evaluation.evaluate import shown_metrics
-from lslam.printable import counted, metres
 from lslam.reports.back_end import back_end_rows, before_and_after
 from lslam.reports.facts import Failure, RunFacts, run_facts
 from lslam.types.run_record import RunRecord

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError
 from lslam.formats.atomic import write_text
 from lslam.geometry import portable
 from lslam.types.arrays import Floats
 from lslam.types.building import Building, Footprint, footprint_polygon, footprints_of
-from lslam.untrusted import MISFIT, parse_json
 
 SCHEMA = "lslam-osm-perturbation-1"
 

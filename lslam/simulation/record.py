@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.untrusted import parse_json
 from lslam.errors import OutputError, OutputExistsError, cause
 from lslam.formats.atomic import write_text
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, scan_files, write_calib, write_scan, write_times
@@ -29,7 +30,6 @@ from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
 from lslam.types.scan import Scan
-from lslam.untrusted import parse_json
 from lslam.version import __version__
 
 MANIFEST = "manifest.json"

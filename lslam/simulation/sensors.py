@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.printable import toml_text
 from lslam.errors import UsageError
 from lslam.formats.atomic import write_text
 from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv
 from lslam.formats.trajectory_files import write_tum
 from lslam.geometry import geodesy, portable, se3
-from lslam.printable import toml_text
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
 from lslam.simulation.kinematics import Motion
 from lslam.types.arrays import Floats, Longs

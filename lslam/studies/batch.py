@@ -11,9 +11,9 @@ from typing import Any
 
 from lslam.config import Config
 from lslam.config.study import BatchConfig, BatchJob, parse_batch
+from lslam.core.printable import file_safe, toml_text
 from lslam.errors import InputError, UsageError
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
-from lslam.printable import file_safe, toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same
 from lslam.studies.grid import Cell, Job, cells_of, expand, label_of, run_folder
 from lslam.studies.output import BATCH, OutputOptions

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.printable import lasting
 from lslam.errors import RunFailedError
-from lslam.printable import lasting
 from lslam.readers import open_sequence
 from lslam.studies.grid import Job
 from lslam.studies.jobs import Local

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lslam.config.load import read_toml
+from lslam.core.untrusted import parse_toml
 from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.formats.atomic import write_text
 from lslam.studies.grid import Job
@@ -16,7 +17,6 @@ from lslam.studies.results import Results
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import Variant
 from lslam.types.study import StudyRow
-from lslam.untrusted import parse_toml
 
 
 @dataclass(frozen=True)

@@ -11,18 +11,18 @@ from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
 from lslam.config.load import shipped
 from lslam.config.study import StudyConfig, StudySequence, parse_study, read_study
+from lslam.core.printable import file_safe
+from lslam.core.remote import RemotePath, as_path
+from lslam.core.untrusted import parse_toml
 from lslam.errors import InputError, UsageError, nearest
 from lslam.formats.bag_listing import stem_of
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
-from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.readers.raw_drive import with_imu
-from lslam.remote import RemotePath, as_path
 from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.subjects import Scene, check_range, drive_of, scans_needed, scene_digest, scene_folder, with_range
 from lslam.studies.variants import Variant, free_name
-from lslam.untrusted import parse_toml
 
 if TYPE_CHECKING:
     from lslam.types.trajectory import Trajectory

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lslam.config.study import StudyMetric
+from lslam.core.printable import printable_tree
+from lslam.core.untrusted import MISFIT, parse_json
 from lslam.errors import InputError, cause
 from lslam.formats.atomic import atomic_write, write_text
-from lslam.printable import printable_tree
 from lslam.types.study import StudyRow, Value
-from lslam.untrusted import MISFIT, parse_json
 
 # What a repetition would end with again; everything else is tried anew.
 FINAL = ("done", "degraded", "diverged")

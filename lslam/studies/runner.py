@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from lslam.stopping import heeded, is_too_late
+from lslam.core.stopping import heeded, is_too_late
 
 log = logging.getLogger("lslam")
 _PATIENCE_S = 20.0

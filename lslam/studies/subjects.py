@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, InputConfig, ScanRange
+from lslam.core.printable import file_safe
 from lslam.errors import InputError, OutputExistsError, UsageError, nearest
-from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.readers.lookup import find_folder
 from lslam.simulation.scenario_files import scenario_named

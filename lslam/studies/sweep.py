@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.config.study import ExpectedFinding, StudyConfig, read_study
+from lslam.core.printable import toml_text
 from lslam.errors import InputError, RunFailedError
-from lslam.printable import toml_text
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
 from lslam.studies.jobs import Engine

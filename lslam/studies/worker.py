@@ -18,6 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.remote import RemotePath
+from lslam.core.stopping import current, is_interrupt
 from lslam.errors import (
     GateError,
     InputError,
@@ -29,8 +31,6 @@ from lslam.errors import (
 )
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
 from lslam.pipeline.storage import spool_of
-from lslam.remote import RemotePath
-from lslam.stopping import current, is_interrupt
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, write_state
 from lslam.types.scan import Scan

@@ -17,7 +17,7 @@ from typing import Any
 from unittest import mock
 
 from lslam.cli.main import main
-from lslam.stopping import SIGNALS
+from lslam.core.stopping import SIGNALS
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 COMMAND = (sys.executable, "-m", "lslam")

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from calling import SAMPLE, lslam, manifest
 
+from lslam.core.printable import printable
 from lslam.formats.trajectory_files import read_trajectory
-from lslam.printable import printable
 from lslam.readers import open_sequence
 
 pytestmark = pytest.mark.skipif(

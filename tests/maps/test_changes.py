@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.core.stopping import asking
 from lslam.errors import ConfigError, InterruptedRunError
 from lslam.geometry import se3
 from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.occupancy import Evidence, OccupancyMapper
-from lslam.stopping import asking
 
 VOXEL = 0.4
 ORIGIN = np.zeros(3, np.int64)

@@ -50,7 +50,10 @@ def asked(at: Callable[[int, str], bool], looks: list[str]) -> Watch:
 
     def look() -> bool:
         frame = sys._getframe(1)
-        while frame.f_globals["__name__"] == "lslam.stopping" or frame.f_code.co_name in ("<lambda>", "<listcomp>"):
+        while frame.f_globals["__name__"] == "lslam.core.stopping" or frame.f_code.co_name in (
+            "<lambda>",
+            "<listcomp>",
+        ):
             assert frame.f_back is not None
             frame = frame.f_back
         looks.append(frame.f_code.co_name)

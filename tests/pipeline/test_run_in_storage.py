@@ -11,11 +11,11 @@ from storages import Counted, counted
 from stub_sequences import sample
 
 from lslam.config import Config
+from lslam.core.remote import RemotePath
 from lslam.errors import InterruptedRunError, OutputExistsError, RunFinishedError, StorageError
 from lslam.pipeline.run import run
 from lslam.pipeline.storage import spool_of
 from lslam.pipeline.watch import Watch
-from lslam.remote import RemotePath
 
 CONFIG = Config.model_validate({"report": {"html": False}, "map": {"voxel": 1.0}})
 TIMED = {

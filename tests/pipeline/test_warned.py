@@ -22,7 +22,7 @@ from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import deliver
 from lslam.pipeline.watch import Watch
 from lslam.types.sequence import StatedTimes
-from lslam.warned import MOST_ALIKE, hearing, warnings_so_far
+from lslam.types.warned import MOST_ALIKE, hearing, warnings_so_far
 
 PACKAGE = Path(lslam.__file__).parent
 LOG = logging.getLogger("lslam")

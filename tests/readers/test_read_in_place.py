@@ -16,12 +16,12 @@ from stub_sequences import SAMPLE
 from lslam.config import Config
 from lslam.convert import bag_messages
 from lslam.convert.bag_writer import BagWriter
+from lslam.core.remote import RemotePath
 from lslam.errors import InputError, StorageError, UsageError
 from lslam.formats.bag_chunks import BLOCK, RangedFile
 from lslam.pipeline.resume import input_digest, listing_digest
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence
-from lslam.remote import RemotePath
 from lslam.types.sequence import Sequence
 
 IMAGE = 400_000

@@ -141,7 +141,7 @@ def test_one_scan_leaves_none_for_a_lidar_that_begins_later() -> None:
 def test_a_scenario_with_two_lidars_is_ready_and_reads_back_from_its_text() -> None:
     scenario = scenario_named("two-lidars")
     assert [mount.name for mount in scenario.lidars] == ["rear"]
-    from lslam.untrusted import parse_toml
+    from lslam.core.untrusted import parse_toml
 
     again = parse_scenario("two-lidars", parse_toml(scenario_text(scenario)))
     assert again == scenario

@@ -11,8 +11,8 @@ from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
 from lslam.config.study import BatchConfig, parse_batch
+from lslam.core.remote import RemotePath
 from lslam.pipeline.storage import spool_of
-from lslam.remote import RemotePath
 from lslam.studies.batch import expand_batch, expand_lines, listed_line
 from lslam.studies.cluster import connected
 from lslam.studies.expanded_study import make_runs

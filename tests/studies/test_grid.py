@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lslam.config import Config, load_config
+from lslam.core.printable import file_safe
 from lslam.errors import InputError, UsageError
 from lslam.pipeline.resume import input_digest, job_digest
-from lslam.printable import file_safe
 from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate

@@ -11,11 +11,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from lslam.core.untrusted import parse_json
 from lslam.errors import InputError
-from lslam.untrusted import parse_json
 
 # Of a checkout; where lslam is installed, the folder of packages.
-_SOURCES = Path(__file__).resolve().parents[1]
+_SOURCES = Path(__file__).resolve().parents[2]
 
 
 def install_hint(extra: str) -> str:

@@ -11,6 +11,7 @@ from lslam.errors import InputError, UsageError, nearest
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+
 # name -> (module with `create`, one line for people)
 Table = Mapping[str, tuple[str, str]]
 

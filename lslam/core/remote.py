@@ -20,8 +20,8 @@ from functools import cache
 from pathlib import Path, PosixPath
 from typing import Any
 
+from lslam.core.extras import install_command
 from lslam.errors import LslamError, OutputError, StorageError, UsageError, sentence
-from lslam.extras import install_command
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://")
 _DISK = "file://"
