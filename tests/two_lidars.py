@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lslam.convert.convert_sequence import convert_sequence
+from lslam.pipeline.convert.convert_sequence import convert_sequence
 from lslam.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.record import record

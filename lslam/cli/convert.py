@@ -135,13 +135,13 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     import logging
 
     from lslam.cli.console import progress
-    from lslam.convert import check_output
+    from lslam.pipeline.convert import check_output
 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
     options.require_there(given["deskewed"])
     sequence = _open(source, given)
-    from lslam.convert.convert_sequence import convert_sequence
     from lslam.formats.trajectory_files import read_trajectory
+    from lslam.pipeline.convert.convert_sequence import convert_sequence
 
     log = logging.getLogger("lslam")
     for note in sequence.notes:
@@ -164,7 +164,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
 
 def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any]) -> None:
     from lslam.cli.console import progress
-    from lslam.convert import check_output
+    from lslam.pipeline.convert import check_output
 
     out = folder / f"run{BAGS[kind]}" if out is None else out
     check_output(kind, out, given["is_zstd"], given["overwrite"])
@@ -172,7 +172,7 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
     if not has_clouds:
         _refuse(given, ("voxel", "sequence"), "contradicts --no-clouds")
     options.require_there(given["sequence"])
-    from lslam.convert.convert_run import convert_run
+    from lslam.pipeline.convert.convert_run import convert_run
     from lslam.pipeline.rebuild import open_scans, read_run
 
     run = read_run(folder)
@@ -198,7 +198,7 @@ def _print(text: str, path: Path, kind: str, values: dict[str, Any], given: dict
 
 
 def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
-    from lslam.convert.to_gpkg import convert_to_gpkg
+    from lslam.pipeline.convert.to_gpkg import convert_to_gpkg
 
     options.require_there(folder)
     done = convert_to_gpkg(folder, out, overwrite=given["overwrite"])
@@ -210,11 +210,11 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
     for flag, name in (("--zstd", "is_zstd"), ("--deskewed", "deskewed")):
         if given[name]:
             raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
-    from lslam.convert.convert_trajectory import convert_trajectory
+    from lslam.pipeline.convert.convert_trajectory import convert_trajectory
 
     how = {"frame": given["frame"], "overwrite": given["overwrite"]}
     if kind in EARTH:
-        from lslam.convert.convert_trajectory import convert_to_earth, georeference_beside
+        from lslam.pipeline.convert.convert_trajectory import convert_to_earth, georeference_beside
 
         options.require_there(Path(source))
         georeference = georeference_beside(Path(source).expanduser(), kind)

@@ -99,7 +99,7 @@ def command(
     except LslamError as error:
         _show_bag(sequence, data_root, str(error) if as_json else None)
         raise
-    from lslam.doctor.inspect import inspect
+    from lslam.pipeline.doctor.inspect import inspect
 
     facts = inspect(opened, None if all_scans else scans, quick)
     if imu_toml is not None:
@@ -138,7 +138,7 @@ def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
         find_folder(name, data_root)
     except LslamError:
         return  # there is nothing: no need to import what would look into it
-    from lslam.doctor.inspect import bag_at
+    from lslam.pipeline.doctor.inspect import bag_at
 
     bag = bag_at(name, data_root)
     if bag is None:
@@ -237,9 +237,9 @@ def _noise(noise: dict[str, Any] | None) -> str:
 
 
 def _write_noise(path: Path, facts: dict[str, Any]) -> None:
-    from lslam.doctor.examine_imu import imu_toml
     from lslam.errors import InputError
     from lslam.formats.atomic import atomic_write
+    from lslam.pipeline.doctor.examine_imu import imu_toml
 
     noise = (facts["imu"] or {}).get("noise")
     if noise is None:

@@ -14,8 +14,6 @@ from lslam.backend.georeferencing import require_gnss
 from lslam.backend.manual import read_manual
 from lslam.config import Config
 from lslam.core.stopping import asking
-from lslam.doctor.examine_positions import examine_jumps
-from lslam.doctor.examine_units import examine_units
 from lslam.errors import InputError, InterruptedRunError
 from lslam.evaluation.frames import main_axis
 from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
@@ -31,6 +29,8 @@ from lslam.odometry.base import Odometry
 from lslam.odometry.given import GivenMotion, GivenPoses
 from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline.check import check_config
+from lslam.pipeline.doctor.examine_positions import examine_jumps
+from lslam.pipeline.doctor.examine_units import examine_units
 from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.prior_map_files import require_map
 from lslam.pipeline.run_folder import RunFolder

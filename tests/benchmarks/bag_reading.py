@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.convert.convert_sequence import convert_sequence
+from lslam.pipeline.convert.convert_sequence import convert_sequence
 from lslam.readers import open_sequence
 from lslam.types.scan import Scan
 from lslam.types.sequence import Sequence

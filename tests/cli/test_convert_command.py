@@ -33,8 +33,8 @@ def test_a_bag_of_the_sample_runs_as_the_sample_does(tmp_path: Path) -> None:
 
 
 def test_topics_are_listed_where_there_is_a_choice(tmp_path: Path) -> None:
-    from lslam.convert import bag_messages
-    from lslam.convert.bag_writer import BagWriter
+    from lslam.pipeline.convert import bag_messages
+    from lslam.pipeline.convert.bag_writer import BagWriter
 
     scan = open_sequence(SAMPLE).scan(0)
     with BagWriter(tmp_path / "two.bag", "bag") as writer:

@@ -23,10 +23,10 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial import cKDTree
 from shapely.geometry.base import BaseGeometry
 
-from lslam.convert.convert_run import PATHS, convert_run
 from lslam.formats.trajectory_files import read_trajectory, write_tum
 from lslam.geometry import se3, so3
 from lslam.geometry.geodesy import from_local
+from lslam.pipeline.convert.convert_run import PATHS, convert_run
 from lslam.pipeline.rebuild import open_scans, read_run
 
 SCANS, VOXEL = 48, 0.2

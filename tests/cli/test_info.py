@@ -16,8 +16,8 @@ from calling import SAMPLE, lslam
 sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from sequence_builders import cloud, kitti_root, raw_drive
 
-from lslam.doctor.inspect import inspect
 from lslam.formats.stamped_csv import read_imu_csv, write_imu_csv
+from lslam.pipeline.doctor.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.imu import ImuStream
 

@@ -14,10 +14,10 @@ from rosbags.highlevel import AnyReader
 sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from bag_builders import KINDS, START_NS, SUFFIX, bag, clouds, imu, together, transforms
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
-from lslam.doctor.inspect import examine_bag
 from lslam.formats.bag_files import Bag, open_bag
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.doctor.inspect import examine_bag
 
 
 def other(writer: BagWriter) -> None:

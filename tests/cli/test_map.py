@@ -15,12 +15,12 @@ import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, sample_copy, strict_json
 
 from lslam.cli.main import cli
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, LslamError, OutputError
 from lslam.formats.point_files import read_cloud
 from lslam.geometry.geodesy import from_local
 from lslam.pipeline import rebuild
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.map_files import georeference_note
 from lslam.pipeline.run_folder import held
 from lslam.readers import open_sequence

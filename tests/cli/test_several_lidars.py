@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from calling import lslam, strict_json
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"

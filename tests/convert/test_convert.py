@@ -13,14 +13,14 @@ from stub_sequences import StampedInTheMiddle, sample
 from two_lidars import two_lidars
 
 from lslam.config import load_config
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
-from lslam.convert.convert_run import convert_run
-from lslam.convert.convert_sequence import convert_sequence
 from lslam.errors import InputError, OutputExistsError, UsageError
 from lslam.formats.pointcloud2 import decode_pointcloud2
 from lslam.formats.sequence_toml import FILE_NAME, read_sequence_toml
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.convert_run import convert_run
+from lslam.pipeline.convert.convert_sequence import convert_sequence
 from lslam.pipeline.rebuild import EarlierRun
 from lslam.readers import open_sequence
 from lslam.simulation.record import record

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.doctor import Facts, Finding
-from lslam.doctor.examine_imu import examine_imu
-from lslam.doctor.examine_positions import examine_gnss
-from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times
-from lslam.doctor.examine_turns import compare, examine_turns
-from lslam.doctor.inspect import inspect
 from lslam.geometry import so3
 from lslam.inertial.imu_cleaning import ImuFault, ImuRefusedError, clean
+from lslam.pipeline.doctor import Facts, Finding
+from lslam.pipeline.doctor.examine_imu import examine_imu
+from lslam.pipeline.doctor.examine_positions import examine_gnss
+from lslam.pipeline.doctor.examine_scans import examine_points, examine_stamps, examine_times
+from lslam.pipeline.doctor.examine_turns import compare, examine_turns
+from lslam.pipeline.doctor.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.gnss import GnssStream
 from lslam.types.imu import ImuStream
@@ -291,7 +291,7 @@ def test_no_finding_hangs_on_the_words_of_a_refusal(healthy: Sequence, monkeypat
     def refuse(*given: object) -> None:
         raise ImuRefusedError("turns: too quick: by far", "divide", ImuFault.GYRO_IN_DEGREES)
 
-    monkeypatch.setattr("lslam.doctor.examine_turns.check_agreement", refuse)
+    monkeypatch.setattr("lslam.pipeline.doctor.examine_turns.check_agreement", refuse)
     findings, _ = against_truth(healthy, imu_of(healthy))
     assert findings == [Finding("imu-gyro-unit", "IMU: turns: too quick: by far", "divide")]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.doctor.examine_positions import examine_gaps, examine_jumps
+from lslam.pipeline.doctor.examine_positions import examine_gaps, examine_jumps
 from lslam.readers import open_sequence
 from lslam.types.sequence import Sequence
 from lslam.types.trajectory import Trajectory

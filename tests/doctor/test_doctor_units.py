@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.doctor import Finding
-from lslam.doctor.examine_units import examine_units
-from lslam.doctor.inspect import inspect
+from lslam.pipeline.doctor import Finding
+from lslam.pipeline.doctor.examine_units import examine_units
+from lslam.pipeline.doctor.inspect import inspect
 from lslam.readers import open_sequence
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lslam.config import load_config
-from lslam.doctor.examine_imu import allan_deviation, examine_noise, imu_toml
 from lslam.inertial.imu_noise import USUAL, ImuNoise
+from lslam.pipeline.doctor.examine_imu import allan_deviation, examine_noise, imu_toml
 from lslam.simulation.imu import GRAVITY, Triad, measure
 from lslam.types.imu import ImuStream
 

@@ -14,9 +14,9 @@ from readers.bag_builders import START_NS, STEP_NS, Fill, bag, clouds, imu, scan
 from readers.packet_builders import ouster_packets, velodyne_scans
 from readers.pcap_builders import OusterSpec, ouster, ouster_imu, velodyne
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.formats.bag_chunks import zstd
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.types.scan import Scan
 
 _METADATA = (

@@ -12,11 +12,11 @@ from readers.bag_builders import bag, clouds, imu, together, transforms
 from readers.pcap_builders import velodyne, write_pcap
 from readers.sequence_builders import T_CAM0_LIDAR, kitti_root, raw_drive, scans
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError
 from lslam.formats.bag_files import INFO_TOPIC
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 
 _SCANS = 3

@@ -7,8 +7,6 @@ import pytest
 from numpy.typing import NDArray
 from stub_sequences import Stub
 
-from lslam.doctor import Finding
-from lslam.doctor.examine_imu import examine_imu
 from lslam.errors import InputError
 from lslam.frontend.inertial_start import _require_rate
 from lslam.geometry import se3, so3
@@ -18,6 +16,8 @@ from lslam.inertial.imu_cleaning import ImuRefusedError, clean
 from lslam.inertial.imu_estimate import ImuEstimate
 from lslam.inertial.initialise import _is_stationary, _path_of_force
 from lslam.inertial.kalman import update
+from lslam.pipeline.doctor import Finding
+from lslam.pipeline.doctor.examine_imu import examine_imu
 from lslam.types.imu import ImuStream
 
 Floats = NDArray[np.float64]

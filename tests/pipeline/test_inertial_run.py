@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from stub_sequences import Standstill, Stub
 
 from lslam.config import Config, load_config
-from lslam.doctor import Finding
-from lslam.doctor.examine_turns import examine_turns
 from lslam.errors import GateError, InputError
 from lslam.evaluation.timing import read_timing_rows
 from lslam.formats.trajectory_files import read_trajectory
@@ -24,6 +22,8 @@ from lslam.frontend.register_scans import estimate
 from lslam.geometry import se3
 from lslam.inertial.fusion import InertialMotion
 from lslam.odometry import create_odometry
+from lslam.pipeline.doctor import Finding
+from lslam.pipeline.doctor.examine_turns import examine_turns
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.reports.text import summary

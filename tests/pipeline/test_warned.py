@@ -16,10 +16,10 @@ from stub_sequences import sample
 
 import lslam
 from lslam.config import Config, load_config
-from lslam.doctor.inspect import inspect
 from lslam.errors import InterruptedRunError
 from lslam.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import deliver
+from lslam.pipeline.doctor.inspect import inspect
 from lslam.pipeline.watch import Watch
 from lslam.types.sequence import StatedTimes
 from lslam.types.warned import MOST_ALIKE, hearing, warnings_so_far

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.types.scan import Scan
 
 START_NS = 1_700_000_000_123_456_789

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import get_types_from_msg
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 
 Frame = tuple[int, bytes]  # when it arrived, ns, and what
 VELODYNE = {

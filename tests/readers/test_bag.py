@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from bag_builders import GRAVITY, KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, clouds, imu, scan, together, transforms
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence
 from lslam.readers.raw_drive import with_gnss, with_imu

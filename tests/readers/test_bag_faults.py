@@ -17,9 +17,9 @@ from bag_builders import KINDS, START_NS, STEP_NS, SUFFIX, bag, clouds, imu, sca
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, LslamError
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.readers.bag_topics import put_in_order
 from lslam.readers.ground_truth import Voice

@@ -10,9 +10,9 @@ import pytest
 from bag_builders import KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, clouds, imu, together, transforms
 from numpy.typing import NDArray
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence
 

@@ -14,9 +14,9 @@ from packet_builders import VELODYNE, ouster_packets, types_of, velodyne_scans
 from pcap_builders import START_NS, OusterSpec, ouster, ouster_imu, velodyne, write_ouster, write_pcap
 from test_pcap import ATOL_M, assert_measured
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence
 from lslam.types.sequence import Sequence

@@ -16,11 +16,11 @@ from bag_builders import GRAVITY, KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, c
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
 from lslam.formats import bag_unpacking
 from lslam.formats.bag_chunks import zstd
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.readers.bag import BagSequence
 from lslam.types.sequence import Sequence

@@ -10,8 +10,8 @@ import pytest
 from bag_builders import GRAVITY, START_NS, STEP_NS, Fill, bag, clouds, raw_cloud, scan, together, transforms
 from numpy.typing import NDArray
 
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.readers.bag_topics import put_in_order
 from lslam.readers.ground_truth import Voice

@@ -16,8 +16,8 @@ from stub_sequences import Stub
 
 import lslam
 from lslam.config import load_config
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate

@@ -17,12 +17,12 @@ from stub_sequences import Stub
 from test_bag_clouds import CUSTOM, POINT
 
 from lslam.config.input import PreprocessConfig
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.errors import InputError, UsageError
 from lslam.formats.kitti_layout import write_scan, write_times
 from lslam.frontend.point_times import with_point_times
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.resume import input_digest
 from lslam.preprocessing.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
 from lslam.preprocessing.views import with_rings

@@ -11,9 +11,9 @@ import pytest
 from bag_builders import START_NS, STEP_NS, bag, raw_cloud
 from numpy.typing import NDArray
 
-from lslam.convert.bag_writer import BagWriter
 from lslam.formats.point_files import write_bin
 from lslam.frontend.register_scans import sweep_of
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.readers import open_sequence
 from lslam.types.sequence import Sequence
 

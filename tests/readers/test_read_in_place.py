@@ -14,11 +14,11 @@ from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
 from lslam.config import Config
-from lslam.convert import bag_messages
-from lslam.convert.bag_writer import BagWriter
 from lslam.core.remote import RemotePath
 from lslam.errors import InputError, StorageError, UsageError
 from lslam.formats.bag_chunks import BLOCK, RangedFile
+from lslam.pipeline.convert import bag_messages
+from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.resume import input_digest, listing_digest
 from lslam.pipeline.run import run
 from lslam.readers import open_sequence

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.doctor import Facts, Finding, plural
 from lslam.errors import InputError
 from lslam.integrity.directions import MOST_EMPTIED, emptied, filled_directions
+from lslam.pipeline.doctor import Facts, Finding, plural
 from lslam.preprocessing.rings import RingRule
 from lslam.preprocessing.views import with_rings
 from lslam.types.arrays import Longs

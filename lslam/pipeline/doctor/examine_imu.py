@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.doctor import Facts, Finding, plural
 from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
 from lslam.inertial.initialise import STILL_FORCE, STILL_RATE
+from lslam.pipeline.doctor import Facts, Finding, plural
 from lslam.types.arrays import Floats
 from lslam.types.imu import ImuStream
 from lslam.types.sequence import Sequence, no_shared_time

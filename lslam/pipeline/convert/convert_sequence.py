@@ -13,9 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from lslam.convert import bag_messages, check_beside, check_output, staged
-from lslam.convert.bag_writer import BagWriter
-from lslam.convert.convert_trajectory import change_frame
 from lslam.errors import InputError, UsageError
 from lslam.formats.bag_files import INFO_TOPIC
 from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
@@ -24,6 +21,9 @@ from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv
 from lslam.formats.trajectory_files import write_kitti, write_tum
 from lslam.frontend.register_scans import sweep_of
 from lslam.geometry import se3
+from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
+from lslam.pipeline.convert.bag_writer import BagWriter
+from lslam.pipeline.convert.convert_trajectory import change_frame
 from lslam.pipeline.map_pass import motion_within
 from lslam.preprocessing.deskew import deskew_points
 from lslam.preprocessing.merged_lidars import MergedLidars

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.doctor import Facts, Finding, plural
 from lslam.geometry.geodesy import to_local
+from lslam.pipeline.doctor import Facts, Finding, plural
 from lslam.types.arrays import Floats, Longs
 from lslam.types.sequence import Sequence, no_shared_time
 from lslam.types.trajectory import Trajectory

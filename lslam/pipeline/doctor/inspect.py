@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from lslam.config.input import PreprocessConfig
-from lslam.doctor import Facts, Finding
-from lslam.doctor.examine_imu import examine_imu
-from lslam.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps
-from lslam.doctor.examine_scans import examine_points, examine_stamps, examine_times, rings_rule
-from lslam.doctor.examine_turns import examine_turns
-from lslam.doctor.examine_units import examine_units
 from lslam.errors import LslamError
 from lslam.formats.bag_files import Bag, BagTopic, open_bag
 from lslam.formats.stamp_texts import utc_of
 from lslam.frontend.point_times import with_point_times
+from lslam.pipeline.doctor import Facts, Finding
+from lslam.pipeline.doctor.examine_imu import examine_imu
+from lslam.pipeline.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps
+from lslam.pipeline.doctor.examine_scans import examine_points, examine_stamps, examine_times, rings_rule
+from lslam.pipeline.doctor.examine_turns import examine_turns
+from lslam.pipeline.doctor.examine_units import examine_units
 from lslam.readers import bag as bag_reader
 from lslam.readers.lookup import find_folder
 from lslam.types.arrays import Longs

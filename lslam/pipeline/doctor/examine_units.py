@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.doctor import Finding
+from lslam.pipeline.doctor import Finding
 from lslam.types.arrays import Stamps
 from lslam.types.scan import Span
 from lslam.types.sequence import Sequence

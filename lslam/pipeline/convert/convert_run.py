@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.convert import bag_messages, check_beside, check_output, staged
-from lslam.convert.bag_writer import MAP_TOPIC, PATH_TOPIC, BagWriter
 from lslam.errors import InputError, UsageError
 from lslam.formats.point_files import read_cloud
 from lslam.frontend.register_scans import read_ahead
 from lslam.kernels.voxel import first_points
 from lslam.maps.clean import PosedScan
+from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
+from lslam.pipeline.convert.bag_writer import MAP_TOPIC, PATH_TOPIC, BagWriter
 from lslam.pipeline.map_files import in_own_world
 from lslam.pipeline.map_pass import scan_poser
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, map_of, results_of
