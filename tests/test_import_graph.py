@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import ast
-from functools import cache
-from pathlib import Path
-
 import pytest
-
-ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "lslam"
+from import_graph import MODULES, PACKAGE, ROOT, edges, imports_of, package_of, read
 
 # Top may import below; packages on one line are siblings and never import each other.
 LAYERS = [
@@ -59,60 +53,6 @@ HOMES = {
     "numba": ["kernels/"],
     "matplotlib": ["reports/"],
 }
-
-
-def modules() -> dict[str, Path]:
-    names = {}
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(ROOT).with_suffix("").parts
-        names[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    return names
-
-
-@cache
-def read(path: Path) -> tuple[set[str], set[str], list[str]]:
-    """What a file says, parsed once for all tests: its imports, its dotted names, its classes."""
-    imports: set[str] = set()
-    names: set[str] = set()
-    classes: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            imports |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            assert node.level == 0, f"{path}: relative import"
-            imports |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.ClassDef):
-            classes.append(node.name)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value.startswith("lslam."):
-            names.add(node.value.split(":")[0])
-    return imports, names, classes
-
-
-def imports_of(path: Path) -> set[str]:
-    """Every name imported anywhere in the file, also inside functions and `if TYPE_CHECKING`, with from-imports expanded."""
-    return read(path)[0]
-
-
-def tables_of(path: Path) -> set[str]:
-    """Dotted names in string constants: modules imported lazily through a table."""
-    return read(path)[1]
-
-
-MODULES = modules()
-
-
-def edges() -> list[tuple[str, str]]:
-    pairs = []
-    for name, path in MODULES.items():
-        for target in imports_of(path) | tables_of(path):
-            if target in MODULES and target != name:
-                pairs.append((name, target))
-    return pairs
-
-
-def package_of(name: str) -> str:
-    parts = name.split(".")
-    return parts[1] if len(parts) > 1 else ""
 
 
 def inner_of(name: str) -> str:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import sys
 import tempfile
 import tomllib
 from dataclasses import dataclass
@@ -40,7 +41,10 @@ from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.studies.subjects import Scene, simulate_once
-from tests.building_errors import BuildingError, building_errors
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from building_errors import BuildingError, building_errors
 
 Floats = NDArray[np.float64]
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from building_errors import BuildingError, building_errors
 from numpy.typing import NDArray
 
 import lslam
@@ -26,7 +27,6 @@ from lslam.osm.track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
 from lslam.types.building import CorrectedMap, KeyframeMatch
 from lslam.types.stage_clock import KeyframeClocks
-from tests.building_errors import BuildingError, building_errors
 
 Floats = NDArray[np.float64]
 
