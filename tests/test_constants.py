@@ -20,6 +20,13 @@ def test_every_number_of_a_scans_path_is_in_the_register() -> None:
     assert sorted(PATH - set(listed)) == []
 
 
+def test_what_was_halved_and_doubled_is_on_a_scans_path() -> None:
+    measured = METHODS.split("<!-- table constants -->")[1].split("<!-- end -->")[0]
+    rows = set(re.findall(r"^\| `([\w.]+)` \| `(\S+)` \| [^|]+ \| [^|]+ \|$", measured, re.MULTILINE))
+    assert rows
+    assert sorted(rows - PATH) == []
+
+
 def test_a_share_is_changed_by_what_it_lacks_and_a_cosine_by_its_angle() -> None:
     assert eval(constants.changed("FORGETTING", "registration/robust.py", "0.8", 0.5)) == 0.9
     assert eval(constants.changed("MUCH", "registration/start_search.py", "1.1", 2.0)) == 1.2000000000000002

@@ -50,7 +50,8 @@ PATH: dict[str, tuple[str, ...]] = {
     ),
     "checks": ("integrity/*.py", "types/scan_result.py"),
 }  # fmt: skip
-# Of other methods, of `localize`, or of the whole recording, and what is no quantity: indices, marks, bits, constants of nature.
+# Of other methods, of `localize`, of the whole recording, of what is off unless asked for, and what is no quantity: dimensions,
+# indices, marks, bits, constants of nature.
 NOT_OF_IT = {
     "registration/source_covariance.py", "registration/map_scans.py", "registration/acceptance.py MAP_MIN_OVERLAP",
     "registration/acceptance.py MAP_MIN_INLIERS", "registration/voxel_target.py SPARSE_SHARE",
@@ -63,7 +64,8 @@ NOT_OF_IT = {
     "registration/optimiser.py EVERYWHERE", "odometry/feature_solver.py NONE", "preprocessing/prepare.py NO_TIMES",
     "kernels/gaussians.py USED", "kernels/gaussians.py FREED", "kernels/gaussians.py HAND", "kernels/gaussians.py LIVE",
     "frontend/scene_scale.py USUAL_RANGE_M", "integrity/directions.py _ROWS", "integrity/directions.py _COLUMNS",
-    "inertial/imu_estimate.py PLACE_NOISE", "inertial/imu_estimate.py TURN_NOISE",
+    "inertial/gyroscope.py MOUNTING_SIGMA", "inertial/gyroscope.py OFFSET_SIGMA", "inertial/gyroscope.py OFFSET_WALK",
+    "registration/optimiser.py LEAST_MATCHED", "inertial/imu_estimate.py PLACE_NOISE", "inertial/imu_estimate.py TURN_NOISE",
 }  # fmt: skip
 # Keys of sections that every scan passes, those that the scene's size decides aside.
 KEYS = {
