@@ -40,20 +40,21 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanR
         astray = [poses[0]]
         for step, error in zip(steps, errors, strict=True):
             astray.append(se3.normalise(astray[-1] @ step @ error))
-        return [_moved(result, pose) for result, pose in zip(results, astray, strict=True)]
+        return _moved(results, np.stack(astray))
     directions, sides = _courses(way, config)
     # The horizon sinks towards the direction.
     across = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
     degrees = np.column_stack([config.drift_tilt_deg_per_100m * across, config.drift_deg_per_100m * sides])
-    turns = np.deg2rad(degrees) / 100 * way[:, None]
+    turns = so3.exp(np.deg2rad(degrees) / 100 * way[:, None])
+    shifts = 0.01 * config.drift_percent * way[:, None] * directions
     drifted = [poses[0]]
-    for step, m, turn, direction in zip(steps, way, turns, directions, strict=True):
+    for step, turn, shift in zip(steps, turns, shifts, strict=True):
         pose = drifted[-1] @ step
-        pose[:3, :3] = so3.exp(turn) @ pose[:3, :3]
-        pose[:3, 3] += 0.01 * config.drift_percent * m * direction
+        pose[:3, :3] = turn @ pose[:3, :3]
+        pose[:3, 3] += shift
         drifted.append(se3.normalise(pose))
-    return [_moved(result, pose) for result, pose in zip(results, drifted, strict=True)]
+    return _moved(results, np.stack(drifted))
 
 
 def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
@@ -130,16 +131,19 @@ def describe(config: DebugConfig) -> str:
     )
 
 
-def _moved(result: ScanResult, pose: Floats) -> ScanResult:
-    R = so3.normalise(pose[:3, :3] @ result.T_world_lidar[:3, :3].T)
+def _moved(results: Sequence[ScanResult], poses: Floats) -> list[ScanResult]:
+    turns = so3.normalise(poses[:, :3, :3] @ np.stack([r.T_world_lidar[:3, :3].T for r in results]))
 
-    def turned(covariance: Floats | None) -> Floats | None:
+    def turned(covariance: Floats | None, R: Floats) -> Floats | None:
         return None if covariance is None else noise.rotated(covariance, R)
 
-    return replace(
-        result,
-        T_world_lidar=pose,
-        covariance=turned(result.covariance),
-        registration_covariance=turned(result.registration_covariance),
-        points_covariance=turned(result.points_covariance),
-    )
+    return [
+        replace(
+            result,
+            T_world_lidar=pose,
+            covariance=turned(result.covariance, R),
+            registration_covariance=turned(result.registration_covariance, R),
+            points_covariance=turned(result.points_covariance, R),
+        )
+        for result, pose, R in zip(results, poses, turns, strict=True)
+    ]
