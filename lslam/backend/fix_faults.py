@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.geometry.se3 import poses_at
+from lslam.geometry.se3 import poses_at, turns_between
 from lslam.graph.fix_errors import (
     FEWEST,
     NO_HEIGHT,
@@ -73,12 +73,12 @@ def clock_of(fixes: Fixes, stamps_ns: Longs, poses: Floats, arm: Floats, level: 
 
     arm : (3,) of the antenna; level : (3, 3) of the poses' world
     """
-    start = int(stamps_ns[0])
+    start, turns = int(stamps_ns[0]), turns_between(poses[:-1], poses[1:])
 
     def antenna_at(seconds: Floats) -> Floats:
         at = start + np.round(1e9 * seconds).astype(np.int64)
         inside = (at >= stamps_ns[0]) & (at <= stamps_ns[-1])
-        poses_there = poses_at(stamps_ns, poses, np.clip(at, stamps_ns[0], stamps_ns[-1]))
+        poses_there = poses_at(stamps_ns, poses, np.clip(at, stamps_ns[0], stamps_ns[-1]), turns)
         places = (np.einsum("nij,j->ni", poses_there[:, :3, :3], arm) + poses_there[:, :3, 3]) @ level.T
         return np.where(inside[:, None], places, np.nan)
 

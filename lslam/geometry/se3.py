@@ -95,9 +95,17 @@ def _inverse_left_jacobian(phi: Floats) -> Floats:
     return np.asarray(np.eye(3) - 0.5 * so3.hat(phi) + c * so3.square(phi))
 
 
-def poses_at(stamps_ns: NDArray[np.int64], poses: Floats, query_ns: NDArray[Any]) -> Floats:
+def turns_between(a: Floats, b: Floats) -> Floats:
+    """(N, 3) rotation vectors from poses `a` to `b` (N, 4, 4), in the axes of `a`."""
+    return so3.log(portable.product(np.swapaxes(a[:, :3, :3], -1, -2), b[:, :3, :3]))
+
+
+def poses_at(
+    stamps_ns: NDArray[np.int64], poses: Floats, query_ns: NDArray[Any], turns: Floats | None = None
+) -> Floats:
     """Poses (M, 4, 4) at `query_ns` (M,) from increasing `stamps_ns` (N,) and `poses` (N, 4, 4), N >= 2.
 
+    turns : (N - 1, 3) `turns_between` successive poses, of a caller that asks often
     Queries outside the stamps extrapolate the first or last segment: the caller decides how far that is wise.
     """
     stamps = np.asarray(stamps_ns, np.int64)
@@ -106,10 +114,9 @@ def poses_at(stamps_ns: NDArray[np.int64], poses: Floats, query_ns: NDArray[Any]
     span = (stamps[left + 1] - stamps[left]).astype(np.float64)
     share = (query - stamps[left]).astype(np.float64) / span
     a, b = poses[left], poses[left + 1]
-    R_a = a[:, :3, :3]
-    turn = so3.log(portable.product(np.swapaxes(R_a, -1, -2), b[:, :3, :3]))
+    turn = turns_between(a, b) if turns is None else turns[left]
     t = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
-    return make(portable.product(R_a, so3.exp(share[:, None] * turn)), t)
+    return make(portable.product(a[:, :3, :3], so3.exp(share[:, None] * turn)), t)
 
 
 def umeyama(source: NDArray[Any], target: NDArray[Any], with_scale: bool = False) -> tuple[Floats, float, bool]:

@@ -62,8 +62,8 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
 
     def off(offset: float) -> Floats:
         """(P, 2) residuals after the best turn."""
-        own = (antenna_at(seconds[last] + offset) - antenna_at(seconds[first] + offset))[:, :2]
-        return moved - _turned(own, moved)
+        there = antenna_at(seconds + offset)[:, :2]
+        return moved - _turned(there[last] - there[first], moved)
 
     tried = np.arange(-LARGEST_S, LARGEST_S + 0.5 * STEP_S, STEP_S)
     sizes = np.stack([np.linalg.norm(off(float(offset)), axis=1) for offset in tried])
