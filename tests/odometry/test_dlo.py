@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ from lslam.config import load_config
 from lslam.frontend.register_scans import estimate
 from lslam.odometry import create_odometry
 from lslam.odometry.dlo import Dlo
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.types.scan_result import ScanResult
 
 COUNT = 40
@@ -28,25 +30,36 @@ def error_of(results: list[ScanResult], truth: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(found[:3, 3] - true[:3, 3]))
 
 
-def test_a_drive_is_followed_on_few_keyframes() -> None:
-    drive = simulate("residential", seed=3, lidar="vlp16", count=COUNT)
+@cache
+def drive() -> SimulatedDrive:
+    return simulate("residential", seed=3, lidar="vlp16", count=COUNT)
+
+
+@cache
+def followed() -> tuple[Dlo, list[ScanResult]]:
     method = dlo()
-    results = list(estimate(drive, method))
+    return method, list(estimate(drive(), method))
+
+
+def true_poses() -> NDArray[np.float64]:
+    truth = drive().ground_truth
+    assert truth is not None
+    return truth.poses
+
+
+def test_a_drive_is_followed_on_few_keyframes() -> None:
+    method, results = followed()
     assert all(r.status == "ok" for r in results)
     assert {"scan", "map"} <= set(results[-1].stages)
     assert all(r.covariance is not None for r in results)
-    assert drive.ground_truth is not None
-    assert error_of(results, drive.ground_truth.poses) < 0.1
+    assert error_of(results, true_poses()) < 0.1
     target = method.registration.target.scans
     assert 2 <= len(target.poses) < COUNT  # type: ignore[attr-defined]
 
 
 def test_the_submap_corrects_what_the_last_scan_alone_gives() -> None:
     """Scan to scan, errors add up: the same drive without its submap ends farther from the truth."""
-    drive = simulate("residential", seed=3, lidar="vlp16", count=COUNT)
-    assert drive.ground_truth is not None
-    truth = drive.ground_truth.poses
-    both = error_of(list(estimate(drive, dlo())), truth)
+    both = error_of(followed()[1], true_poses())
     settings = ["odometry.method=gicp", "registration.target=scan"]
-    alone = error_of(list(estimate(drive, create_odometry(load_config(None, settings, {})))), truth)
+    alone = error_of(list(estimate(drive(), create_odometry(load_config(None, settings, {})))), true_poses())
     assert both < alone
