@@ -12,6 +12,7 @@ import pytest
 from lslam.config.config import Config
 from lslam.errors import UsageError
 from lslam.odometry import METHODS, create_odometry, known_methods
+from lslam.odometry.base import Traits
 from lslam.registration.residuals import RESIDUALS
 
 FAMILY = ("gicp", "vgicp", "ndt")
@@ -25,7 +26,7 @@ def config(method: str) -> Config:
     return Config.model_validate({"odometry": {"method": method, "poses": poses}})
 
 
-class Foreign:
+class Foreign(Traits):
     """What another package's factory returns."""
 
     def __init__(self, made_from: Config) -> None:

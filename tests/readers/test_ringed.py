@@ -54,7 +54,7 @@ def test_every_scan_gets_its_rings_and_the_notes_say_how() -> None:
 
 def test_only_methods_that_need_rings_get_them_and_any_part_of_a_recording_has_the_same_rule() -> None:
     config = load_config(None, ["input.start=5", "input.skip_frames=3", "input.rings=order"], {})
-    plain = choose_scans(bare(), SimpleNamespace(), config)  # type: ignore[arg-type]
+    plain = choose_scans(bare(), SimpleNamespace(needs_rings=False), config)  # type: ignore[arg-type]
     assert plain.scan(0).rings is None
     chosen = choose_scans(bare(), SimpleNamespace(needs_rings=True), config)  # type: ignore[arg-type]
     assert [chosen.scan(i).index for i in range(len(chosen))] == [5, 8, 11]
