@@ -92,7 +92,7 @@ class Ours(Timed):
         self._odometry = create_odometry(load_config(None, [f"odometry.method={method}", "input.threads=1"], {}))
         self._odometry.warm_up()
         self._tracker = Tracker(self._odometry)
-        self._rings = decide_rings(beginning.scans) if getattr(self._odometry, "needs_rings", False) else None
+        self._rings = decide_rings(beginning.scans) if self._odometry.needs_rings else None
 
     def convert(self, scan: Scan) -> Scan:
         return scan
