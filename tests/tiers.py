@@ -47,16 +47,16 @@ def is_there(function: str) -> bool:
 
 
 @cache
-def slow_files() -> frozenset[Path]:
+def slow_files(root: Path) -> frozenset[Path]:
     """Files that have a slow test."""
-    files = {ROOT / function.partition("::")[0] for function in read_table()}
-    return frozenset(files | {path for path in (ROOT / "tests").rglob("test_*.py") if "mark.slow" in path.read_text()})
+    files = {root / function.partition("::")[0] for function in read_table()}
+    return frozenset(files | {path for path in (root / "tests").rglob("test_*.py") if "mark.slow" in path.read_text()})
 
 
 def is_passed_over(path: Path, config: pytest.Config) -> bool:
     """Whether a file need not be imported: nothing in it is slow, and nothing else is asked for."""
     is_test = path.name.startswith("test_") and path.suffix == ".py"
-    return config.option.markexpr == "slow" and is_test and path not in slow_files()
+    return config.option.markexpr == "slow" and is_test and path not in slow_files(ROOT)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -18,7 +18,7 @@ from lslam.errors import InputError, UsageError, cause, nearest
 from lslam.formats.atomic import write_text
 from lslam.formats.stamp_texts import seconds_to_ns
 from lslam.formats.text_tables import separator_of, split_cells
-from lslam.geometry.geodesy import parse_crs
+from lslam.geometry.crs_names import parse_crs
 from lslam.geometry.se3 import poses_at
 from lslam.maps.georeference import to_wgs84
 from lslam.types.arrays import Floats

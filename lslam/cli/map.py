@@ -212,7 +212,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
     settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
-    from lslam.geometry.geodesy import parse_crs
+    from lslam.geometry.crs_names import parse_crs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
     from lslam.reports.evaluations import crispness_document
     from lslam.types.gnss import OutputCrs

@@ -96,16 +96,15 @@ class WindowTracker:
         return self._tracker.decide(loaded, self._tracker.present.track(loaded))
 
     def _close(self) -> list[Tracked]:
-        """The scans of the window, along their course where it bends and more of their points agree along it."""
-        is_bent, first = self._is_bent(), self._agreeing()
-        before, gain = first, math.inf
-        # As long as more points agree than may do by chance: the first course is told by scans that constant velocity deskewed.
-        while is_bent and gain > math.sqrt(before):
-            before = self._agreeing()
+        """The scans of the window, along their course where it bends and more points agree along it in most of them."""
+        is_bent, is_better, passes = self._is_bent(), True, 0
+        # The first course is told by scans that constant velocity deskewed.
+        while is_bent and is_better:
+            before, passes = self._inliers(), passes + 1
             self._track_again(self._course())
-            gain = self._agreeing() - before
-            is_decided = self._tracker.is_settled or self._scans[-1] is None
-            is_bent = is_decided and self._is_whole() and self._agreeing() > first
+            is_whole = self._is_whole() and (self._tracker.is_settled or self._scans[-1] is None)
+            is_better = is_whole and _is_more(self._inliers(), before)
+            is_bent = is_better or (is_whole and passes > 1)
             if not is_bent:
                 self._track_again(None)
         self._set_course(None)
@@ -114,8 +113,8 @@ class WindowTracker:
         self._scans, self._decided = [], []
         return out
 
-    def _agreeing(self) -> int:
-        return sum(tracked.result.inliers for tracked in self._decided)
+    def _inliers(self) -> list[int]:
+        return [tracked.result.inliers for tracked in self._decided]
 
     def _middles(self) -> list[tuple[int, Floats]]:
         """Instants and poses of the middles of registered sweeps, up to the end of the window."""
@@ -127,13 +126,14 @@ class WindowTracker:
         return Course(np.array(instants, np.int64), np.stack(poses))
 
     def _track_again(self, course: Course | None) -> None:
-        spent = [tracked.result.stages for tracked in self._decided]
+        spent = [tracked.result for tracked in self._decided]
         self._tracker.restore(deepcopy(self._begun))
         self._set_course(course)
         self._decided = [tracked for loaded in self._scans for tracked in self._track(loaded)]
         for k, (tracked, before) in enumerate(zip(self._decided, spent, strict=False)):
-            stages = _sum(tracked.result.stages, before)
-            self._decided[k] = replace(tracked, result=replace(tracked.result, stages=stages))
+            now = tracked.result
+            work = replace(now, stages=_sum(now.stages, before.stages), iterations=now.iterations + before.iterations)
+            self._decided[k] = replace(tracked, result=work)
 
     def _set_course(self, course: Course | None) -> None:
         motion = self._tracker.present.motion
@@ -163,6 +163,12 @@ def _displacement2(tracked: Tracked, course: Course) -> float | None:
     points = np.column_stack([source, np.ones(len(source))])
     moments = np.einsum("na,nb->ab", points, points) / max(len(points), 1)
     return float(np.einsum("kia,ab,kib->k", change, moments, change).mean())
+
+
+def _is_more(ours: list[int], others: list[int]) -> bool:
+    """Whether more scans have more inliers than have less, at two sigma: points of one scan agree or do not together."""
+    won, lost = (sum(sign * (a - b) > 0 for a, b in zip(ours, others, strict=True)) for sign in (1, -1))
+    return won - lost > 2 * math.sqrt(won + lost)
 
 
 def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:

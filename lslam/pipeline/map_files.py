@@ -6,7 +6,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,13 +21,15 @@ from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
-from lslam.pipeline.map_pass import BuiltMap
 from lslam.reports.evaluations import strict
 from lslam.reports.png import grey_png
 from lslam.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.types.gnss import Georeference
 from lslam.types.trajectory import Trajectory
 from lslam.version import __version__
+
+if TYPE_CHECKING:
+    from lslam.pipeline.map_pass import BuiltMap
 
 Note = dict[str, Any]
 SCHEMA = "lslam-map"

@@ -1,4 +1,4 @@
-"""Studies by name or file, and their grid: cells of recordings and simulations, x methods x seeds, as jobs."""
+"""The grid of a study: cells of recordings and simulations, x methods x seeds, as jobs."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from lslam.config import Config
 from lslam.config.input import AS_CONFIGURED, ScanRange
-from lslam.config.load import shipped
-from lslam.config.study import StudyConfig, StudySequence, parse_study, read_study
+from lslam.config.study import StudySequence
 from lslam.core.printable import file_safe
 from lslam.core.remote import RemotePath, as_path
-from lslam.core.untrusted import parse_toml
-from lslam.errors import InputError, UsageError, nearest
+from lslam.errors import InputError, UsageError
 from lslam.formats.bag_listing import stem_of
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.readers import open_sequence
@@ -230,20 +228,3 @@ def _simulated(
     scene = Scene(s.scenario, s.scans, s.lidar, s.columns, s.speed, s.compensated, s.imu, s.settings)
     scene = fitted_scene(scene, needed, own, seeds)
     return [scene_cell(scene, seed, output.scenes or output.out / SIMULATED, own) for seed in seeds]
-
-
-def study_names() -> tuple[str, ...]:
-    """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
-    return tuple(sorted(shipped("lslam.studies", "ready")))
-
-
-def find_study(word: str) -> StudyConfig:
-    """The study of a TOML file, else the ready one of that name.
-
-    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
-    """
-    if word.endswith(".toml") or Path(word).is_file():
-        return read_study(Path(word))
-    if word not in study_names():
-        raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
-    return parse_study(parse_toml(shipped("lslam.studies", "ready")[word]), f"study {word!r}", word)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import tables
 
-from lslam.studies.grid import find_study, study_names
+from lslam.studies.study_files import find_study, study_names
 from lslam.studies.sweep import report_folder
 from lslam.types.study import StudyResult
 

@@ -22,11 +22,11 @@ from collections import Counter
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
-from lslam.studies.grid import find_study
 from lslam.studies.jobs import Local
 from lslam.studies.output import OutputOptions
 from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress
+from lslam.studies.study_files import find_study
 from lslam.studies.sweep import Sweep, expand_study, report_folder, run_sweep
 
 GAIN = 1.8

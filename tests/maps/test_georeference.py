@@ -14,7 +14,7 @@ from pyproj import CRS, Transformer
 from lslam.errors import UsageError
 from lslam.formats.las_files import read_las
 from lslam.geometry import se3, so3
-from lslam.geometry.geodesy import parse_crs
+from lslam.geometry.crs_names import parse_crs
 from lslam.maps.georeference import Projection, to_lat_lon, utm_epsg
 from lslam.pipeline.map_files import MapNote, write_geojson, write_map
 from lslam.types.cloud import ArrayCloud

@@ -10,8 +10,8 @@ import pytest
 from lslam.config.study import Kind
 from lslam.errors import UsageError
 from lslam.studies.expanded_study import ExpandedStudy
-from lslam.studies.grid import find_study, study_names
 from lslam.studies.output import OutputOptions
+from lslam.studies.study_files import find_study, study_names
 from lslam.studies.sweep import Sweep, expand_study
 
 ROOT = Path(__file__).resolve().parents[2]

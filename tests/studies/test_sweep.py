@@ -17,12 +17,12 @@ from lslam.config.study import StudyConfig, parse_study
 from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
 from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded_study import ExpandedStudy
-from lslam.studies.grid import find_study
 from lslam.studies.jobs import Local
 from lslam.studies.output import OutputOptions
 from lslam.studies.results import is_comparable
 from lslam.studies.results_csv import VERSION, State, read_state, read_study_csv
 from lslam.studies.runner import StudyProgress
+from lslam.studies.study_files import find_study
 from lslam.studies.subjects import used
 from lslam.studies.sweep import Sweep, expand_study, run_sweep, write_study_report
 from lslam.types.study import StudyRow
