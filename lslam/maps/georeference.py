@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from lslam.errors import UsageError
 from lslam.geometry import se3
+from lslam.geometry.crs_names import crs_name
 from lslam.geometry.geodesy import (
-    crs_name,
     crs_of,
     exact_transformer,
     from_local,
