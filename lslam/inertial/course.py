@@ -18,11 +18,12 @@ MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
 class Course:
     """Natural cubic splines through the poses of middles around each sweep.
 
-    instants_ns : (N,) increasing; poses : (N, 4, 4)
+    instants_ns : (N,); poses : (N, 4, 4). A middle no later than one before it, as of a sliver of a sweep, is left out.
     """
 
     def __init__(self, instants_ns: NDArray[np.int64], poses: Floats) -> None:
-        self.instants_ns, self.poses = instants_ns, poses
+        is_later = np.append(True, instants_ns[1:] > np.maximum.accumulate(instants_ns)[:-1])
+        self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
 
     def at(self, stamp_ns: int, times: Floats) -> Floats | None:
         """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no middle lies within, or there are few."""

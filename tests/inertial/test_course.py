@@ -70,6 +70,19 @@ def test_where_scans_are_missing_the_course_goes_through_those_that_are_there() 
     assert most_apart(told, turning(0.2 + KNOTS))[1] < np.deg2rad(0.3)
 
 
+def test_a_middle_that_is_no_later_than_one_before_it_is_left_out() -> None:
+    middles = np.arange(7) * TENTH_NS + TENTH_NS // 2
+    twice = np.insert(middles, [4, 5], [middles[3] - 5_000_000, middles[4]])
+    poses = turning(1e-9 * twice)
+    poses[[4, 6]] = se3.make(np.eye(3), np.full(3, 9.0))
+    told, expected = (
+        course.at(3 * TENTH_NS, KNOTS) for course in (Course(twice, poses), Course(middles, turning(1e-9 * middles)))
+    )
+    assert told is not None
+    assert expected is not None
+    np.testing.assert_allclose(told, expected, atol=1e-12)
+
+
 def test_the_spline_is_the_natural_one() -> None:
     """Its second derivative vanishes at both ends, and is continuous in between."""
     rng = np.random.default_rng(3)
