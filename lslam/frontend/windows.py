@@ -45,7 +45,7 @@ class WindowTracker:
         # Of the open window, None: the end of the recording.
         self._scans: list[Loaded | None] = []
         self._decided: list[Tracked] = []
-        self._begun: State = {}
+        self._start: State = {}
         # Instants, ns, and poses of the last middles before the window.
         self._before: list[tuple[int, Floats]] = []
 
@@ -66,7 +66,7 @@ class WindowTracker:
                 yield self._track(loaded)
                 continue
             if not self._scans:
-                self._begun = deepcopy(self._tracker.state())
+                self._start = deepcopy(self._tracker.state())
             self._scans.append(loaded)
             self._decided += self._track(loaded)
             is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
@@ -74,7 +74,7 @@ class WindowTracker:
 
     def state(self) -> State:
         """What `restore` needs to go on from here."""
-        state = self._begun if self._scans else self._tracker.state()
+        state = self._start if self._scans else self._tracker.state()
         return {**state, "before": self._before, "monitor": None if self._monitor is None else self._monitor.state()}
 
     def restore(self, state: State) -> None:
@@ -126,11 +126,11 @@ class WindowTracker:
         return Course(np.array(instants, np.int64), np.stack(poses))
 
     def _track_again(self, course: Course | None) -> None:
-        spent = [tracked.result for tracked in self._decided]
-        self._tracker.restore(deepcopy(self._begun))
+        earlier = [tracked.result for tracked in self._decided]
+        self._tracker.restore(deepcopy(self._start))
         self._set_course(course)
         self._decided = [tracked for loaded in self._scans for tracked in self._track(loaded)]
-        for k, (tracked, before) in enumerate(zip(self._decided, spent, strict=False)):
+        for k, (tracked, before) in enumerate(zip(self._decided, earlier, strict=False)):
             now = tracked.result
             work = replace(now, stages=_sum(now.stages, before.stages), iterations=now.iterations + before.iterations)
             self._decided[k] = replace(tracked, result=work)
@@ -154,11 +154,11 @@ class WindowTracker:
 
 def _displacement2(tracked: Tracked, course: Course) -> float | None:
     """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is unknown."""
-    told = course.at(tracked.result.stamp_ns, tracked.sweep.times)
-    if told is None:
+    poses = course.at(tracked.result.stamp_ns, tracked.sweep.times)
+    if poses is None:
         return None
-    middle, source = len(told) // 2, tracked.loaded.prepared.source
-    within, course_within = (se3.relative(poses[middle], poses) for poses in (tracked.sweep.poses, told))
+    middle, source = len(poses) // 2, tracked.loaded.prepared.source
+    within, course_within = (se3.relative(sweep[middle], sweep) for sweep in (tracked.sweep.poses, poses))
     change = (se3.relative(within, course_within) - np.eye(4))[:, :3]
     points = np.column_stack([source, np.ones(len(source))])
     moments = np.einsum("na,nb->ab", points, points) / max(len(points), 1)

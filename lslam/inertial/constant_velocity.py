@@ -134,11 +134,10 @@ class ConstantVelocity(Stateful, MotionModel):
         poses = None if self.course is None else self.course.at(stamp_ns, knots)
         if poses is None:
             return self.steady(self.predict(stamp_ns), span)
-        told = MotionPrior(knots, poses, change=motion_covariance())
-        # The world begins where the first scan is expected.
-        return (
-            told if self._instant_ns is not None else replace(told, poses=self._pose @ se3.relative(told.pose, poses))
-        )
+        sweep = MotionPrior(knots, poses, change=motion_covariance())
+        if self._instant_ns is None:  # the world begins where the first scan is expected
+            sweep = replace(sweep, poses=self._pose @ se3.relative(sweep.pose, poses))
+        return sweep
 
     def steady(self, pose: Floats, span: Span) -> MotionPrior:
         """As `sweep`, through the `pose` (4, 4) at the stamp."""

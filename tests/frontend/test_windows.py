@@ -132,6 +132,17 @@ def test_a_window_stays_as_it_was_where_fewer_points_agree_along_its_course(monk
     np.testing.assert_array_equal(poses_of(decided), alone)
 
 
+def test_scans_that_cannot_be_read_are_no_part_of_the_course() -> None:
+    """One of them stamped so near the scan before that the middle of that one's sweep lies within its own."""
+    good, k = scans("walk"), 9
+    stamp_ns = good[k].stamp_ns - 60_000_000
+    unread = Loaded(good[k].index, stamp_ns, None)
+    decided = list(tracked(windows_of(configured()), (*good[:k], unread, *good[k + 1 :])))
+    results = [t.result for now in decided for t in now]
+    assert [r.status for r in results] == ["skipped" if i == k else "ok" for i in range(COUNT)]
+    assert [t.is_two_sided for now in decided for t in now] == [True] * COUNT
+
+
 def test_scans_of_one_instant_are_decided_as_they_come() -> None:
     at_once = tuple(replace(loaded, scan=replace(loaded.scan, times=None)) for loaded in scans("walk") if loaded.scan)
     assert [len(now) for now in tracked(windows_of(configured()), at_once[:6])] == [*[1] * 6, 0]
