@@ -25,8 +25,7 @@ Floats = NDArray[np.float64]
 # scans lie closer.
 LAG_S, REACH_SHARE = 0.45, 0.75
 # Points that make the planes of the first scan, and of the last scan those that are laid on them.
-LAID_POINTS = 1200
-PLANE_POINTS = (PreprocessConfig().source_points_min + PreprocessConfig().source_points_max) // 2
+PLANE_POINTS, LAID_POINTS = 5000, 1200
 # m, of a point at `LEVER_M`: poses that move by less state no motion, which is tested against a motion of metres.
 STILL_M = 0.05
 # Another motion than the one found from the claim must explain so many times more points.

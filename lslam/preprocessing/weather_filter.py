@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
 from lslam.kernels import voxel
 
 # The field of view of a spinning scanner, 360 x 45 deg. With a smaller one the test is more lenient.
 FIELD_OF_VIEW_SR = 4.8
 
 # m; wide enough for several pulses of one ring at fifty metres, and as the source points' grid begins.
-WIDE_CELL = PreprocessConfig().source_voxel
+WIDE_CELL = 1.0
 
 # Least share of sparse cells: edges make up to a fifth of a clear scan's cells sparse.
 CLEAR = 0.25

@@ -35,7 +35,8 @@ HIGH = 1.2
 # m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
 START_STEP = 1.0
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
-START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, 3.0), 10)
+TURN_STEP_DEG = 3.0
+START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, TURN_STEP_DEG), 10)
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
 SEARCH_SHARE, LOOKED_AT = 4, 3
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
@@ -201,12 +202,9 @@ def _likeliest(
 
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:
-    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it.
-
-    That is nearer than a step of `START_TURNS_DEG`.
-    """
+    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
     move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
-    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(np.ptp(START_TURNS_DEG[:2])))
+    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(TURN_STEP_DEG))
 
 
 def is_much_more(ours: Flags, others: Flags, margin: float = MUCH) -> bool:
