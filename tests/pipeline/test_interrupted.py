@@ -152,3 +152,22 @@ def test_a_stop_in_graph_buildings_or_map_interrupts_and_resumes_to_the_same_byt
     askers = ("solve", "marginal_blocks", "_along", "agreeing", "new_walls", "combined", "_pieces")
     stops = [(asker, counts[asker] // 2) for asker in askers]
     assert_goes_on(everything, whole_of_all[0], tmp_path / "out", OF_ALL, stops)
+
+
+@pytest.mark.parametrize("way", ["resume", "overwrite"])
+def test_a_run_that_was_stopped_before_it_knew_its_configuration_begins_anew(
+    way: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config = load_config(None, ["input.count=6", "map.write=false", "report.html=false"])
+
+    def stopped(config: Config) -> str:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("lslam.pipeline.outputs.config_text", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            lslam.run(SAMPLE, config, out=tmp_path / "out")
+    assert not (tmp_path / "out" / "config.toml").exists()
+    lslam.run(SAMPLE, config, out=tmp_path / "out", **{way: True})
+    assert json.loads((tmp_path / "out" / "manifest.json").read_text())["status"] == "done"
+    assert len((tmp_path / "out" / "trajectory_kitti.txt").read_text().splitlines()) == 6

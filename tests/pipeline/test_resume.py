@@ -318,24 +318,6 @@ def test_another_version_or_a_run_that_says_nothing_is_refused(begun: Begun, tmp
             lslam.run(drive(), config, out=out, resume=True)
 
 
-def test_a_run_that_was_stopped_before_it_had_written_anything_goes_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    out, config = tmp_path / "out", config_of("map.write=false", "input.count=6")
-
-    def stopped(config: Config) -> str:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("lslam.pipeline.outputs.config_text", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            lslam.run(sample(COUNT), config, out=out)
-    assert not (out / "config.toml").exists()
-    lslam.run(sample(COUNT), config, out=out, resume=True)
-    assert manifest(out)["status"] == "done"
-    assert len(read_trajectory(out / "trajectory.tum")) == 6
-
-
 def test_a_finished_run_is_left_alone(tmp_path: Path) -> None:
     out = tmp_path / "out"
     config = config_of("map.write=false")
