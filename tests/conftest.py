@@ -20,9 +20,11 @@ import pytest
 from compiled_once import compile_once
 from hypothesis import settings
 from shared_towns import Towns, TracedScans
+from sought_starts import SoughtStarts
 
 from lslam.core.extras import importing_open3d
 from lslam.errors import InputError
+from lslam.registration.start_search import held_by_non_ground
 from lslam.simulation.scenarios import SimulatedDrive
 
 if TYPE_CHECKING:
@@ -102,7 +104,7 @@ def recordings(made_once: MadeOnce) -> Callable[[str], Path]:
     return unpack
 
 
-TOWNS, SCANS = Towns(), TracedScans()
+TOWNS, SCANS, STARTS = Towns(), TracedScans(), SoughtStarts()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -116,6 +118,23 @@ def shared_towns(request: pytest.FixtureRequest) -> Iterator[None]:
             patch.setattr("lslam.simulation.built_scenario._city", TOWNS.city)
             patch.setattr("lslam.simulation.scenarios.RayScene", TOWNS.scene)
             patch.setattr(SimulatedDrive, "scan", SCANS.once(SimulatedDrive.scan))
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_starts(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A first step is sought once, however many runs take it, for all tests but those of registration."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name != "registration":
+            patch.setattr("lslam.registration.start_search.held_by_non_ground", STARTS.held_by_non_ground)
+        yield
+
+
+@pytest.fixture
+def starts_sought_anew(shared_starts: None) -> Iterator[None]:
+    """Nothing of an earlier run is taken: for the repetition that must give the same bytes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lslam.registration.start_search.held_by_non_ground", held_by_non_ground)
         yield
 
 

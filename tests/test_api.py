@@ -80,6 +80,7 @@ def test_open_run_and_evaluate_without_writing(tmp_path: Path, monkeypatch: pyte
     assert outcome.evaluation.ate["origin"].translation == translation
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_run_takes_a_path_and_gives_the_same_every_time() -> None:
     first, second = (lslam.run(str(SAMPLE), few_scans()).trajectory for _ in range(2))
     one_thread = lslam.run(SAMPLE, few_scans(input={"count": 12, "threads": 1})).trajectory

@@ -120,6 +120,7 @@ def test_evaluation_json_and_report(first: tuple[Done, Path]) -> None:
     assert 'src="http' not in html
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_repetition_threads_and_the_written_config_give_the_same_bytes(
     first: tuple[Done, Path], tmp_path: Path
 ) -> None:

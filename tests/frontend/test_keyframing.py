@@ -51,6 +51,7 @@ def test_a_run_keeps_its_keyframes(tmp_path: Path) -> None:
     assert max(steps) < 4.5, "no scan that was due is left out"
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_the_thread_changes_no_byte(tmp_path: Path) -> None:
     for threads in (1, 2):
         settings = (f"input.threads={threads}", "map.write=false", "report.html=false")

@@ -200,6 +200,7 @@ def digest(count: int = 12) -> str:
 
 
 @pytest.mark.unperturbed
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_the_same_drive_gives_the_same_bytes_twice_and_in_another_process() -> None:
     expected = digest()
     assert digest() == expected

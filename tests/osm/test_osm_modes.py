@@ -105,6 +105,7 @@ def test_the_report_has_the_building_pages(two_level: Path) -> None:
         assert words in page
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_the_same_run_writes_the_same_bytes(two_level: Path, tmp_path: Path) -> None:
     again = run(tmp_path / "again")
     for name in ("buildings.geojson", "buildings.osm", "osm_matches.csv", "trajectory.tum"):

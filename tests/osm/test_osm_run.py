@@ -148,6 +148,7 @@ def test_every_kind_of_run_ends_in_the_same_place_of_the_map(words: tuple[str, .
     assert away < (2.0 if "gnss.mode=graph" in words else 0.4)
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_the_number_of_threads_changes_nothing(by_file: Path, tmp_path: Path) -> None:
     lslam.run(SAMPLE, config(MAP, "input.threads=1"), out=tmp_path / "out")
     assert bytes_of(tmp_path / "out") == bytes_of(by_file)

@@ -108,6 +108,7 @@ def test_a_method_that_registers_nothing_does_not_pass_for_accurate() -> None:
     assert rmse(estimate(stub, Standstill(), motion=motion)) > 5 * rmse(runs()[1].record.results)
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_results_are_the_same_twice_and_without_the_comparison(monkeypatch: pytest.MonkeyPatch) -> None:
     """What constant velocity would have taken is tried on the side: not a bit of the result depends on it."""
     assert sum(r.imu.saved_s is not None for r in runs()[1].record.results) >= 2
@@ -116,6 +117,7 @@ def test_results_are_the_same_twice_and_without_the_comparison(monkeypatch: pyte
     np.testing.assert_array_equal(again.trajectory.poses, runs()[1].trajectory.poses)
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_scans_csv_is_the_same_twice_and_times_are_in_timing_csv(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

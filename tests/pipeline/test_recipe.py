@@ -278,6 +278,7 @@ def test_switched_off_outputs_are_not_written(tmp_path: Path) -> None:
     assert "map.pcd" in names(tmp_path / "pcd")
 
 
+@pytest.mark.usefixtures("starts_sought_anew")
 def test_threads_and_repetition_change_no_byte(tmp_path: Path) -> None:
     stub = with_points(sample(25), 12, noise(3))
     seen: list[dict[str, bytes]] = []
