@@ -47,7 +47,7 @@ def walked(in_the_middle: bool) -> Sequence:
 
 
 def poses_of(sequence: Sequence, method: str, use_imu: bool) -> Floats:
-    settings = [f"odometry.method={method}", f"imu.use={str(use_imu).lower()}", "loops.use=false"]
+    settings = [f"odometry.method={method}", f"imu.use={str(use_imu).lower()}", "loops.use=false", "map.write=false"]
     results = run(sequence, load_config(None, settings, {})).record.results
     assert all(r.status == "ok" for r in results)
     return np.stack([r.T_world_lidar for r in results])

@@ -37,12 +37,12 @@ class Revisited:
         return self.drive.city_poses
 
 
-def town_map(scenario: str, seed: int, count: int | None = None) -> Floats:
-    """(N, 3) m, town frame: the scans of the first visit merged at true poses."""
+def town_map(scenario: str, seed: int, count: int | None = None, every: int = 1) -> Floats:
+    """(N, 3) m, town frame: the scans of the first visit, or every so many-th, merged at true poses."""
     drive = simulate(scenario, seed=seed, count=count, motion_compensated=True)
     merger = MapMerger(0.2, 2.0, 80.0)
-    for scan, T in zip(drive, drive.city_poses, strict=True):
-        merger.add(scan.points, T, None)
+    for k in range(0, len(drive), every):
+        merger.add(drive.scan(k).points, drive.city_poses[k], None)
     return np.concatenate([block.points for block in merger.result().blocks()])
 
 

@@ -60,7 +60,7 @@ def test_a_drive_on_the_other_lane_is_found_anywhere_in_the_map(world: Revisited
 
 
 def test_a_drive_in_another_town_is_refused(search: PlaceFinder, world: Revisited) -> None:
-    other = make_prior_map(town_map("street", 5, 120), REGISTRATION)
+    other = make_prior_map(town_map("street", 5, 120, every=3), REGISTRATION)
     lost = PlaceFinder(PlaceSearch(other, REGISTRATION), world.store, CONFIG)
     assert lost.find() is None
     assert lost.reasons

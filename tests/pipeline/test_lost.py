@@ -131,7 +131,7 @@ def test_scans_swapped_in_pairs_degrade_the_run() -> None:
 
 
 def test_stamps_that_jitter_are_told_as_the_fault_of_the_clock() -> None:
-    whole = drive("street", 40)
+    whole = drive("street")
     late_ns = np.zeros(40, np.int64)
     late_ns[[12, 13, 25]] = 40_000_000, -40_000_000, 45_000_000
     scans = [replace(whole.scan(i), stamp_ns=int(whole.scan(i).stamp_ns + late_ns[i])) for i in range(40)]
@@ -163,7 +163,7 @@ def test_clouds_in_the_frame_of_a_world_are_reported() -> None:
 
 @pytest.mark.parametrize("lidar", ["vlp16", "hdl64"])
 def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
-    whole = drive("street", 70, lidar=lidar)
+    whole = drive("street", lidar=lidar)
     scans = [whole.scan(i) for i in (*range(20), *range(50, 70))]
     outcome = ended(Holed([replace(scan, index=k) for k, scan in enumerate(scans)], None, whole.calibration))
     assert outcome.record.manifest["status"] in ("degraded", "diverged")
