@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence as Many
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -87,22 +87,7 @@ def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
     if not level.is_turned:
         return results
     T = se3.make(level.R, np.zeros(3))
-    B = np.kron(np.eye(2), level.R)
-
-    def turned(covariance: Floats | None) -> Floats | None:
-        return None if covariance is None else np.asarray(B @ covariance @ B.T)
-
-    return [
-        replace(
-            r,
-            T_world_lidar=se3.normalise(T @ r.T_world_lidar),
-            covariance=turned(r.covariance),
-            registration_covariance=turned(r.registration_covariance),
-            points_covariance=turned(r.points_covariance),
-            degenerate=r.degenerate @ B.T,
-        )
-        for r in results
-    ]
+    return [r.moved(T) for r in results]
 
 
 def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:

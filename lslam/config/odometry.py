@@ -82,7 +82,12 @@ class RegistrationConfig(Section):
         ge=1,
         description="Gauss-Newton steps per scan; three times as many for `point` and `ndt`, which converge slowly",
     )
-    start_scans: int = Field(5, ge=1, description="first scans, registered coarse to fine because the speed is unknown")
+    start_scans: int = Field(
+        5,
+        ge=1,
+        description="first scans, registered coarse to fine because the speed is unknown; above 1 the first is registered again "
+        "on the map of those that follow",
+    )
     start_reach: float = Field(
         12.0,
         ge=0,

@@ -72,7 +72,7 @@ def estimate(
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
         results = checkpoints.begin(windows, keyframing)
-    middle = tracker.middle
+    middle = windows.middle
     ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
     for decided in windows.decided(chain(ahead, (None,))):
         for tracked in decided:

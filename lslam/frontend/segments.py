@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.config.odometry import RegistrationConfig
 from lslam.frontend.tracker import Loaded, Tracker
+from lslam.geometry import se3
 from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.registration.robust import UsualAgreement
@@ -35,6 +36,16 @@ class Tracked:
     middle: tuple[int, Floats]
     is_two_sided: bool = False
 
+    def moved(self, T: Floats) -> Tracked:
+        """In the world that `T` (4, 4) leads to."""
+        instant_ns, middle = self.middle
+        sweep = replace(self.sweep, poses=T @ self.sweep.poses)
+        return replace(self, result=self.result.moved(T), sweep=sweep, middle=(instant_ns, T @ middle))
+
+    def at(self, pose: Floats) -> Tracked:
+        """With the scan at another pose (4, 4)."""
+        return self.moved(pose @ se3.inverse(self.result.T_world_lidar))
+
 
 class SegmentTracker:
     """Tracks the scans of a run, each segment of them in a local map of its own.
@@ -48,7 +59,7 @@ class SegmentTracker:
     """
 
     def __init__(self, tracker: Tracker, begin: Begin | None = None, initial_scans: int = 5) -> None:
-        self._tracker, self._begin, self._initial_scans = tracker, begin, initial_scans
+        self._tracker, self._begin, self.initial_scans = tracker, begin, initial_scans
         self._segment = 0
         # What scans agreed with their maps: by less than a share of that, scans of nothing agree as well.
         self._usual = UsualAgreement(RegistrationConfig().min_agreement)
@@ -72,6 +83,11 @@ class SegmentTracker:
         return isinstance(self.odometry, Deskewing) and isinstance(self._tracker.motion, ConstantVelocity)
 
     @property
+    def begin(self) -> Begin | None:
+        """Begins an empty map; None for a method that has one map only."""
+        return self._begin
+
+    @property
     def present(self) -> Tracker:
         """The tracker of the present segment."""
         return self._tracker
@@ -91,7 +107,7 @@ class SegmentTracker:
             self._open.append((first, other))
             if is_held and not _is_less(first.result, other.result):
                 return self.finish()
-            return self._new_segment() if is_held or len(self._open) > self._initial_scans else []
+            return self._new_segment() if is_held or len(self._open) > self.initial_scans else []
         decided = self.finish()
         if is_held or self._begin is None or loaded.scan is None:
             return [*decided, first]

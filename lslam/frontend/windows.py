@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from dataclasses import replace
@@ -10,13 +11,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.frontend.look_back import first_pose
 from lslam.frontend.segments import SegmentTracker, Tracked
 from lslam.frontend.tracker import Loaded
 from lslam.geometry import se3
 from lslam.inertial.constant_velocity import ConstantVelocity
 from lslam.inertial.course import NEIGHBOURS, Course
 from lslam.integrity.monitor import IntegrityMonitor
-from lslam.odometry.base import Odometry, Resumable
+from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.types.state import State
 
 Floats = NDArray[np.float64]
@@ -31,6 +33,8 @@ class WindowTracker:
     A window is tracked with constant velocity first. Where its points are displaced by more than their noise, it is tracked
     again from where it began, along the course through the middles of its sweeps, as long as more points agree. A run goes on
     from where a window began.
+
+    The first scans of a run are a window whatever the method: with it the pose of the first is known, as in `first_pose`.
 
     monitor : sees the scans that are decided; noise_m : of a point
     """
@@ -48,6 +52,20 @@ class WindowTracker:
         self._start: State = {}
         # Instants, ns, and poses of the last middles before the window.
         self._before: list[tuple[int, Floats]] = []
+        # The tracker's world in that of the first pose as later scans tell it; None until they do.
+        self._world: Floats | None = None if self._is_looking_back else np.eye(4)
+
+    @property
+    def middle(self) -> tuple[int, Floats]:
+        """Instant, ns, and pose of the middle of the newest sweep."""
+        instant_ns, pose = self._tracker.middle
+        return instant_ns, pose if self._world is None else self._world @ pose
+
+    @property
+    def _is_looking_back(self) -> bool:
+        """Whether the first scans can be registered again on a map of later ones."""
+        tracker = self._tracker
+        return tracker.begin is not None and tracker.initial_scans > 1 and isinstance(tracker.odometry, Resumable)
 
     @property
     def odometry(self) -> Odometry:
@@ -63,7 +81,7 @@ class WindowTracker:
         """With each of the scans to come, None at the end, those that are decided: one, none, or all of a window."""
         for loaded in ahead:
             if not self._scans and not self._is_begin(loaded):
-                yield self._track(loaded)
+                yield self._moved(self._track(loaded))
                 continue
             if not self._scans:
                 self._start = deepcopy(self._tracker.state())
@@ -75,19 +93,22 @@ class WindowTracker:
     def state(self) -> State:
         """What `restore` needs to go on from here."""
         state = self._start if self._scans else self._tracker.state()
-        return {**state, "before": self._before, "monitor": None if self._monitor is None else self._monitor.state()}
+        monitor = None if self._monitor is None else self._monitor.state()
+        return {**state, "before": self._before, "world": self._world, "monitor": monitor}
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         self._tracker.restore(state)
-        self._before = list(state["before"])
+        self._before, self._world = list(state["before"]), state["world"]
         if self._monitor is not None:
             self._monitor.restore(state["monitor"])
 
     def _is_begin(self, loaded: Loaded | None) -> bool:
         """Whether a window begins with the scan."""
         scan = None if loaded is None else loaded.scan
-        return self.is_windowed and scan is not None and scan.span.seconds > 0 and self._tracker.is_settled
+        if scan is None or not self._tracker.is_settled:
+            return False
+        return self._world is None or (self.is_windowed and scan.span.seconds > 0)
 
     def _track(self, loaded: Loaded | None) -> list[Tracked]:
         # Scans that are still open at the end of the recording have their word there.
@@ -96,7 +117,17 @@ class WindowTracker:
         return self._tracker.decide(loaded, self._tracker.present.track(loaded))
 
     def _close(self) -> list[Tracked]:
-        """The scans of the window, along their course where it bends and more points agree along it in most of them."""
+        """The scans of the window, the first of a run where the later ones put it."""
+        is_bent = self.is_windowed and self._follow_course()
+        out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
+        self._before = self._middles()[-NEIGHBOURS:]
+        if self._world is None:
+            out = self._look_back(out)
+        self._scans, self._decided = [], []
+        return self._moved(out)
+
+    def _follow_course(self) -> bool:
+        """Track the window along its course where it bends and more points agree along it in most scans; whether it does."""
         is_bent, is_better, passes = self._is_bent(), True, 0
         # The first course is told by scans that constant velocity deskewed.
         while is_bent and is_better:
@@ -108,10 +139,27 @@ class WindowTracker:
             if not is_bent:
                 self._track_again(None)
         self._set_course(None)
-        out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
-        self._before = self._middles()[-NEIGHBOURS:]
-        self._scans, self._decided = [], []
-        return out
+        return is_bent
+
+    def _look_back(self, decided: list[Tracked]) -> list[Tracked]:
+        """The first scan on the map of the later ones, in the tracker's world, which turns with its pose."""
+        begin, first, began = self._tracker.begin, decided[0], time.perf_counter()
+        assert begin is not None
+
+        def create() -> Deskewing:
+            odometry = begin(np.eye(4)).odometry
+            assert isinstance(odometry, Deskewing)
+            return odometry
+
+        pose = first_pose(decided, self._tracker.initial_scans, create)
+        self._world = se3.normalise(first.result.T_world_lidar @ se3.inverse(pose))
+        stages = _sum(first.result.stages, {"register": time.perf_counter() - began})
+        return [replace(first, result=replace(first.result, stages=stages)).at(pose), *decided[1:]]
+
+    def _moved(self, decided: list[Tracked]) -> list[Tracked]:
+        """In the world of the first pose."""
+        world = self._world
+        return decided if world is None else [tracked.moved(world) for tracked in decided]
 
     def _inliers(self) -> list[int]:
         return [tracked.result.inliers for tracked in self._decided]

@@ -30,8 +30,8 @@ class PoseUncertainty(Stateful):
     error. So per scan the map's covariance grows by (step / lever arm) times the registration's, and a rotation error
     moves all later positions. A sensor at rest does not drift: its scans enter at one pose, and leave the map's error as it is.
 
-    A young map is the mean of its scans: one part in k of the error of the k-th stays in all that follow. The registrations
-    of the first few are the least accurate, which the later covariances do not model.
+    A young map is the mean of its scans: one part in k of the error of the k-th stays in all that follow. The first few err by
+    more than their covariances say; `frontend.look_back` registers the first again, to which all are relative.
 
     Scan-to-scan odometry has no such map: every registration's error enters in full.
 

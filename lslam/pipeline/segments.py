@@ -200,20 +200,13 @@ def _bridged(results: list[ScanResult], T: Floats, following: Session) -> list[S
 
 def _moved(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanResult:
     """The result in the world that T (4, 4) leads to, its covariance beside that of the segment's `origin` (3,), m."""
-    pose = se3.normalise(T @ result.T_world_lidar)
+    moved = result.moved(T)
 
-    def turned(covariance: Floats | None) -> Floats | None:
-        return None if covariance is None else noise.rotated(covariance, T[:3, :3])
+    def chained(own: Floats | None) -> Floats | None:
+        step = moved.T_world_lidar[:3, 3] - origin
+        return None if own is None else np.asarray(own + noise.transported(base, step))
 
-    def chained(covariance: Floats | None) -> Floats | None:
-        own = turned(covariance)
-        return None if own is None else np.asarray(own + noise.transported(base, pose[:3, 3] - origin))
-
-    return replace(
-        result, T_world_lidar=pose, covariance=chained(result.covariance), points_covariance=chained(result.points_covariance),
-        registration_covariance=turned(result.registration_covariance),
-        degenerate=result.degenerate @ np.kron(np.eye(2), T[:3, :3]).T,
-    )  # fmt: skip
+    return replace(moved, covariance=chained(moved.covariance), points_covariance=chained(moved.points_covariance))
 
 
 def _say(segments: Sequence[Segment], manifest: Manifest) -> None:

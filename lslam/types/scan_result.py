@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.geometry import portable, so3
+from lslam.geometry import noise, portable, se3, so3
 from lslam.types.arrays import Floats
 from lslam.types.imu import ImuDiagnostics
 from lslam.types.scan import LEVER_M
@@ -152,6 +152,19 @@ class ScanResult:
         if self.stamp_offset is None:
             return self
         return replace(self, T_world_lidar=self.T_world_lidar @ self.stamp_offset, stamp_offset=None)
+
+    def moved(self, T: Floats) -> ScanResult:
+        """The result in the world that `T` (4, 4) leads to: pose, covariances and degenerate directions."""
+        R = T[:3, :3]
+
+        def turned(covariance: Floats | None) -> Floats | None:
+            return None if covariance is None else noise.rotated(covariance, R)
+
+        return replace(
+            self, T_world_lidar=se3.normalise(T @ self.T_world_lidar), covariance=turned(self.covariance),
+            points_covariance=turned(self.points_covariance), registration_covariance=turned(self.registration_covariance),
+            degenerate=self.degenerate @ np.kron(np.eye(2), R).T,
+        )  # fmt: skip
 
     @property
     def by_points(self) -> ScanResult:

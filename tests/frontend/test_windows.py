@@ -54,7 +54,8 @@ def windows_of(config: Config, *, is_windowed: bool = True) -> WindowTracker:
     def begin(pose: Floats) -> Tracker:
         return Tracker(create_odometry(config), motion=ConstantVelocity(pose))
 
-    tracker = SegmentTracker(Tracker(create_odometry(config)), begin)
+    # One scan that initialises a map: none is registered again on a map of later ones.
+    tracker = SegmentTracker(Tracker(create_odometry(config)), begin, initial_scans=1)
     windows = WindowTracker(tracker, None, config.registration.sigma)
     windows.is_windowed = windows.is_windowed and is_windowed
     return windows

@@ -30,7 +30,8 @@ COUNT = 12
 
 
 def config_of(*settings: str) -> Config:
-    return load_config(None, ["loops.use=false", *settings], {})
+    # Each scan is decided as it comes: none is registered again on the map of those that follow.
+    return load_config(None, ["loops.use=false", "registration.start_scans=1", *settings], {})
 
 
 def manifest(folder: Path) -> dict[str, Any]:
