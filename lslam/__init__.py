@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from lslam.version import __version__
+from lslam.core.version import __version__
 
 if TYPE_CHECKING:
-    from lslam.config.load import load_config
+    from lslam.core.config.load import load_config
     from lslam.evaluation.evaluate import evaluate
+    from lslam.io.readers import open_sequence
     from lslam.pipeline.run import run
-    from lslam.readers import open_sequence
     from lslam.registration.registration import Registration
     from lslam.simulation.scenarios import simulate
     from lslam.studies.from_python import compare
@@ -28,8 +28,8 @@ _HOMES = {
     "Registration": ("lslam.registration.registration", "Registration"),
     "compare": ("lslam.studies.from_python", "compare"),
     "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
-    "load_config": ("lslam.config.load", "load_config"),
-    "open_sequence": ("lslam.readers", "open_sequence"),
+    "load_config": ("lslam.core.config.load", "load_config"),
+    "open_sequence": ("lslam.io.readers", "open_sequence"),
     "run": ("lslam.pipeline.run", "run"),
     "simulate": ("lslam.simulation.scenarios", "simulate"),
 }

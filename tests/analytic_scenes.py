@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.geometry import geodesy, se2
-from lslam.types.arrays import Floats
-from lslam.types.building import BuildingCorrection, BuildingStatus, CorrectedMap
+from lslam.core.geometry import geodesy, se2
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import BuildingCorrection, BuildingStatus, CorrectedMap
 
 HELD = 0.6  # m; one sigma along an axis below which walls hold it: a building that nothing holds has 1 m
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from lslam.core.kernels import jit  # noqa: F401  # which tells numba where its cache is
 from lslam.core.machine import lock
-from lslam.kernels import jit  # noqa: F401  # which tells numba where its cache is
 from lslam.pipeline import precompile
 
 # isort: split

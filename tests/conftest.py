@@ -22,8 +22,8 @@ from hypothesis import settings
 from shared_towns import Towns, TracedScans
 from sought_starts import SoughtStarts
 
+from lslam.core.errors import InputError
 from lslam.core.extras import importing_open3d
-from lslam.errors import InputError
 from lslam.registration.start_search import held_by_non_ground
 from lslam.simulation.scenarios import SimulatedDrive
 

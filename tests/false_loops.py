@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from graph_builders import measured
 
-from lslam.types.constraint import LoopCandidate
+from lslam.core.types.constraint import LoopCandidate
 
 # m and rad, how wrong: another car park, another heading; too little to stand out against odometry that drifted.
 WRONG = np.array([3.0, 3.0, 0.5, 0.02, 0.02, 0.2])

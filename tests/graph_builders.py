@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.geometry import se3, so3
-from lslam.graph.problem import PoseGraph
-from lslam.types.constraint import Constraint
+from lslam.backend.graph.problem import PoseGraph
+from lslam.core.geometry import se3, so3
+from lslam.core.types.constraint import Constraint
 
 STEP_SIGMAS = np.array([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3])
 LOOP_SIGMAS = np.array([0.03, 0.03, 0.03, 2e-3, 2e-3, 2e-3])

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import pytest
 from stub_sequences import Stub
 
-from lslam.config import Config
-from lslam.frontend import inertial_start
-from lslam.frontend.inertial_start import first_heard_ns, first_poses
-from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.initialise import FirstPoses
-from lslam.types.sequence import Selection, Sequence
+from lslam.core.config import Config
+from lslam.core.types.sequence import Selection, Sequence
+from lslam.odometry.frontend import inertial_start
+from lslam.odometry.frontend.inertial_start import first_heard_ns, first_poses
+from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.odometry.inertial.initialise import FirstPoses
 
 
 @pytest.fixture(scope="module")

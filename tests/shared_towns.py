@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from lslam.core.types.scan import Scan
 from lslam.simulation import built_scenario
 from lslam.simulation.city import City
 from lslam.simulation.curve import RouteCurve
@@ -19,7 +20,6 @@ from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.scene_mesh import RayScene, SceneMesh
 from lslam.simulation.terrain import Terrain
 from lslam.studies.worker import ScanStore
-from lslam.types.scan import Scan
 
 HELD = 5  # towns, of some 100 MB each with what rays need
 HELD_BYTES = 300_000_000  # of scans

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import fsspec
 from fsspec.implementations.memory import MemoryFileSystem
 
-from lslam.core.remote import RemotePath
+from lslam.io.remote import RemotePath
 
 
 class Counted(MemoryFileSystem):

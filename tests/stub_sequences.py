@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Calibration, Sequence, StatedTimes
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.readers import open_sequence
 from lslam.odometry.base import Traits
-from lslam.readers import open_sequence
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Calibration, Sequence, StatedTimes
-from lslam.types.trajectory import Trajectory
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
 

@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config.config import Config
-from lslam.errors import InputError, UsageError
-from lslam.types.trajectory import Trajectory
+from lslam.core.config.config import Config
+from lslam.core.errors import InputError, UsageError
+from lslam.core.types.trajectory import Trajectory
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
 

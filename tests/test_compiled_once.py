@@ -6,8 +6,8 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+from lslam.core.kernels.jit import kernel
 from lslam.core.machine import lock
-from lslam.kernels.jit import kernel
 
 results = []
 

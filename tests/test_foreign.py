@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from lslam.config import load_config
+from lslam.core.config import load_config
+from lslam.core.errors import InputError
 from lslam.core.extras import importing
-from lslam.errors import InputError
 from lslam.odometry import create_odometry
 
 

@@ -104,7 +104,7 @@ def test_flags_exist(name: str) -> None:
 
 
 def test_configuration_keys_exist() -> None:
-    from lslam.config import load_config
+    from lslam.core.config import load_config
     from lslam.simulation.scenario_files import scenario_named
 
     lines = [line for shown in PAGES for line in shown.shell_lines()]
@@ -124,7 +124,7 @@ def test_configuration_keys_exist() -> None:
 
 
 def test_keys_in_the_text_exist() -> None:
-    from lslam.config.config import Config
+    from lslam.core.config.config import Config
 
     sections = {name: type(getattr(Config(), name)) for name in Config.model_fields}
     files = ("csv", "html", "json", "md", "npz", "ply", "py", "toml", "txt")
@@ -137,7 +137,7 @@ def test_keys_in_the_text_exist() -> None:
 
 @pytest.mark.parametrize("name", ["README.md", "docs/commands.md"])
 def test_sequence_toml_is_understood(name: str, tmp_path: Path) -> None:
-    from lslam.formats.sequence_toml import read_sequence_toml
+    from lslam.io.formats.sequence_toml import read_sequence_toml
 
     (tmp_path / "sequence.toml").write_text(page(name).block("toml", "motion_compensated"))
     info = read_sequence_toml(tmp_path / "sequence.toml")
@@ -147,7 +147,7 @@ def test_sequence_toml_is_understood(name: str, tmp_path: Path) -> None:
 def test_keys_of_sequence_toml_are_all_described() -> None:
     from dataclasses import fields
 
-    from lslam.formats.sequence_toml import SequenceInfo
+    from lslam.io.formats.sequence_toml import SequenceInfo
 
     section = Page("", page("docs/conventions.md").text.split("## `sequence.toml`")[1].split("\n## ")[0])
     named = {name for row in section.rows() for name in re.findall(r"`(\w+)`", row[0])}
@@ -157,7 +157,7 @@ def test_keys_of_sequence_toml_are_all_described() -> None:
 def test_the_study_is_understood_and_says_what_was_printed() -> None:
     import tomllib
 
-    from lslam.config.study import parse_study
+    from lslam.core.config.study import parse_study
 
     study = parse_study(tomllib.loads(COMMANDS.block("toml", "[parameters]")), "commands", "shares")
     assert len(study.points()) == 8
@@ -168,7 +168,7 @@ def test_the_study_is_understood_and_says_what_was_printed() -> None:
 
 @pytest.mark.parametrize("name", ["README.md", "docs/commands.md"])
 def test_exit_codes_are_those_of_the_errors(name: str) -> None:
-    from lslam import errors
+    from lslam.core import errors
 
     listed = {int(row[0]) for row in page(name).rows() if row[0].isdigit()}
     classes = [c for c in vars(errors).values() if isinstance(c, type) and issubclass(c, errors.LslamError)]
@@ -262,17 +262,17 @@ MARKS = {
     "NO_LINE",
 }
 SECTIONS = ("preprocess", "registration", "recovery", "keyframes", "loops", "graph")
-HELD = ("registration", "recovery", "loops", "graph", "odometry", "integrity")
+HELD = ("registration", "backend/loops", "backend/graph", "odometry", "odometry/integrity")
 
 
 def file_of(section: Any) -> str:
-    """Of a section of the configuration, from the package: `config/input.py`."""
+    """Of a section of the configuration, from the package: `core/config/input.py`."""
     return type(section).__module__.removeprefix("lslam.").replace(".", "/") + ".py"
 
 
 def value_in_code(name: str, file: str) -> Any:
-    if file.startswith("config/"):
-        from lslam.config.config import Config
+    if file.startswith("core/config/"):
+        from lslam.core.config.config import Config
 
         section, key = name.split(".")
         assert file == file_of(getattr(Config(), section))
@@ -324,11 +324,11 @@ def constants_of(path: Path) -> set[str]:
 
 
 def test_no_constant_is_missing_in_the_register() -> None:
-    from lslam.config.config import Config
+    from lslam.core.config.config import Config
 
     listed = {(file, name) for name, _, _, file, _ in REGISTER}
     files = {path for package in HELD for path in (PACKAGE / package).glob("*.py")}
-    files |= {PACKAGE / file for file, _ in listed if not file.startswith("config/")}
+    files |= {PACKAGE / file for file, _ in listed if not file.startswith("core/config/")}
     held = {(path.relative_to(PACKAGE).as_posix(), name) for path in files for name in constants_of(path)}
     for section in SECTIONS:
         model = getattr(Config(), section)

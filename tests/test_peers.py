@@ -13,13 +13,13 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam import Registration
-from lslam.config import Config, load_config
-from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.core.config import Config, load_config
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.io.readers import open_sequence
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.open3d import create as create_open3d
 from lslam.odometry.small_gicp import create as create_small_gicp
-from lslam.readers import open_sequence
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from lslam.config.backend import LoopsConfig
-from lslam.config.config import Config
-from lslam.errors import InputError, UsageError
-from lslam.loops import create_descriptor
+from lslam.backend.loops import create_descriptor
+from lslam.core.config.backend import LoopsConfig
+from lslam.core.config.config import Config
+from lslam.core.errors import InputError, UsageError
+from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry, known_methods
 from lslam.pipeline.check import check_config
-from lslam.readers import open_sequence
 
 MODULE = """
 from lslam.odometry.base import Traits
-from lslam.readers import scan_folder
+from lslam.io.readers import scan_folder
 
 
 class Method(Traits):

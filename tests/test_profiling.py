@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from lslam.cli import profiling
-from lslam.errors import OutputError
+from lslam.core.errors import OutputError
 
 
 def spin(seconds: float) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 from storages import Counted, counted, stored
 
-from lslam.core.remote import RemotePath, as_path
-from lslam.errors import LslamError, StorageError, UsageError
-from lslam.formats.atomic import atomic_write, write_text
+from lslam.core.errors import LslamError, StorageError, UsageError
+from lslam.io.formats.atomic import atomic_write, write_text
+from lslam.io.remote import RemotePath, as_path
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from shared_towns import HELD, Towns, TracedScans
 
+from lslam.core.types.scan import Scan
 from lslam.simulation import built_scenario, scenarios
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import RayScene
-from lslam.types.scan import Scan
 
 
 def test_a_shared_town_is_the_one_that_is_built_anew(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numba.core import event
 
+from lslam.core.kernels.jit import kernel
 from lslam.core.stopping import Interrupt, heeded
-from lslam.kernels.jit import kernel
 
 
 class Hit:

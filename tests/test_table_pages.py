@@ -12,6 +12,7 @@ import pytest
 from pages import Page, page
 
 from lslam.backend.manual import write_control
+from lslam.core.types.building import KeyframeMatch, OsmMatches
 from lslam.pipeline.merged_folder import COLUMNS
 from lslam.pipeline.outputs import (
     imu_states_text,
@@ -22,7 +23,6 @@ from lslam.pipeline.outputs import (
     write_scans,
 )
 from lslam.pipeline.run_folder import OURS
-from lslam.types.building import KeyframeMatch, OsmMatches
 
 SECTION = page("docs/conventions.md").text.split("\n## Tables of a run\n")[1].split("\n## ")[0]
 SECTIONS = {

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from lslam.core import untrusted
+from lslam.core.errors import InputError
 from lslam.core.untrusted import JsonItems, is_file, parse_json, parse_toml, whole_number
-from lslam.errors import InputError
 
 PACKAGE = Path(__file__).resolve().parents[1] / "lslam"
 DIGITS = "9" * 5000

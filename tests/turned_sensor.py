@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
-from lslam.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.geometry import se3, so3
 
 Floats = NDArray[np.float64]
 # Roll, pitch, yaw, deg.

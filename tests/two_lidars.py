@@ -6,12 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lslam.core.types.sequence import Sequence
+from lslam.io.readers import open_sequence
 from lslam.pipeline.convert.convert_sequence import convert_sequence
-from lslam.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.sequence import Sequence
 
 LIDAR = replace(LIDARS["vlp16"], columns=600)
 PLACE = 'name = "rear", place = [-1.6, 0.4, -0.2], rpy_deg = [0, 3, 172]'

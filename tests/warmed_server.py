@@ -6,7 +6,7 @@ from compiled_once import compile_once
 
 import lslam.pipeline.run
 import lslam.studies.worker  # noqa: F401
-from lslam.config import Config
+from lslam.core.config import Config
 from lslam.odometry import create_odometry
 from lslam.pipeline import precompile
 

@@ -16,15 +16,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from lslam.config.backend import DebugConfig
-from lslam.errors import InputError
+from lslam.core.config.backend import DebugConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import noise, se3, so3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Keyframe
 from lslam.evaluation.associate import associate
 from lslam.evaluation.frames import main_axis
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import noise, se3, so3
-from lslam.types.arrays import Floats
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Keyframe
+from lslam.io.formats.trajectory_files import read_trajectory
 
 # x ahead, y to the left, z up, of axes with x to the right, y down, z ahead.
 CAMERA_TO_LIDAR = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

@@ -9,24 +9,24 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
+from lslam.backend.graph.consistency import Drift, judge_loops
+from lslam.backend.graph.odometry_constraints import odometry_constraints
+from lslam.backend.graph.pose_graph import from_held
+from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.backend.manual import stamp_of
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import GraphError, UsageError
+from lslam.core.geometry import geodesy, noise, se3, so3
+from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.se3 import poses_at
 from lslam.core.printable import counted
-from lslam.errors import GraphError, UsageError
-from lslam.geometry import geodesy, noise, se3, so3
-from lslam.geometry.noise import quantile
-from lslam.geometry.se3 import poses_at
-from lslam.graph.consistency import Drift, judge_loops
-from lslam.graph.odometry_constraints import odometry_constraints
-from lslam.graph.pose_graph import from_held
-from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Keyframe
 from lslam.maps.georeference import Projection, to_wgs84
-from lslam.preprocessing.ground import world_up_of
-from lslam.types.arrays import Floats, Longs
-from lslam.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
-from lslam.types.gnss import Georeference
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Keyframe
+from lslam.registration.preprocessing.ground import world_up_of
 
 log = logging.getLogger("lslam")
 

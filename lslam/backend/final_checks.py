@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.fix_faults import Fixes
-from lslam.geometry import geodesy, se3
-from lslam.geometry.noise import quantile
-from lslam.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.geometry import geodesy, se3
+from lslam.core.geometry.noise import quantile
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import ControlPoint
+from lslam.core.types.gnss import Georeference
 from lslam.maps.crispness import plane_variances
-from lslam.types.arrays import Floats
-from lslam.types.constraint import ControlPoint
-from lslam.types.gnss import Georeference
 
 # Points of all keyframes, neighbourhoods of that comparison, and parts of the drive whose noise is independent.
 POINTS, SAMPLES, PARTS = 400_000, 20_000, 16

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.geometry.se3 import poses_at, turns_between
-from lslam.graph.fix_errors import (
+from lslam.backend.graph.fix_errors import (
     FEWEST,
     NO_HEIGHT,
     ClockOffset,
@@ -18,9 +17,10 @@ from lslam.graph.fix_errors import (
     height_levels,
     rough_residuals,
 )
-from lslam.graph.gnss_alignment import GnssAlignment, align
-from lslam.types.arrays import Bools, Floats, Longs
-from lslam.types.gnss import GnssStream
+from lslam.backend.graph.gnss_alignment import GnssAlignment, align
+from lslam.core.geometry.se3 import poses_at, turns_between
+from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.types.gnss import GnssStream
 
 # Fixes that heights alone reject, at least, as a share of all.
 LEAST_SHARE = 0.05

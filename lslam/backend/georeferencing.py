@@ -18,23 +18,23 @@ from lslam.backend.fix_faults import (
     on_clock_of_scans,
     with_actual_sigmas,
 )
-from lslam.config.backend import GnssConfig, GraphConfig
-from lslam.config.config import Config
-from lslam.errors import InputError
-from lslam.geometry import geodesy, noise, se3, so3
-from lslam.geometry.noise import quantile
-from lslam.geometry.se3 import poses_at
-from lslam.graph.drift import chains, drift_covariance
-from lslam.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
-from lslam.graph.gnss_alignment import GnssAlignment
-from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.backend.graph.drift import chains, drift_covariance
+from lslam.backend.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
+from lslam.backend.graph.gnss_alignment import GnssAlignment
+from lslam.backend.graph.problem import PoseGraph, PositionFix
+from lslam.core.config.backend import GnssConfig, GraphConfig
+from lslam.core.config.config import Config
+from lslam.core.errors import InputError
+from lslam.core.geometry import geodesy, noise, se3, so3
+from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.arrays import Floats
+from lslam.core.types.gnss import Georeference, GnssStream
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Keyframe
 from lslam.maps.georeference import Projection
-from lslam.preprocessing.ground import world_up_of
-from lslam.types.arrays import Floats
-from lslam.types.gnss import Georeference, GnssStream
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Keyframe
+from lslam.registration.preprocessing.ground import world_up_of
 
 log = logging.getLogger("lslam")
 

@@ -13,21 +13,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.config.backend import GraphConfig
+from lslam.backend.graph.problem import FloorPlane, UpDirection
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.config import Config
+from lslam.core.config.backend import GraphConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3, so3
+from lslam.core.kernels import jit
 from lslam.core.machine import one_at_a_time
 from lslam.core.stopping import checking
-from lslam.errors import InputError
-from lslam.geometry import se3, so3
-from lslam.graph.problem import FloorPlane, UpDirection
-from lslam.kernels import jit
-from lslam.keyframes.store import KeyframeStore
-from lslam.preprocessing.ground import Z, levelling, up_of
-from lslam.preprocessing.up import NEAR_Z
-from lslam.types.arrays import Floats
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Keyframe
+from lslam.core.types.arrays import Floats
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Keyframe
+from lslam.registration.preprocessing.ground import Z, levelling, up_of
+from lslam.registration.preprocessing.up import NEAR_Z
 
 log = logging.getLogger("lslam")
 

@@ -12,20 +12,20 @@ from typing import Literal, cast
 import numpy as np
 
 from lslam.backend.georeferencing import require_crs
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import InputError, UsageError, cause, nearest
+from lslam.core.geometry.crs_names import parse_crs
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import ControlPoint, ControlResidual, Instant, KnownPair, Manual, NamedPair
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Selection, Sequence
+from lslam.core.types.trajectory import Keyframe
 from lslam.core.untrusted import whole_number
-from lslam.errors import InputError, UsageError, cause, nearest
-from lslam.formats.atomic import write_text
-from lslam.formats.stamp_texts import seconds_to_ns
-from lslam.formats.text_tables import separator_of, split_cells
-from lslam.geometry.crs_names import parse_crs
-from lslam.geometry.se3 import poses_at
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.stamp_texts import seconds_to_ns
+from lslam.io.formats.text_tables import separator_of, split_cells
 from lslam.maps.georeference import to_wgs84
-from lslam.types.arrays import Floats
-from lslam.types.constraint import ControlPoint, ControlResidual, Instant, KnownPair, Manual, NamedPair
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Selection, Sequence
-from lslam.types.trajectory import Keyframe
 
 # What a run writes into the column is its own verdict, and says nothing here: its loops.csv can be edited and given back.
 VERDICTS, OWN_VERDICTS = ("known", "forbidden"), ("accepted", "rejected")

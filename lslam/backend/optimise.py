@@ -24,26 +24,26 @@ from lslam.backend.control_points import (
 )
 from lslam.backend.final_checks import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
+from lslam.backend.graph.consistency import Drift, drift_of
+from lslam.backend.graph.drift import tilt_factor
+from lslam.backend.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
+from lslam.backend.graph.pose_graph import optimise
+from lslam.backend.graph.problem import PoseGraph
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.levelling import floor_planes, on_one_plane, up_directions, world_up
 from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_steady_drift
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import GraphError
+from lslam.core.geometry import se3
 from lslam.core.stopping import checking
-from lslam.errors import GraphError
-from lslam.geometry import se3
-from lslam.graph.consistency import Drift, drift_of
-from lslam.graph.drift import tilt_factor
-from lslam.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
-from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import PoseGraph
-from lslam.keyframes.store import KeyframeStore
-from lslam.preprocessing.ground import up_of, world_up_of
-from lslam.types.arrays import Floats
-from lslam.types.constraint import ControlPoint, LoopCandidate, Turn
-from lslam.types.gnss import Georeference
-from lslam.types.imu import InertialChain
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.stage_clock import KeyframeClocks
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import ControlPoint, LoopCandidate, Turn
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.imu import InertialChain
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.registration.preprocessing.ground import up_of, world_up_of
 
 log = logging.getLogger("lslam")
 # Solves the graph with the priors of a map, given its georeference; None where the map gives none.

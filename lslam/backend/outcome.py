@@ -8,25 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.errors import GraphError
-from lslam.geometry import se3
-from lslam.graph.drift import tilt_factor
-from lslam.graph.factors import well_conditioned
-from lslam.graph.fix_errors import NO_HEIGHT
-from lslam.graph.fix_noise import GaussMarkovNoise
-from lslam.graph.loop_drift import without_loop_drift
-from lslam.graph.odometry_constraints import corrected
-from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import EstimatedDrift, PoseGraph, Solution
-from lslam.keyframes.store import KeyframeStore
-from lslam.types.arrays import Floats
-from lslam.types.building import CorrectedMap, OsmMatches
-from lslam.types.constraint import Constraint, ControlPoint, ControlResidual, LoopCandidate, LoopStage, Verdict
-from lslam.types.gnss import Georeference
-from lslam.types.run_record import LoopSurroundings, LoopView, RunRecord
-from lslam.types.scan_result import ScanResult
-from lslam.types.stage_clock import KeyframeClocks
+from lslam.backend.graph.drift import tilt_factor
+from lslam.backend.graph.factors import well_conditioned
+from lslam.backend.graph.fix_errors import NO_HEIGHT
+from lslam.backend.graph.fix_noise import GaussMarkovNoise
+from lslam.backend.graph.loop_drift import without_loop_drift
+from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.pose_graph import optimise
+from lslam.backend.graph.problem import EstimatedDrift, PoseGraph, Solution
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.config import Config
+from lslam.core.errors import GraphError
+from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import CorrectedMap, OsmMatches
+from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, LoopCandidate, LoopStage, Verdict
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.run_record import LoopSurroundings, LoopView, RunRecord
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 

@@ -13,15 +13,15 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
-from lslam.core.remote import RemotePath, as_path
-from lslam.errors import GateError, InputError, LslamError, RunFailedError, UsageError
+from lslam.core.errors import GateError, InputError, LslamError, RunFailedError, UsageError
+from lslam.io.remote import RemotePath, as_path
 from lslam.studies.output import BATCH, require_free
 
 if TYPE_CHECKING:
+    from lslam.core.types.study import StudyRow
     from lslam.studies.batch import RunLine
     from lslam.studies.expanded_study import ExpandedStudy
     from lslam.studies.output import OutputOptions
-    from lslam.types.study import StudyRow
 
 # Options of `lslam run` that belong to the whole batch.
 _OF_THE_BATCH = ("resume", "overwrite", "dry_run", "as_json")
@@ -67,8 +67,8 @@ def command(jobs_file: Path, **given: Any) -> None:
 
 def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
     if path != Path("-"):
-        from lslam.config.load import check_settings
-        from lslam.config.study import read_batch
+        from lslam.core.config.load import check_settings
+        from lslam.core.config.study import read_batch
 
         check_settings(given["settings"])
         batch = read_batch(path)
@@ -87,7 +87,7 @@ def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     """The run of one line, parsed as by `lslam run`; raises the errors of that command with the number of the line."""
     from lslam.cli.run import command as run_command
     from lslam.cli.run import opened_with, read_truth, resolved
-    from lslam.readers.lookup import find_folder
+    from lslam.io.readers.lookup import find_folder
     from lslam.studies.batch import listed_line, opened_line, refused_line
 
     try:

@@ -16,10 +16,10 @@ from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 
 if TYPE_CHECKING:
+    from lslam.core.types.comparison import Comparison
+    from lslam.core.types.trajectory import Trajectory
     from lslam.studies.plan import Plan
     from lslam.studies.subjects import Subject
-    from lslam.types.comparison import Comparison
-    from lslam.types.trajectory import Trajectory
 
 
 @click.command(
@@ -74,7 +74,7 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     setup_logging(given["verbose"], given["quiet"])
     plan = _plan(sequences, given)
     from lslam.cli.console import bars
-    from lslam.errors import GateError, RunFailedError
+    from lslam.core.errors import GateError, RunFailedError
     from lslam.studies.compare import compare
 
     with ExitStack() as stack:
@@ -131,8 +131,8 @@ def _crop(text: str | None) -> tuple[float, float, float] | None:
 
 def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     from lslam.cli.run import read_truth
-    from lslam.errors import UsageError
-    from lslam.readers import open_sequence
+    from lslam.core.errors import UsageError
+    from lslam.io.readers import open_sequence
     from lslam.studies.plan import ONE_TRUTH
 
     if path is None:

@@ -25,7 +25,7 @@ def command() -> None:
 @click.option("--describe", is_flag=True, help="Explain each key in a comment.")
 def show(config_file: Path | None, preset: str | None, settings: tuple[str, ...], describe: bool) -> None:
     """Print the resolved configuration as TOML."""
-    from lslam.config import load_config, to_described_toml, to_toml
+    from lslam.core.config import load_config, to_described_toml, to_toml
     from lslam.pipeline.check import check_config
 
     config = load_config(config_file, options.with_preset(settings, preset))
@@ -36,7 +36,7 @@ def show(config_file: Path | None, preset: str | None, settings: tuple[str, ...]
 @command.command(epilog="Example: lslam config presets")
 def presets() -> None:
     """List the presets that `--preset` takes."""
-    from lslam.config.load import known_presets
+    from lslam.core.config.load import known_presets
 
     known = known_presets()
     width = max(len(name) for name in known)
@@ -48,7 +48,7 @@ def presets() -> None:
 @click.argument("file", type=click.Path(path_type=Path))
 def check(file: Path) -> None:
     """Check a configuration file: exit 0 when every key, value and name in it is known."""
-    from lslam.config import load_config
+    from lslam.core.config import load_config
     from lslam.pipeline.check import check_config
 
     check_config(load_config(file, environ={}))

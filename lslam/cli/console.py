@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from lslam.core.types.study import StudyRow
     from lslam.studies.runner import StudyProgress
-    from lslam.types.study import StudyRow
 
 
 class TimeLeft:

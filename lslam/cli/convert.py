@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.formats.trajectory_formats import WRITTEN
+from lslam.io.formats.trajectory_formats import WRITTEN
 
 if TYPE_CHECKING:
-    from lslam.types.sequence import Calibration, Sequence
-    from lslam.types.trajectory import Trajectory
+    from lslam.core.types.sequence import Calibration, Sequence
+    from lslam.core.types.trajectory import Trajectory
 
 SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
 EARTH = ("kml", "gpx")
@@ -113,19 +113,19 @@ def _refuse(given: dict[str, Any], names: tuple[str, ...], why: str) -> None:
 
 def _is_trajectory(source: str) -> bool:
     """Whether `source` is a run folder, or a file that is no bag."""
-    from lslam.formats.bag_listing import list_bag_files
+    from lslam.io.formats.bag_listing import list_bag_files
 
     path = Path(source).expanduser()
     return (path / "trajectory.tum").is_file() or (path.is_file() and not list_bag_files(path))
 
 
 def _open(source: str, given: dict[str, Any]) -> Sequence:
-    from lslam.readers import open_sequence
+    from lslam.io.readers import open_sequence
 
     sequence = open_sequence(source, data_root=given["data_root"], **options.reading_of(given))
-    from lslam.config.input import PreprocessConfig
-    from lslam.frontend.point_times import with_point_times
-    from lslam.types.sequence import select
+    from lslam.core.config.input import PreprocessConfig
+    from lslam.core.types.sequence import select
+    from lslam.odometry.frontend.point_times import with_point_times
 
     sequence = with_point_times(sequence, PreprocessConfig(), is_stated_only=given["deskewed"] is None)
     return select(sequence, given["start"] or 0, given["count"], given["skip_frames"] or 1)
@@ -140,7 +140,7 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
     check_output(kind, out, given["is_zstd"], given["overwrite"])
     options.require_there(given["deskewed"])
     sequence = _open(source, given)
-    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.io.formats.trajectory_files import read_trajectory
     from lslam.pipeline.convert.convert_sequence import convert_sequence
 
     log = logging.getLogger("lslam")
@@ -229,10 +229,10 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
 
 def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:
     """The trajectory of the file, or the ground truth of the sequence, and the calibration between the bodies."""
-    from lslam.errors import InputError
-    from lslam.formats.calibration_files import read_cam0_lidar, read_transform
-    from lslam.formats.trajectory_files import read_trajectory
-    from lslam.types.sequence import Calibration
+    from lslam.core.errors import InputError
+    from lslam.core.types.sequence import Calibration
+    from lslam.io.formats.calibration_files import read_cam0_lidar, read_transform
+    from lslam.io.formats.trajectory_files import read_trajectory
 
     if _is_trajectory(source):
         trajectory = read_trajectory(Path(source).expanduser(), times=given["times"])

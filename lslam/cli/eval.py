@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.errors import UsageError, nearest
+from lslam.core.errors import UsageError, nearest
 from lslam.evaluation import ALIGNMENTS, check_words, parse_delta
-from lslam.formats.trajectory_formats import FORMATS
+from lslam.io.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:
-    from lslam.config.outputs import EvalConfig
+    from lslam.core.config.outputs import EvalConfig
+    from lslam.core.types.sequence import Calibration
+    from lslam.core.types.trajectory import Trajectory
     from lslam.evaluation.results import Evaluation
     from lslam.evaluation.timing import Timing
-    from lslam.types.sequence import Calibration
-    from lslam.types.trajectory import Trajectory
 
 EPILOG = """\b
 Examples:
@@ -125,8 +125,8 @@ def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
     """Section `eval` of the configuration, overridden by the flags."""
     from pydantic import ValidationError
 
-    from lslam.config import load_config
-    from lslam.config.outputs import EvalConfig
+    from lslam.core.config import load_config
+    from lslam.core.config.outputs import EvalConfig
 
     values = load_config(given["config_file"], given["settings"]).eval.model_dump() | flags
     for delta in values["delta"]:
@@ -142,10 +142,10 @@ def _config(given: dict[str, Any], flags: dict[str, Any]) -> EvalConfig:
 def _evaluate_all(
     estimates: tuple[Path, ...], truth: Path, config: EvalConfig, given: dict[str, Any]
 ) -> list[Evaluation]:
-    from lslam.errors import InputError
+    from lslam.core.errors import InputError
     from lslam.evaluation.evaluate import evaluate
-    from lslam.formats.calibration_files import read_transform
-    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.io.formats.calibration_files import read_transform
+    from lslam.io.formats.trajectory_files import read_trajectory
 
     ground_truth = read_trajectory(truth, given["gt_format"], given["times"])
     T_est_gt = None if given["transform"] is None else read_transform(given["transform"])
@@ -163,8 +163,8 @@ def _evaluate_all(
 
 def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
     """The calibration of --calib, or the file at KITTI's place for this ground truth; None without one."""
-    from lslam.formats import calibration_files
-    from lslam.types.sequence import Calibration
+    from lslam.core.types.sequence import Calibration
+    from lslam.io.formats import calibration_files
 
     if calib is not None:
         return Calibration(T_cam0_lidar=calibration_files.read_cam0_lidar(calib))
@@ -187,7 +187,7 @@ def _timing(estimate: Path, given: Path | None) -> Timing | None:
 
 def _hold_gates(evaluations: list[Evaluation], given: dict[str, Any]) -> None:
     """Raise GateError with every number above its gate; a number that is not available fails its gate."""
-    from lslam.errors import GateError
+    from lslam.core.errors import GateError
     from lslam.evaluation.evaluate import METRICS
 
     broken = []

@@ -12,7 +12,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, setup_logging
-from lslam.errors import RunFinishedError, UsageError
+from lslam.core.errors import RunFinishedError, UsageError
 
 
 @click.command(

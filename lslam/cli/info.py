@@ -89,8 +89,8 @@ def command(
     Of a bag all topics are listed, also where none has clouds. Each finding comes with advice.
     The first scans are registered, to compare their rotations with the IMU's.
     """
-    from lslam.errors import LslamError, OutputExistsError
-    from lslam.readers import open_sequence
+    from lslam.core.errors import LslamError, OutputExistsError
+    from lslam.io.readers import open_sequence
 
     if imu_toml is not None and imu_toml.exists():
         raise OutputExistsError(f"{imu_toml} exists already: name another file with --imu-toml")
@@ -131,8 +131,8 @@ def _show_topics(bag: dict[str, Any]) -> None:
 
 def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
     """What is in a bag that is no sequence: as JSON with the `error`, as a page without one; nothing where there is no bag."""
-    from lslam.errors import LslamError
-    from lslam.readers.lookup import find_folder
+    from lslam.core.errors import LslamError
+    from lslam.io.readers.lookup import find_folder
 
     try:
         find_folder(name, data_root)
@@ -237,8 +237,8 @@ def _noise(noise: dict[str, Any] | None) -> str:
 
 
 def _write_noise(path: Path, facts: dict[str, Any]) -> None:
-    from lslam.errors import InputError
-    from lslam.formats.atomic import atomic_write
+    from lslam.core.errors import InputError
+    from lslam.io.formats.atomic import atomic_write
     from lslam.pipeline.doctor.examine_imu import imu_toml
 
     noise = (facts["imu"] or {}).get("noise")

@@ -12,14 +12,14 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import progress, setup_logging, show
+from lslam.core.errors import UsageError
 from lslam.core.stopping import heeded
-from lslam.errors import UsageError
 
 if TYPE_CHECKING:
+    from lslam.core.types.gnss import OutputCrs
+    from lslam.core.types.run_record import Crispness
     from lslam.maps.changes import ChangedCells
     from lslam.pipeline.rebuild import EarlierRun
-    from lslam.types.gnss import OutputCrs
-    from lslam.types.run_record import Crispness
 
 
 # What a map is made with, and how clouds are scored: no part of a comparison of drives.
@@ -176,7 +176,7 @@ def command(target: Path, **given: Any) -> None:
 
 def _measure(target: Path, given: dict[str, Any]) -> None:
     options.require_there(target, given["against"])
-    from lslam.formats.point_files import read_cloud
+    from lslam.io.formats.point_files import read_cloud
     from lslam.maps.crispness import RADIUS, THRESHOLD, compare, crispness
     from lslam.pipeline.rebuild import map_of
     from lslam.reports.evaluations import crispness_document, strict
@@ -204,7 +204,7 @@ def _measure(target: Path, given: dict[str, Any]) -> None:
 
 
 def _rebuild(target: Path, given: dict[str, Any]) -> None:
-    from lslam.errors import UsageError
+    from lslam.core.errors import UsageError
     from lslam.pipeline.run_folder import require_run
 
     for flag in ("threshold", "radius"):
@@ -212,10 +212,10 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
     settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
-    from lslam.geometry.crs_names import parse_crs
+    from lslam.core.geometry.crs_names import parse_crs
+    from lslam.core.types.gnss import OutputCrs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
     from lslam.reports.evaluations import crispness_document
-    from lslam.types.gnss import OutputCrs
 
     out: Path | None = given["out"]
     epsg, height_epsg = (None, None) if given["crs"] is None else parse_crs(given["crs"])
@@ -236,7 +236,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
 
 
 def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: dict[str, Any]) -> None:
-    from lslam.errors import UsageError
+    from lslam.core.errors import UsageError
     from lslam.pipeline.map_tiles import check_tiles, rebuild_in_tiles
     from lslam.pipeline.rebuild import open_scans
 
@@ -257,7 +257,7 @@ def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: 
 
 def _settings(given: dict[str, Any]) -> list[str]:
     """Flags over --set, as settings of the section `map`."""
-    from lslam.errors import UsageError
+    from lslam.core.errors import UsageError
 
     out: Path | None = given["out"]
     suffix = None if out is None else out.suffix.lower().lstrip(".")

@@ -40,7 +40,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
     The first run gives the frame. RUN may be the folder of an earlier merge, whose runs then stand in its place. A run that
     cannot be tied to the others is left out and named; exit 1 when none can.
     """
-    from lslam.errors import UsageError
+    from lslam.core.errors import UsageError
 
     setup_logging(given["verbose"], given["quiet"])
     if given["overwrite"] and given["resume"]:
@@ -48,7 +48,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
     if given["resume"] and given["out"] is None:
         raise UsageError("--resume needs --out: the folder of the interrupted merge")
     options.require_there(*runs)
-    from lslam.config import load_config
+    from lslam.core.config import load_config
     from lslam.pipeline.merged_folder import merge_into
     from lslam.pipeline.run_folder import check_target
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lslam.core.remote import RemotePath, as_path
-from lslam.errors import ConfigError, InputError, UsageError, nearest
+from lslam.core.errors import ConfigError, InputError, UsageError, nearest
+from lslam.io.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
-    from lslam.config.input import ScanRange
+    from lslam.core.config.input import ScanRange
     from lslam.studies.jobs import Engine
     from lslam.studies.output import OutputOptions
 
@@ -118,8 +118,8 @@ def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], d
     """
     from pydantic import ValidationError
 
-    from lslam.config.input import AS_CONFIGURED, ScanRange
-    from lslam.config.load import explain
+    from lslam.core.config.input import AS_CONFIGURED, ScanRange
+    from lslam.core.config.load import explain
 
     words = list(words)
     common: dict[str, int] = {}
@@ -227,7 +227,7 @@ def coordinates(function: F) -> F:
 
 def crs_settings(crs: str | None, geoid: str | None) -> dict[str, str | None]:
     """Configuration keys of these flags; raises UsageError for what is no code."""
-    from lslam.geometry.crs_names import parse_crs
+    from lslam.core.geometry.crs_names import parse_crs
 
     epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
     path = None if geoid is None else grid_file(geoid)

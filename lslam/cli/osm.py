@@ -10,7 +10,7 @@ import click
 from lslam.cli import console, options
 
 if TYPE_CHECKING:
-    from lslam.formats.osm_buildings import BuildingExtract
+    from lslam.io.formats.osm_buildings import BuildingExtract
     from lslam.osm.bounds import Bounds
     from lslam.osm.overpass import OverpassReply
 
@@ -89,8 +89,8 @@ def fetch(
     console.setup_logging(verbose, quiet)
     import json
 
-    from lslam.config import load_config
-    from lslam.errors import OutputError, OutputExistsError
+    from lslam.core.config import load_config
+    from lslam.core.errors import OutputError, OutputExistsError
 
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists: give --overwrite to replace it, or another --out")
@@ -128,9 +128,9 @@ def _bounds(
 
 
 def _write(out: Path, reply: OverpassReply) -> None:
-    from lslam.formats.atomic import atomic_write
-    from lslam.formats.osm_buildings import buildings_of, middle_of
-    from lslam.formats.osm_files import write_osm
+    from lslam.io.formats.atomic import atomic_write
+    from lslam.io.formats.osm_buildings import buildings_of, middle_of
+    from lslam.io.formats.osm_files import write_osm
     from lslam.osm.overpass import from_overpass
 
     data = from_overpass(reply)
@@ -158,8 +158,8 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
     at = None if origin is None else [*options.place("--origin", origin), 0.0][:3]
     import numpy as np
 
-    from lslam.errors import OutputExistsError
-    from lslam.formats.osm_buildings import read_buildings
+    from lslam.core.errors import OutputExistsError
+    from lslam.io.formats.osm_buildings import read_buildings
 
     if png is not None and png.exists() and not overwrite:
         raise OutputExistsError(f"{png} exists: give --overwrite to replace it, or another --png")
@@ -181,7 +181,7 @@ def show(file: Path, png: Path | None, origin: str | None, overwrite: bool, as_j
 def _facts(extract: BuildingExtract) -> dict[str, Any]:
     import numpy as np
 
-    from lslam.geometry.geodesy import from_local
+    from lslam.core.geometry.geodesy import from_local
 
     rings = [ring for b in extract.buildings for f in b.footprints for ring in f.rings]
     corners = np.concatenate(rings)

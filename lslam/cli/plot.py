@@ -9,7 +9,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
-from lslam.errors import OutputExistsError
+from lslam.core.errors import OutputExistsError
 
 
 @click.command(

@@ -14,8 +14,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from lslam.formats.atomic import atomic_write
-from lslam.version import __version__
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import atomic_write
 
 INTERVAL_S = 0.005
 MAX_STACKS = 50_000  # changes of stack kept at one interval: a longer run is looked at half as often, again and again

@@ -14,16 +14,16 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
+from lslam.core.errors import RunFinishedError, UsageError
 from lslam.core.stopping import Stop, heeded
 from lslam.core.untrusted import parse_json
-from lslam.errors import RunFinishedError, UsageError
 from lslam.registration.residuals import RESIDUALS, residual_named
 
 if TYPE_CHECKING:
-    from lslam.config import Config
+    from lslam.core.config import Config
+    from lslam.core.types.sequence import Sequence
+    from lslam.core.types.trajectory import Trajectory
     from lslam.pipeline.watch import RunOutcome, Watch
-    from lslam.types.sequence import Sequence
-    from lslam.types.trajectory import Trajectory
 
 
 @click.command(
@@ -87,7 +87,7 @@ def command(sequence: str, **given: Any) -> None:
     a URL of storage: s3://bucket/drive7.bag.
     """
     setup_logging(given["verbose"], given["quiet"])
-    from lslam.types.warned import hearing
+    from lslam.core.types.warned import hearing
 
     with hearing():
         _check_folder(given)
@@ -119,14 +119,14 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
 
     Cheap checks come first: words, then the configuration, then the sequence.
     """
-    from lslam.readers.lookup import find_folder
+    from lslam.io.readers.lookup import find_folder
 
     flags = _flags(given)
     extract = None if given["osm"] in (None, "auto") else Path(given["osm"])
     options.require_there(given["gt"], given["poses"], extract, given["loops_file"], given["control"])
     find_folder(given["sequence"], given["data_root"])
     config = _resolve(given, flags)
-    from lslam.readers import open_sequence
+    from lslam.io.readers import open_sequence
 
     opened = open_sequence(
         given["sequence"], data_root=given["data_root"],
@@ -204,7 +204,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
 
 def _resolve(given: dict[str, Any], flags: dict[str, Any]) -> Config:
     """The checked configuration. Precedence: flags, --set, environment, --config, --preset, defaults."""
-    from lslam.config import load_config
+    from lslam.core.config import load_config
     from lslam.pipeline.check import check_config
 
     settings = options.with_preset(given["settings"], given["preset"])
@@ -219,7 +219,7 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
         return None
     from dataclasses import replace
 
-    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.io.formats.trajectory_files import read_trajectory
 
     truth = read_trajectory(path)
     if not truth.has_stamps and len(truth) == len(sequence):
@@ -247,7 +247,7 @@ def watch_of(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None])
 
 
 def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) -> None:
-    from lslam.config import to_toml
+    from lslam.core.config import to_toml
 
     if as_json:
         facts = {"name": sequence.name, "path": str(sequence.path), "format": sequence.kind, "scans": len(sequence)}

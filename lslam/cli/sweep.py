@@ -15,8 +15,8 @@ from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
 
 if TYPE_CHECKING:
+    from lslam.core.types.study import StudyRow
     from lslam.studies.sweep import Sweep
-    from lslam.types.study import StudyRow
 
 
 @click.command(
@@ -67,7 +67,7 @@ def command(study: str | None, **given: Any) -> None:
         raise click.UsageError("STUDY is missing; for example: lslam sweep skip-frames --dry-run")
     options.check_engine(given)
     sweep = _sweep(study, given)
-    from lslam.errors import GateError
+    from lslam.core.errors import GateError
     from lslam.studies.sweep import run_sweep
 
     with options.engine_of(given, "studying") as engine, ExitStack() as stack:
@@ -98,8 +98,8 @@ def command(study: str | None, **given: Any) -> None:
 def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     """The study that the options describe. They are checked as far as possible before heavy imports."""
     seeds = None if given["seeds"] is None else options.seeds_of(given["seeds"])
-    from lslam.config.load import check_settings
-    from lslam.config.study import parse_study
+    from lslam.core.config.load import check_settings
+    from lslam.core.config.study import parse_study
     from lslam.studies.output import STUDY, require_free
     from lslam.studies.study_files import find_study
 

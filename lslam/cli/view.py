@@ -30,7 +30,7 @@ Examples:
 def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: bool) -> None:
     """Write the recording; what users read is HELP."""
     setup_logging(verbose, quiet)
-    from lslam.errors import OutputError, OutputExistsError
+    from lslam.core.errors import OutputError, OutputExistsError
     from lslam.pipeline.run_folder import require_run
     from lslam.reports.recording import require_rerun, write_recording
 

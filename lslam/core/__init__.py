@@ -1,1 +1,1 @@
-"""What every room needs and no file of it is about LiDAR: cores and locks, paths in storage, stops, texts, untrusted input."""
+"""What every room needs: values, geometry, configuration, shared kernels, errors, locks, stops, untrusted input."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
+from lslam.core.errors import InputError
 from lslam.core.untrusted import parse_json
-from lslam.errors import InputError
 
 # Of a checkout; where lslam is installed, the folder of packages.
 _SOURCES = Path(__file__).resolve().parents[2]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from lslam.errors import InputError, UsageError, nearest
+from lslam.core.errors import InputError, UsageError, nearest
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

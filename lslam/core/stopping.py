@@ -12,7 +12,7 @@ from threading import Timer, current_thread, main_thread
 from types import FrameType
 from typing import NoReturn, TypeVar
 
-from lslam.errors import InterruptedRunError
+from lslam.core.errors import InterruptedRunError
 
 T = TypeVar("T")
 

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from lslam.errors import UsageError, nearest
+from lslam.core.errors import UsageError, nearest
 
 ALIGNMENTS = {
     "none": "estimate as it is",

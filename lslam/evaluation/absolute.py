@@ -6,9 +6,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import UsageError, nearest
+from lslam.core.geometry import se3, so3
 from lslam.core.printable import fixed, metres, significant
-from lslam.errors import UsageError, nearest
+from lslam.core.types.arrays import Floats
+from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
@@ -21,9 +24,6 @@ from lslam.evaluation.metric import (
     two,
 )
 from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
-from lslam.geometry import se3, so3
-from lslam.types.arrays import Floats
-from lslam.types.comparison import Metric, Table
 
 
 def absolute_error(estimate: Floats, truth: Floats, alignment: str, has_rotations: bool = True) -> AbsoluteError:

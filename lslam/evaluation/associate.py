@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
-from lslam.geometry import se3, so3
-from lslam.types.arrays import Floats, Longs, Stamps
-from lslam.types.trajectory import Trajectory
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats, Longs, Stamps
+from lslam.core.types.trajectory import Trajectory
 
 LEAST = 3
 # Interpolation pays when truth has a pose at least every 0.6 estimate intervals, and stops at holes of 5 of its own.

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lslam.types.arrays import Bools, Floats
-from lslam.types.study import Curve, Divergence, Interval, Optimum, StudyRow, Value
+from lslam.core.types.arrays import Bools, Floats
+from lslam.core.types.study import Curve, Divergence, Interval, Optimum, StudyRow, Value
 
 # Everything else is registration: what Girolimetto's times per iteration hold (equation 5.2).
 NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")

@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3, so3
 from lslam.core.printable import metres
-from lslam.errors import InputError
+from lslam.core.types.arrays import Floats
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset
 from lslam.evaluation.frames import body_turn, reconcile
@@ -20,10 +24,6 @@ from lslam.evaluation.relative import RelativePoseError
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.thesis import DelTufo, Girolimetto
 from lslam.evaluation.time_offset import fit_offset
-from lslam.geometry import se3, so3
-from lslam.types.arrays import Floats
-from lslam.types.sequence import Calibration
-from lslam.types.trajectory import Trajectory
 
 METRICS: tuple[TrajectoryMetric[Any], ...] = (
     AbsoluteTrajectoryError(),

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lslam.core.types.arrays import Floats
+from lslam.core.types.study import Curve, Interval, Law, LawKind
 from lslam.evaluation.curves import two_sided
-from lslam.types.arrays import Floats
-from lslam.types.study import Curve, Interval, Law, LawKind
 
 FEWEST = 6
 LEVEL = 0.99  # as the bands of Girolimetto's figure 5.19

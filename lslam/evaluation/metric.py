@@ -9,11 +9,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
 from lslam.core.printable import significant
+from lslam.core.types.arrays import Floats
+from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.results import Evaluation, Statistics
-from lslam.types.arrays import Floats
-from lslam.types.comparison import Metric, Table
 
 Document = dict[str, Any]
 Score = TypeVar("Score")

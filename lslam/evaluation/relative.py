@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.geometry import se3, so3
 from lslam.core.printable import metres
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import parse_delta
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
@@ -22,9 +25,6 @@ from lslam.evaluation.metric import (
     two,
 )
 from lslam.evaluation.results import Evaluation, RelativeError, describe
-from lslam.geometry import se3, so3
-from lslam.types.arrays import Floats, Longs
-from lslam.types.comparison import Metric, Table
 
 Pairs = NDArray[np.int64]
 TOLERANCE = 0.1  # of the distance, for pairs that must be as far apart as asked

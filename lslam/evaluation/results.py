@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.evaluation import ALIGNMENTS
-from lslam.types.arrays import Floats, Longs
 
 # A path this short, m, is the rounding of poses that do not move.
 STANDS_M = 1e-3

@@ -6,7 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from lslam.config.study import ExpectedFinding
+from lslam.core.config.study import ExpectedFinding
+from lslam.core.types.arrays import Floats
+from lslam.core.types.study import (
+    Curve,
+    CurveResult,
+    FindingVerdict,
+    Interval,
+    Judged,
+    Law,
+    LawKind,
+    Outcome,
+    StudyResult,
+    StudyRow,
+)
 from lslam.evaluation.curves import curves_of, divergence, lost_above, median_over_seeds, optimum, over_seeds
 from lslam.evaluation.laws import FEWEST, fit_law, law_over
 from lslam.evaluation.verdicts import (
@@ -20,19 +33,6 @@ from lslam.evaluation.verdicts import (
     judge_law,
     judge_matters_little,
     judge_product,
-)
-from lslam.types.arrays import Floats
-from lslam.types.study import (
-    Curve,
-    CurveResult,
-    FindingVerdict,
-    Interval,
-    Judged,
-    Law,
-    LawKind,
-    Outcome,
-    StudyResult,
-    StudyRow,
 )
 
 _OF_TIME = ("time_per_scan", "total_time")

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.geometry import so3
 from lslam.core.printable import fixed, metres, significant
+from lslam.core.types.arrays import Floats
+from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.absolute import align
 from lslam.evaluation.metric import NO_ROTATIONS, MatchedPoses, MetricRow, TrajectoryMetric, two
 from lslam.evaluation.results import Evaluation, percent_of_length
-from lslam.geometry import so3
-from lslam.types.arrays import Floats
-from lslam.types.comparison import Metric, Table
 
 
 @dataclass(frozen=True)

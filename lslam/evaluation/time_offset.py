@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
-from lslam.types.arrays import Bools, Floats, Stamps
-from lslam.types.trajectory import Trajectory
+from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Bools, Floats, Stamps
+from lslam.core.types.trajectory import Trajectory
 
 # Windows that are compared, s; how far an offset may lie from the one that is begun with, s; rounds of the fit.
 WINDOW_S, FARTHEST_S, ROUNDS = 0.3, 0.5, 20

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.core.remote import as_path
-from lslam.errors import InputError, cause
-from lslam.types.arrays import Floats, Longs
+from lslam.core.errors import InputError, cause
+from lslam.core.types.arrays import Floats, Longs
+from lslam.io.remote import as_path
 
 SAVED = "saved_s"
 NOT_STAGES = ("index", "stamp_ns", "stamp", "total", SAVED)

@@ -8,7 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.config.study import ExpectedFinding
+from lslam.core.config.study import ExpectedFinding
+from lslam.core.types.arrays import Bools, Floats
+from lslam.core.types.study import Curve, CurveResult, Judged, Law, Optimum, Outcome
 from lslam.evaluation.curves import (
     NOT_REGISTRATION,
     Rise,
@@ -22,8 +24,6 @@ from lslam.evaluation.curves import (
     rise_below,
 )
 from lslam.evaluation.laws import FEWEST, law_over, rival
-from lslam.types.arrays import Bools, Floats
-from lslam.types.study import Curve, CurveResult, Judged, Law, Optimum, Outcome
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import ConfigError
 from lslam.core.stopping import check_stop
-from lslam.errors import ConfigError
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.maps.occupancy import MODEL, Evidence
-from lslam.types.arrays import Bools, Floats, Longs
 
 Keys = NDArray[np.int64]
 Kind = Literal["appeared", "vanished"]
@@ -192,7 +192,7 @@ def _open(keys: Keys, seen: Keys) -> Bools:
 
 def _steps() -> list[int]:
     """Differences of keys to the 27 cells about one, rising; the cell itself is in the middle."""
-    from lslam.kernels.voxel_average import AXIS_BITS
+    from lslam.maps.kernels.voxel_average import AXIS_BITS
 
     return [
         (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)
@@ -212,6 +212,6 @@ def _found(keys: Keys, others: Keys) -> Longs:
 
 
 def _cells(keys: Keys, found: Evidence) -> Longs:
-    from lslam.kernels.voxel_average import unpack_cells
+    from lslam.maps.kernels.voxel_average import unpack_cells
 
     return unpack_cells(keys, found.origin)

@@ -9,11 +9,11 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.geometry import se3, so3
 from lslam.core.stopping import checking
-from lslam.geometry import se3, so3
-from lslam.preprocessing.ground import Z
-from lslam.types.arrays import Bools, Floats, Longs
-from lslam.types.state import State
+from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.types.state import State
+from lslam.registration.preprocessing.ground import Z
 
 # The ground is the lowest of some scans around a place, by squares of so many m; what is higher stands on it. On slopes
 # above some 7 % ground does, too, as one large thing that does not move.
@@ -184,7 +184,7 @@ class Cleaner:
 
     def add(self, scan: PosedScan) -> list[PosedScan]:
         """One more scan; those that can be decided now."""
-        from lslam.kernels.see_through import nearest_ranges
+        from lslam.maps.kernels.see_through import nearest_ranges
 
         points = np.ascontiguousarray(scan.points, np.float32)
         scan = replace(scan, points=points)
@@ -266,7 +266,7 @@ class Cleaner:
 
         Where the latter are more, both are counted only until they are so for certain.
         """
-        from lslam.kernels.see_through import vote
+        from lslam.maps.kernels.see_through import vote
 
         free, hit = np.zeros(len(points), np.int16), np.zeros(len(points), np.int16)
         if self._grid is not None:

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lslam.errors import InputError, UsageError
+from lslam.core.errors import InputError, UsageError
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory
+from lslam.core.types.run_record import Crispness, MapDifference
 from lslam.maps.merge import MergedMap
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud, Cloud, in_memory
-from lslam.types.run_record import Crispness, MapDifference
 
 RADIUS = 0.5  # m
 LEAST = 10  # points in a neighbourhood
@@ -35,7 +35,7 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples:
     >>> crispness(ArrayCloud.of([[0, 0, 0]])).entropy is None
     True
     """
-    from lslam.kernels.crispness import cell_keys, shapes
+    from lslam.maps.kernels.crispness import cell_keys, shapes
 
     if not (np.isfinite(radius) and radius > 0) or least < 4 or samples < 1:
         raise UsageError(f"radius {radius} and at least {least} points: a radius above 0 m and 4 points or more")
@@ -56,7 +56,7 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples:
 
 def plane_variances(points: Floats, queries: slice, radius: float = RADIUS, least: int = LEAST) -> Floats:
     """(Q,) m2, variance of the points (N, 3) about the plane through those around each query; NaN where these are few."""
-    from lslam.kernels.crispness import cell_keys, shapes
+    from lslam.maps.kernels.crispness import cell_keys, shapes
 
     if not len(points):
         return np.zeros(0)

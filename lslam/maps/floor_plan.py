@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.maps.occupancy import OccupancyGrid
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud, Cloud
 
 OCCUPIED, UNKNOWN, FREE = 0, 205, 254  # the grey values of ROS' map_server
 LOWEST, HIGHEST = 0.3, 2.0  # m above the floor: kerbs are walked over, canopies walked under

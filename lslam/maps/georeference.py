@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import se3
-from lslam.geometry.crs_names import crs_name
-from lslam.geometry.geodesy import (
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3
+from lslam.core.geometry.crs_names import crs_name
+from lslam.core.geometry.geodesy import (
     crs_of,
     exact_transformer,
     from_local,
@@ -23,9 +23,9 @@ from lslam.geometry.geodesy import (
     local_crs,
     to_local,
 )
-from lslam.types.arrays import Floats
-from lslam.types.cloud import Cloud, CloudBlock
-from lslam.types.gnss import Georeference
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import Cloud, CloudBlock
+from lslam.core.types.gnss import Georeference
 
 
 def utm_epsg(lat: float, lon: float) -> int:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import ConfigError, InputError
 from lslam.core.stopping import checking
-from lslam.errors import ConfigError, InputError
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.cloud import BLOCK, CloudBlock, in_memory
+from lslam.core.types.state import State
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
-from lslam.types.arrays import Floats, Longs
-from lslam.types.cloud import BLOCK, CloudBlock, in_memory
-from lslam.types.state import State
 
 log = logging.getLogger("lslam")
 
@@ -64,7 +64,7 @@ class MergedMap:
 
     def blocks(self) -> Iterator[CloudBlock]:
         """The points, `BLOCK` at a time."""
-        from lslam.kernels.voxel_average import INTENSITY_UNITS, unpack
+        from lslam.maps.kernels.voxel_average import INTENSITY_UNITS, unpack
 
         for rows in self._pieces():
             intensity = (
@@ -139,7 +139,7 @@ class MapMerger:
         The map has intensity only when every scan has; an intensity that is not finite counts as 0. A scan whose pose
         is not finite is refused, counted and logged. Raises InputError when points and intensities differ in number.
         """
-        from lslam.kernels.voxel_average import accumulate
+        from lslam.maps.kernels.voxel_average import accumulate
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
         # Beyond 2**52 voxels the voxel index itself is no longer exact.
@@ -234,7 +234,7 @@ class MapMerger:
 
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows, of one scan with more than `most` of them."""
-        from lslam.kernels.voxel_average import enter
+        from lslam.maps.kernels.voxel_average import enter
 
         if rows > len(self._rows):
             more = rows - len(self._rows)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import InputError
 from lslam.core.extras import importing_open3d
-from lslam.errors import InputError
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud
 
 NEIGHBOURS, DEVIATIONS = 20, 2.0
 # Normals from so many neighbours; a surface farther than so many voxels from every point is made up and goes.

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import ConfigError
+from lslam.core.errors import ConfigError
+from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.types.state import State
 from lslam.maps.sorted_runs import SortedRuns
-from lslam.types.arrays import Bools, Floats, Longs
-from lslam.types.state import State
 
 # Log-odds in hundredths: hit 0.7, miss 0.4, clamped to 0.12 and 0.97 (OctoMap's): what has left is free after some ten scans.
 MODEL = np.array([85, -41, -200, 350], np.int64)
@@ -108,7 +108,7 @@ class OccupancyMapper:
 
     def add(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
         """One deskewed scan: points (N, 3) m in the LiDAR frame, its pose (4, 4); poses that are not finite are left out."""
-        from lslam.kernels.ray_cells import carve, mark_ends
+        from lslam.maps.kernels.ray_cells import carve, mark_ends
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
         if not np.isfinite(T).all() or np.abs(T[:3, 3]).max() / self._voxel > 2.0**52:
@@ -134,14 +134,14 @@ class OccupancyMapper:
 
     def result(self) -> OccupancyGrid:
         """The cells seen so far; the mapper is empty then."""
-        from lslam.kernels.voxel_average import unpack_cells
+        from lslam.maps.kernels.voxel_average import unpack_cells
 
         found = self.evidence()
         return OccupancyGrid(unpack_cells(found.keys, found.origin).astype(np.int32), found.log_odds, self._voxel)
 
     def evidence(self) -> Evidence:
         """The cells seen so far, and all that was said of them; the mapper is empty then."""
-        from lslam.kernels.ray_cells import compose
+        from lslam.maps.kernels.ray_cells import compose
 
         if self._runs is None:
             rows = self._take()
@@ -183,8 +183,8 @@ class OccupancyMapper:
 
     def _reserve(self, rows: int) -> None:
         """Room for `rows` rows; the slots stay at most two thirds full."""
-        from lslam.kernels.ray_cells import COLUMNS
-        from lslam.kernels.voxel_average import enter
+        from lslam.maps.kernels.ray_cells import COLUMNS
+        from lslam.maps.kernels.voxel_average import enter
 
         if rows > len(self._rows):
             more = max(rows, len(self._rows) * 3 // 2)

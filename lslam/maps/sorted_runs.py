@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.stopping import checking
-from lslam.errors import InputError, OutputError, cause
-from lslam.types.arrays import Longs
-from lslam.types.state import State
+from lslam.core.types.arrays import Longs
+from lslam.core.types.state import State
 
 Rows = NDArray[np.int64]
 Combine = Callable[[Rows], Rows]

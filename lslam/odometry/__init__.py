@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
+from lslam.core.errors import UsageError
 from lslam.core.plugins import factory, known, require
-from lslam.errors import UsageError
 
 if TYPE_CHECKING:
-    from lslam.config.config import Config
+    from lslam.core.config.config import Config
     from lslam.odometry.base import Odometry
 
 GROUP = "lslam.methods"
@@ -89,7 +89,7 @@ class ListedMethod:
 
 def coupling_of(method: str) -> Coupling:
     """What the method does with an IMU; those of other packages are predicted by it."""
-    from lslam.config.odometry import TIGHTLY_COUPLED
+    from lslam.core.config.odometry import TIGHTLY_COUPLED
 
     if method in TIGHTLY_COUPLED:
         return Coupling.TIGHT

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.preprocessing.prepare import prepare_points
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
+from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import held_by_non_ground
-from lslam.types.state import Stateful
 
 # In `pose_source`.
 ALL_POINTS = "all-points"

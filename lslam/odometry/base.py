@@ -8,12 +8,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.preprocessing.features import Features
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanEquations, ScanResult
+from lslam.core.types.state import State
+from lslam.registration.preprocessing.features import Features
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanEquations, ScanResult
-from lslam.types.state import State
 
 
 class Traits:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
+from lslam.core.geometry import so3
 
 Floats = NDArray[np.float64]
 

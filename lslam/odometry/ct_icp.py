@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from lslam.config.config import Config
+from lslam.core.config.config import Config
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.elastic_constraints import LastSweep
 from lslam.odometry.icp import Icp, registration_of
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 
 def create(config: Config) -> CtIcp:

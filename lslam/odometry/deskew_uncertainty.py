@@ -14,9 +14,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import noise, se3
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.state import Stateful
+from lslam.core.geometry import noise, se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.state import Stateful
 
 Floats = NDArray[np.float64]
 

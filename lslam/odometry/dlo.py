@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lslam.config.config import Config
-from lslam.config.odometry import NO_RECOVERY
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import NO_RECOVERY
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.stage_clock import StageClock
 from lslam.odometry.icp import Icp, registration_of
-from lslam.preprocessing.deskew import deskew
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.preprocessing.deskew import deskew
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.stage_clock import StageClock
 
 
 def create(config: Config) -> Dlo:

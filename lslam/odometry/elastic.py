@@ -12,13 +12,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
-from lslam.kernels import facts as at
-from lslam.kernels.gauss_newton import UNSEEN
+from lslam.core.geometry import so3
+from lslam.core.kernels import facts as at
+from lslam.core.kernels.gauss_newton import UNSEEN
+from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.elastic_sweep import ElasticSweep
-from lslam.preprocessing.deskew import deskew_points
-from lslam.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import (
     LEAST_MATCHED,
@@ -28,10 +27,11 @@ from lslam.registration.optimiser import (
     OptimiserResult,
     Term,
 )
+from lslam.registration.preprocessing.deskew import deskew_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import voxel_terms
-from lslam.types.motion_prior import MotionPrior
 
 Floats = NDArray[np.float64]
 

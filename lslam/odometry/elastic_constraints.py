@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import noise, se3, so3
-from lslam.inertial.constant_velocity import middle_of
+from lslam.core.geometry import noise, se3, so3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.state import Stateful
 from lslam.odometry.deskew_uncertainty import USUAL
 from lslam.odometry.elastic_sweep import ElasticSweep
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.state import Stateful
+from lslam.odometry.inertial.constant_velocity import middle_of
 
 Floats = NDArray[np.float64]
 

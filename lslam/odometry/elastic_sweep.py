@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
-from lslam.types.motion_prior import MotionPrior
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
 
 Floats = NDArray[np.float64]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.odometry import rest_alone
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import rest_alone
+from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.icp import Icp, registration_of
-from lslam.types.motion_prior import MotionPrior
 
 
 def create(config: Config) -> FastLio2:
@@ -19,8 +19,8 @@ def create(config: Config) -> FastLio2:
 class FastLio2(Icp):
     """Points and the filter's prior in one estimate, on the local map of Gaussian voxels.
 
-    The filter is the motion model (`lslam.inertial.filter`), since it predicts and deskews too; where it is silent, over a gap
-    of the IMU, a scan is registered from constant velocity.
+    The filter is the motion model (`lslam.odometry.inertial.filter`), since it predicts and deskews too; where it is silent, over
+    a gap of the IMU, a scan is registered from constant velocity.
     """
 
     deskew = "by back propagation of the filter"

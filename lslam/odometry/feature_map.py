@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.kernels import voxel
-from lslam.preprocessing.features import Features
-from lslam.preprocessing.prepare import NO_TIMES
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.kernels import voxel
+from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
 from lslam.registration.map_scans import LastKeyframes
-from lslam.types.state import State, Stateful
+from lslam.registration.preprocessing.features import Features
+from lslam.registration.preprocessing.prepare import NO_TIMES
 
 # As LOAM fits its lines: five points at least.
 MIN_LINE_POINTS = 5

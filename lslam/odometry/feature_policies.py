@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lslam.config.odometry import RecoveryConfig
+from lslam.core.config.odometry import RecoveryConfig
 from lslam.odometry.feature_solver import remap_solution
 from lslam.odometry.feature_target import MIN_FEATURES
 from lslam.registration.attempt import Attempt, Policy

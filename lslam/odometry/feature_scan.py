@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.feature_grid import build
-from lslam.kernels.feature_residuals import add_normals
-from lslam.preprocessing.features import FeaturePoints, Features
+from lslam.odometry.kernels.feature_grid import build
+from lslam.odometry.kernels.feature_residuals import add_normals
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.preprocessing.features import FeaturePoints, Features
 
 Grid = tuple[
     NDArray[np.float64], NDArray[np.uint16], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]

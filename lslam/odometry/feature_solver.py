@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
-from lslam.kernels.feature_residuals import linearise_edges, linearise_planes
-from lslam.kernels.lines import linearise_lines
+from lslam.core.geometry import se3, so3
 from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap
 from lslam.odometry.feature_scan import FeatureScan
+from lslam.odometry.kernels.feature_residuals import linearise_edges, linearise_planes
+from lslam.odometry.kernels.lines import linearise_lines
 from lslam.registration.gaussian_map import FLOOR, GaussianMap
 from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise, slots_of
 from lslam.registration.residuals import PLANE

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.stage_clock import StageClock
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, solve_on_scan
-from lslam.preprocessing.features import Features
 from lslam.registration.alignment import upright_directions
+from lslam.registration.preprocessing.features import Features
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
-from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import LoamConfig, RegistrationConfig
-from lslam.geometry import se3
+from lslam.core.config.odometry import LoamConfig, RegistrationConfig
+from lslam.core.geometry import se3
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
 from lslam.odometry.feature_solver import NONE, FeatureNoise, map_problem, remap_solution, solve_on_map
 from lslam.odometry.feature_steps import ScanStep
-from lslam.preprocessing.features import Features
-from lslam.preprocessing.ground import Z
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
 from lslam.registration.optimiser import optimise
+from lslam.registration.preprocessing.features import Features
+from lslam.registration.preprocessing.ground import Z
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.start_search import MUCH, START_STEP, start_offsets

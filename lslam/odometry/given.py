@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry.se3 import poses_at
-from lslam.inertial.constant_velocity import MotionModel
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan, Span
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import Stateful
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry.base import Traits
-from lslam.preprocessing.deskew import knots_over
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan, Span
-from lslam.types.scan_result import ScanResult
-from lslam.types.state import Stateful
-from lslam.types.trajectory import Trajectory
+from lslam.odometry.inertial.constant_velocity import MotionModel
+from lslam.registration.preprocessing.deskew import knots_over
 
 if TYPE_CHECKING:
-    from lslam.config.config import Config
+    from lslam.core.config.config import Config
 
 Floats = NDArray[np.float64]
 

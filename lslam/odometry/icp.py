@@ -9,27 +9,27 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.odometry import RecoveryConfig
-from lslam.errors import UsageError
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import RecoveryConfig
+from lslam.core.errors import UsageError
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.elastic import SweepPoints, register_elastic
 from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.keyframe_submap import KeyframeSubmap
 from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.preprocessing.deskew import deskew
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.map_scans import make_map_scans
+from lslam.registration.preprocessing.deskew import deskew
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS, VoxelTarget
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.state import Stateful
 
 
 def create(config: Config) -> Icp:

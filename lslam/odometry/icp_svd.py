@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lslam.config.config import Config
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
+from lslam.core.config.config import Config
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.optimiser import STEP_M, STEP_RAD
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 

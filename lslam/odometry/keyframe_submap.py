@@ -8,11 +8,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
 from lslam.registration.local_map import LocalMap
 from lslam.registration.map_scans import MapScans
+from lslam.registration.preprocessing.prepare import PreparedPoints
 
 Floats = NDArray[np.float64]
 

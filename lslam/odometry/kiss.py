@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.input import PreprocessConfig
+from lslam.core.config.config import Config
+from lslam.core.config.input import PreprocessConfig
 from lslam.core.extras import importing
-from lslam.geometry import se3
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
-from lslam.preprocessing.prepare import gate_points
+from lslam.registration.preprocessing.prepare import gate_points
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 

@@ -7,13 +7,13 @@ from those. Its mapping takes the less planar points of ground and clusters, as 
 
 from __future__ import annotations
 
-from lslam.config.config import Config
+from lslam.core.config.config import Config
+from lslam.core.types.scan import Scan
 from lslam.odometry.feature_steps import two_steps
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.loam import Loam
-from lslam.preprocessing.features import Features
-from lslam.preprocessing.segments import lego_features
-from lslam.types.scan import Scan
+from lslam.registration.preprocessing.features import Features
+from lslam.registration.preprocessing.segments import lego_features
 
 LEGO = LoamVariant(two_steps, with_map=True, with_less_planes=True)
 

@@ -7,16 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.odometry import rest_alone
-from lslam.geometry import normal_equations
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import rest_alone
+from lslam.core.geometry import normal_equations
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio2 import FastLio2
 from lslam.odometry.icp import registration_of
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan_result import ScanEquations
 
 Floats = NDArray[np.float64]
 
@@ -29,8 +29,8 @@ def create(config: Config) -> LioMapping:
 class LioMapping(FastLio2):
     """Registers a scan with the window's prediction in one estimate, and takes its normal equations where that ends.
 
-    The joint estimate is the motion model's (`lslam.inertial.window`), the map is of the scans that left it: each enters when
-    it is `lag` scans old, at the last pose the window gave it, and is never compared with a map that it is part of.
+    The joint estimate is the motion model's (`lslam.odometry.inertial.window`), the map is of the scans that left it: each enters
+    when it is `lag` scans old, at the last pose the window gave it, and is never compared with a map that it is part of.
     """
 
     deskew = "by the prediction of the window"

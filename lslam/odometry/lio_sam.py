@@ -1,6 +1,6 @@
 """Method `lio-sam`: tightly coupled LiDAR and IMU by smoothing (Shan et al. 2020); here what registers the scans.
 
-The smoother is the motion model (`lslam.inertial.smoothing`, `lslam.graph.inertial_smoother`).
+The smoother is the motion model (`lslam.odometry.inertial.smoothing`, `lslam.backend.graph.inertial_smoother`).
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lslam.config.config import Config
-from lslam.config.odometry import rest_alone
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import rest_alone
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import Stateful
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
 from lslam.odometry.loam import Loam
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.state import Stateful
 
 
 def create(config: Config) -> LioSam | LioSamOfPoints:

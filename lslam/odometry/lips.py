@@ -9,10 +9,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.errors import UsageError
-from lslam.geometry import noise, normal_equations, se3
-from lslam.kernels.transform import transform
+from lslam.core.config.config import Config
+from lslam.core.errors import UsageError
+from lslam.core.geometry import noise, normal_equations, se3
+from lslam.core.kernels.transform import transform
+from lslam.core.types.imu import SweepLink
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import LEVER_M, Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.plane_association import associate
 from lslam.odometry.plane_factors import sighting_residuals
@@ -20,16 +26,10 @@ from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
 from lslam.odometry.plane_values import SHARED
 from lslam.odometry.plane_window import PlaneWindow
 from lslam.odometry.scan_outcome import recorded
-from lslam.preprocessing.deskew import deskew_points
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.acceptance import correction
+from lslam.registration.preprocessing.deskew import deskew_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.solver import RegistrationResult
-from lslam.types.imu import SweepLink
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import LEVER_M, Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.stage_clock import StageClock
-from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

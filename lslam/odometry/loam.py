@@ -7,23 +7,23 @@ from typing import ClassVar
 
 import numpy as np
 
-from lslam.config.config import Config
+from lslam.core.config.config import Config
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.feature_policies import feature_policies
 from lslam.odometry.feature_steps import joint_step
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.preprocessing.deskew import deskew_points
-from lslam.preprocessing.features import FeaturePoints, Features, extract_features
-from lslam.preprocessing.ground import up_of
+from lslam.registration.preprocessing.deskew import deskew_points
+from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features
+from lslam.registration.preprocessing.ground import up_of
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.stage_clock import StageClock
-from lslam.types.state import Stateful
 
 VARIANTS = {
     "loam-odom": LoamVariant(joint_step, with_map=False),

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.stage_clock import StageClock
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.loam import Loam, deskewed
-from lslam.preprocessing.features import FeaturePoints, Features
-from lslam.preprocessing.petals import petal_features
 from lslam.registration.acceptance import correction, failed
+from lslam.registration.preprocessing.features import FeaturePoints, Features
+from lslam.registration.preprocessing.petals import petal_features
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
-from lslam.geometry.normal_equations import Normal
+from lslam.core.geometry import so3
+from lslam.core.geometry.normal_equations import Normal
+from lslam.core.types.imu import PreintegratedStep
 from lslam.odometry import closest_point
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-from lslam.types.imu import PreintegratedStep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

@@ -10,8 +10,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from lslam.kernels import gaussians
-from lslam.kernels.voxel import MASK, OFFSET
+from lslam.core.kernels import gaussians
+from lslam.core.kernels.voxel import MASK, OFFSET
 from lslam.odometry import closest_point
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
-from lslam.types.imu import MotionState
+from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import MotionState
 
 Floats = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
-from lslam.geometry.normal_equations import Normal
-from lslam.kernels import positive
+from lslam.core.geometry import se3
+from lslam.core.geometry.normal_equations import Normal
+from lslam.core.kernels import positive
+from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry.plane_factors import Sightings, WindowPrior, normal_equations, step_residual
 from lslam.odometry.plane_values import ORDER, PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-from lslam.types.imu import MotionState, PreintegratedStep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

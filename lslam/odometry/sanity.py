@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
-from lslam.kernels import voxel
-from lslam.types.scan import FARTHEST_M, Scan
-from lslam.types.scan_result import ScanResult
+from lslam.core.geometry import se3, so3
+from lslam.core.kernels import voxel
+from lslam.core.types.scan import FARTHEST_M, Scan
+from lslam.core.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.registration.acceptance import Acceptance, failed
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 

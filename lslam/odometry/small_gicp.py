@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
+from lslam.core.config.config import Config
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.extras import importing, install_hint
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
-from lslam.preprocessing.prepare import clean_points
+from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import State, Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.state import State, Stateful
 
 Floats = NDArray[np.float64]
 

@@ -7,11 +7,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import noise
+from lslam.core.geometry import noise
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.state import Stateful
 from lslam.odometry.deskew_uncertainty import DeskewUncertainty
 from lslam.registration.solver import RegistrationResult
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import TYPE_CHECKING, cast
 
-from lslam.errors import UsageError, nearest
+from lslam.core.errors import UsageError, nearest
 
 if TYPE_CHECKING:
     from lslam.osm.matcher import Lay

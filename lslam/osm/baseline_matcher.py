@@ -9,29 +9,29 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.backend.graph.building_graph import JointSolution, optimise_jointly
+from lslam.backend.graph.drift import with_drift
+from lslam.backend.graph.factors import PLANAR
+from lslam.backend.graph.odometry_constraints import fitness_covariance
+from lslam.backend.graph.problem import PoseGraph, Solution
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import Given
-from lslam.config import Config
-from lslam.config.odometry import RegistrationConfig
+from lslam.core.config import Config
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se2, se3
 from lslam.core.stopping import checking
-from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se2, se3
-from lslam.graph.building_graph import JointSolution, optimise_jointly
-from lslam.graph.drift import with_drift
-from lslam.graph.factors import PLANAR
-from lslam.graph.odometry_constraints import fitness_covariance
-from lslam.graph.problem import PoseGraph, Solution
-from lslam.keyframes.store import KeyframeStore
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
+from lslam.core.types.stage_clock import KeyframeClocks, StageClock
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.corrections import place_buildings
 from lslam.osm.matcher import Laid, accepted_part
 from lslam.osm.walls import OsmMap
-from lslam.preprocessing.prepare import PreparedPoints
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
-from lslam.types.arrays import Floats
-from lslam.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
-from lslam.types.stage_clock import KeyframeClocks, StageClock
 
 # Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5

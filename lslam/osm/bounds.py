@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
-from lslam.formats.geojson import read_line
-from lslam.formats.stamped_csv import read_gnss_csv
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry.geodesy import from_local
-from lslam.types.arrays import Floats
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.arrays import Floats
+from lslam.io.formats.geojson import read_line
+from lslam.io.formats.stamped_csv import read_gnss_csv
+from lslam.io.formats.trajectory_files import read_trajectory
 
 METRES_PER_DEGREE = 111_320.0
 DECIMALS = 6  # docs/conventions.md: a cached reply is found by the rounded box
@@ -120,7 +120,7 @@ def positions_along(what: str, data_root: Path | None = None, origin: NDArray[An
         if origin is None:
             raise UsageError(f"{path} is in metres: --origin LAT,LON says where its x = y = 0 lies, x east and y north")
         return np.asarray(from_local(read_trajectory(path).positions, origin)[:, :2])
-    from lslam.readers import open_sequence
+    from lslam.io.readers import open_sequence
 
     gnss = open_sequence(what, data_root=data_root).gnss
     if gnss is None or not len(gnss):

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.backend import OsmConfig
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import InputError, LslamError
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT
-from lslam.errors import InputError, LslamError
-from lslam.formats.atomic import atomic_write
-from lslam.formats.osm_buildings import buildings_of
-from lslam.geometry.geodesy import from_local
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.osm_buildings import buildings_of
 from lslam.osm.bounds import Bounds, around
 from lslam.osm.overpass import OverpassReply, from_overpass
-from lslam.types.arrays import Floats
 
 log = logging.getLogger("lslam")
 NOTHING = OverpassReply(b"{}")

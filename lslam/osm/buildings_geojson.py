@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.errors import InputError, cause
+from lslam.core.geometry import se2
+from lslam.core.geometry.geodesy import from_local, to_local
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.errors import InputError, cause
-from lslam.formats.atomic import write_text
-from lslam.formats.osm_data import DECIMALS
-from lslam.geometry import se2
-from lslam.geometry.geodesy import from_local, to_local
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.osm_data import DECIMALS
 
 SCHEMA = "lslam-buildings-1"
 

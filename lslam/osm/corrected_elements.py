@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lslam.formats.osm_data import DECIMALS, OsmData
-from lslam.geometry.geodesy import from_local, to_local
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, BuildingCorrection, CorrectedMap, about
+from lslam.core.geometry.geodesy import from_local, to_local
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, about
+from lslam.io.formats.osm_data import DECIMALS, OsmData
 
 ONE_NODE = 0.05  # m; a node that its buildings want nearer together than this stays one node
 STAYS = 0.01  # m; what moves less is not edited

@@ -10,20 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.backend import OsmConfig
+from lslam.backend.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
+from lslam.core.config.backend import OsmConfig
+from lslam.core.geometry import se2
 from lslam.core.stopping import checking
-from lslam.formats.osm_data import OsmData
-from lslam.formats.osm_files import write_osm
-from lslam.geometry import se2
-from lslam.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
-from lslam.kernels import wall_matching
-from lslam.osm.buildings_geojson import write_corrected
-from lslam.osm.corrected_elements import corrected_osm
-from lslam.osm.overlap import Untangled, remove_overlaps
-from lslam.osm.wall_match import LIKENESS
-from lslam.osm.walls import walls_of
-from lslam.types.arrays import Bools, Floats
-from lslam.types.building import (
+from lslam.core.types.arrays import Bools, Floats
+from lslam.core.types.building import (
     Building,
     BuildingCorrection,
     BuildingMatch,
@@ -34,6 +26,14 @@ from lslam.types.building import (
     footprint_polygon,
     is_canopy,
 )
+from lslam.io.formats.osm_data import OsmData
+from lslam.io.formats.osm_files import write_osm
+from lslam.osm.buildings_geojson import write_corrected
+from lslam.osm.corrected_elements import corrected_osm
+from lslam.osm.kernels import wall_matching
+from lslam.osm.overlap import Untangled, remove_overlaps
+from lslam.osm.wall_match import LIKENESS
+from lslam.osm.walls import walls_of
 
 VIEWS = 3  # keyframes that must agree
 NEAR = 1.5  # m; a building with walls seen within it of its outline is not absent

@@ -8,24 +8,24 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.backend.georeferencing import Placement, on_earth
+from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.problem import PlanarPrior, PoseGraph
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import BackEnd, Given, solve
-from lslam.config import Config
-from lslam.config.backend import OsmConfig
+from lslam.core.config import Config
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import GraphError, InputError
+from lslam.core.geometry import se2, se3
 from lslam.core.stopping import checking
-from lslam.errors import GraphError, InputError
-from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se2, se3
-from lslam.graph.odometry_constraints import corrected
-from lslam.graph.problem import PlanarPrior, PoseGraph
-from lslam.keyframes.store import KeyframeStore
+from lslam.core.types.arrays import Floats
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm import matcher_named
 from lslam.osm.location import Located, finish, locate
 from lslam.osm.source import OsmSource
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
 from lslam.osm.wall_match import match_buildings
-from lslam.types.arrays import Floats
-from lslam.types.gnss import Georeference
-from lslam.types.stage_clock import KeyframeClocks
 
 log = logging.getLogger("lslam")
 # Iterations of the drift estimate: the drift within a submap is not visible in its walls at first.

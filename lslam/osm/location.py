@@ -13,25 +13,25 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from lslam.backend.graph.problem import PlanarPrior, Solution
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.submaps import neighbours, submap
 from lslam.backend.levelling import floor_planes
-from lslam.config import Config
-from lslam.config.backend import GraphConfig, OsmConfig
+from lslam.core.config import Config
+from lslam.core.config.backend import GraphConfig, OsmConfig
+from lslam.core.geometry import se2, se3, so3
+from lslam.core.geometry.noise import quantile
 from lslam.core.stopping import checking
-from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se2, se3, so3
-from lslam.geometry.noise import quantile
-from lslam.graph.problem import PlanarPrior, Solution
-from lslam.keyframes.store import KeyframeStore
-from lslam.keyframes.submaps import neighbours, submap
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.core.types.constraint import Verdict
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildings, match_keyframe, shares
 from lslam.osm.walls import OsmMap, find_walls
-from lslam.preprocessing.ground import Z, up_of, world_up_of
-from lslam.types.arrays import Floats
-from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
-from lslam.types.constraint import Verdict
-from lslam.types.stage_clock import KeyframeClocks
+from lslam.registration.preprocessing.ground import Z, up_of, world_up_of
 
 log = logging.getLogger("lslam")
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from lslam.backend.graph.building_graph import JointSolution, optimise_jointly
+from lslam.backend.graph.drift import with_drift
+from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.outcome import Given
-from lslam.config import Config
-from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se2
-from lslam.graph.building_graph import JointSolution, optimise_jointly
-from lslam.graph.drift import with_drift
-from lslam.graph.problem import PoseGraph, Solution
+from lslam.core.config import Config
+from lslam.core.geometry import se2
+from lslam.core.types.building import CorrectedMap, OsmMatches
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.corrections import agreed, correct_buildings, map_prior, middles_of, place_buildings
-from lslam.types.building import CorrectedMap, OsmMatches
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from lslam.core.stopping import checking
-from lslam.types.arrays import Floats, Longs
-from lslam.types.building import Building, about, footprint_polygon, is_canopy
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.building import Building, about, footprint_polygon, is_canopy
 
 TOUCHING = 0.05  # m; walls of neighbours at most this far apart on the map are a party wall
 SHARED = 0.5  # m; least length of a party wall

@@ -21,16 +21,16 @@ from typing import IO, Any
 
 import numpy as np
 
-from lslam.config.backend import OsmConfig
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import InputError, OutputError, UsageError
+from lslam.core.kernels.cache import cache_folder
 from lslam.core.machine import one_at_a_time
 from lslam.core.untrusted import JsonItems, parse_json, whole_number
-from lslam.errors import InputError, OutputError, UsageError
-from lslam.formats.atomic import atomic_write
-from lslam.formats.osm_data import OsmData
-from lslam.formats.osm_files import ELEMENTS, GaveUpError, add_elements, check_reply
-from lslam.kernels.cache import cache_folder
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.osm_data import OsmData
+from lslam.io.formats.osm_files import ELEMENTS, GaveUpError, add_elements, check_reply
 from lslam.osm.bounds import Bounds
-from lslam.version import __version__
 
 
 class OverpassReply(Mapping[str, Any]):

@@ -11,21 +11,21 @@ from typing import Protocol
 import numpy as np
 
 from lslam.backend.georeferencing import require_crs
-from lslam.config import Config
-from lslam.config.backend import OsmConfig
+from lslam.core.config import Config
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import InputError, UsageError, cause
+from lslam.core.geometry import se2
+from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.sequence import Sequence
 from lslam.core.untrusted import MISFIT
-from lslam.errors import InputError, UsageError, cause
-from lslam.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
-from lslam.formats.osm_data import OsmData
-from lslam.formats.osm_files import read_osm
-from lslam.geometry import se2
-from lslam.geometry.geodesy import to_local
+from lslam.io.formats.osm_buildings import BuildingExtract, buildings_of, some_buildings_of
+from lslam.io.formats.osm_data import OsmData
+from lslam.io.formats.osm_files import read_osm
 from lslam.osm.buffer import Fetch, OsmBuffer
 from lslam.osm.overpass import OverpassReply, fetch_buildings, merged, reply_folder
 from lslam.osm.walls import OsmMap
-from lslam.types.arrays import Floats, Longs
-from lslam.types.gnss import GnssStream
-from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 

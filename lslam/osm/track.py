@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lslam.geometry import se2
-from lslam.types.arrays import Floats
-from lslam.types.building import KeyframeMatch
+from lslam.core.geometry import se2
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import KeyframeMatch
 
 # m, correlation length of odometry's drift.
 MEMORY = 100.0

@@ -14,13 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.config.backend import GraphConfig
+from lslam.backend.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
+from lslam.backend.graph.factors import PLANAR
+from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
+from lslam.core.config.backend import GraphConfig
+from lslam.core.geometry.noise import quantile
 from lslam.core.stopping import checking
-from lslam.geometry.noise import quantile
-from lslam.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
-from lslam.graph.factors import PLANAR
-from lslam.graph.problem import EstimatedDrift, PoseGraph
-from lslam.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Floats, Longs
 
 # Degrees of freedom of the residuals (Student's t), against walls matched wrongly.
 FREEDOM = 3.0

@@ -14,13 +14,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.backend import OsmConfig
-from lslam.geometry import se2
-from lslam.kernels import wall_matching
+from lslam.core.config.backend import OsmConfig
+from lslam.core.geometry import se2
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.building import BuildingMatch, KeyframeMatch
+from lslam.core.types.constraint import Verdict
+from lslam.osm.kernels import wall_matching
 from lslam.osm.walls import OsmMap, find_walls
-from lslam.types.arrays import Floats, Longs
-from lslam.types.building import BuildingMatch, KeyframeMatch
-from lslam.types.constraint import Verdict
 
 WINDOW = 3.0  # sigmas of the prior that are searched
 REACH = 20.0  # m; a virtual edge lies at most so far beyond the ends of its walls

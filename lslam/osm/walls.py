@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.backend import OsmConfig
-from lslam.kernels import ground, segments
-from lslam.types.arrays import Floats, Longs
-from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
+from lslam.core.config.backend import OsmConfig
+from lslam.core.kernels import ground
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
+from lslam.osm.kernels import segments
 
 CELL = 2.0  # m; of the grid in which the ground is found
 SLOPE = 0.3  # m per m; steepest street

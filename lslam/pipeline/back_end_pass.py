@@ -12,33 +12,33 @@ import numpy as np
 
 from lslam.backend import added_drift
 from lslam.backend.control_points import doubts, where_held
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.submaps import mounted_up
 from lslam.backend.levelling import find_level, level_results
+from lslam.backend.loops.find_loops import find_loops, verify_known
 from lslam.backend.manual import KeyframePairs, keyframe_pairs, write_control
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import InterruptedRunError
+from lslam.core.geometry import se2, se3
 from lslam.core.stopping import asking
-from lslam.errors import InterruptedRunError
-from lslam.formats.g2o import write_g2o
-from lslam.formats.state_files import Records
-from lslam.formats.trajectory_files import write_tum
-from lslam.frontend.register_scans import to_trajectory
-from lslam.geometry import se2, se3
-from lslam.keyframes.store import KeyframeStore
-from lslam.keyframes.submaps import mounted_up
-from lslam.loops.find_loops import find_loops, verify_known
+from lslam.core.types.constraint import LoopCandidate
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.version import __version__
+from lslam.io.formats.g2o import write_g2o
+from lslam.io.formats.state_files import Records
+from lslam.io.formats.trajectory_files import write_tum
+from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.osm.hold import hold_by_buildings
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.outputs import write_loops, write_osm_matches
-from lslam.types.constraint import LoopCandidate
-from lslam.types.gnss import Georeference
-from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.stage_clock import KeyframeClocks
-from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 

@@ -9,26 +9,26 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.errors import InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.geometry import se3
+from lslam.core.geometry.geodesy import frame_change
 from lslam.core.stopping import asking
-from lslam.errors import InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
-from lslam.formats.geojson import write_areas
-from lslam.formats.ply_files import write_ply
-from lslam.frontend.register_scans import read_ahead
-from lslam.geometry import se3
-from lslam.geometry.geodesy import frame_change
+from lslam.core.types.arrays import Floats
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.sequence import Sequence
+from lslam.core.version import __version__
+from lslam.io.formats.geojson import write_areas
+from lslam.io.formats.ply_files import write_ply
 from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.georeference import to_lat_lon
 from lslam.maps.occupancy import Evidence, OccupancyMapper
+from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.pipeline.map_files import read_json
 from lslam.pipeline.map_pass import scan_poser
 from lslam.pipeline.rebuild import EarlierRun, results_of
 from lslam.pipeline.run_folder import MANIFEST
-from lslam.preprocessing.ground import world_up_of
-from lslam.types.arrays import Floats
-from lslam.types.gnss import Georeference
-from lslam.types.sequence import Sequence
-from lslam.version import __version__
+from lslam.registration.preprocessing.ground import world_up_of
 
 log = logging.getLogger("lslam")
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from lslam.config import Config
-from lslam.config.load import read_preset
-from lslam.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
-from lslam.errors import UsageError
+from lslam.backend.loops import require_descriptor
+from lslam.core.config import Config
+from lslam.core.config.load import read_preset
+from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
+from lslam.core.errors import UsageError
 from lslam.evaluation import check_words, parse_delta
-from lslam.loops import require_descriptor
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.osm import matcher_named
 from lslam.registration.residuals import residual_named

@@ -9,12 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import BackEnd
-from lslam.config import Config, load_config
-from lslam.core.remote import RemotePath
-from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
+from lslam.core.config import Config, load_config
+from lslam.core.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, RunFinishedError
+from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import Evaluation
-from lslam.keyframes.store import KeyframeStore
+from lslam.io.remote import RemotePath
 from lslam.osm.corrections import write_buildings
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import write_back_end
@@ -25,7 +26,6 @@ from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
 from lslam.pipeline.stages import make_feature_map, make_map, make_report
 from lslam.pipeline.storage import check_place, spool_of, upload
-from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
     from lslam.pipeline.rebuild import EarlierRun

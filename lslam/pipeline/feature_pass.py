@@ -9,20 +9,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import InterruptedRunError, LslamError
+from lslam.core.geometry import se3
 from lslam.core.stopping import asking
-from lslam.errors import InterruptedRunError, LslamError
-from lslam.frontend.register_scans import read_ahead
-from lslam.geometry import se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.run_record import FeatureView
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.state import State
 from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
+from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.pipeline.map_pass import MapCheckpoints, motion_within
-from lslam.preprocessing.features import Features
-from lslam.types.arrays import Floats
-from lslam.types.run_record import FeatureView
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.state import State
+from lslam.registration.preprocessing.features import Features
 
 EDGE, PLANE = 1, 0
 INTERRUPTED = "interrupted while the feature map was built: nothing of it is written"

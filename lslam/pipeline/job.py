@@ -11,21 +11,27 @@ from pathlib import Path
 import numpy as np
 
 from lslam.backend.georeferencing import require_gnss
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.manual import read_manual
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import InputError, InterruptedRunError
+from lslam.core.geometry import se3
 from lslam.core.stopping import asking
-from lslam.errors import InputError, InterruptedRunError
+from lslam.core.types.constraint import Manual
+from lslam.core.types.scan import Span
+from lslam.core.types.sequence import Sequence, select
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.frames import main_axis
-from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.frontend.inertial_start import with_imu_settings
-from lslam.frontend.mounting import with_up
-from lslam.frontend.point_times import with_point_times
-from lslam.frontend.register_scans import sweep_of
-from lslam.frontend.scene_scale import LENGTHS, with_scene_scale
-from lslam.geometry import se3
-from lslam.keyframes.store import KeyframeStore
+from lslam.io.readers import open_sequence
+from lslam.io.readers.raw_drive import with_streams
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
+from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.odometry.frontend.inertial_start import with_imu_settings
+from lslam.odometry.frontend.mounting import with_up
+from lslam.odometry.frontend.point_times import with_point_times
+from lslam.odometry.frontend.register_scans import sweep_of
+from lslam.odometry.frontend.scene_scale import LENGTHS, with_scene_scale
 from lslam.odometry.given import GivenMotion, GivenPoses
 from lslam.osm.source import OsmSource, open_osm
 from lslam.pipeline.check import check_config
@@ -35,13 +41,7 @@ from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.prior_map_files import require_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.pipeline.watch import Watch
-from lslam.preprocessing.views import with_rings
-from lslam.readers import open_sequence
-from lslam.readers.raw_drive import with_streams
-from lslam.types.constraint import Manual
-from lslam.types.scan import Span
-from lslam.types.sequence import Sequence, select
-from lslam.types.trajectory import Trajectory
+from lslam.registration.preprocessing.views import with_rings
 
 log = logging.getLogger("lslam")
 

@@ -11,33 +11,33 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.errors import InterruptedRunError, RunFailedError
-from lslam.formats.state_files import Records
-from lslam.frontend.register_scans import read_ahead, to_trajectory
-from lslam.geometry import noise, se3
-from lslam.geometry.geodesy import to_local
-from lslam.graph.drift import drift_covariance
-from lslam.graph.odometry_constraints import corrected
-from lslam.keyframes.store import KeyframeStore
-from lslam.localization.follow import MapFollower, doubted
-from lslam.localization.place_search import PlaceSearch
-from lslam.localization.prior_map import LocalView, PriorMap
-from lslam.localization.start import PlaceFinder, Start, StartPrior
+from lslam.backend.graph.drift import drift_covariance
+from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.localization.follow import MapFollower, doubted
+from lslam.backend.localization.place_search import PlaceSearch
+from lslam.backend.localization.prior_map import LocalView, PriorMap
+from lslam.backend.localization.start import PlaceFinder, Start, StartPrior
+from lslam.core.config import Config
+from lslam.core.errors import InterruptedRunError, RunFailedError
+from lslam.core.geometry import noise, se3
+from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import MapFix
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.state_files import Records
+from lslam.odometry.frontend.register_scans import read_ahead, to_trajectory
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import motion_within
 from lslam.pipeline.prior_map_files import read_prior_map
 from lslam.pipeline.watch import Watch
-from lslam.preprocessing.deskew import deskew
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
-from lslam.types.arrays import Floats
-from lslam.types.constraint import MapFix
-from lslam.types.run_record import RunRecord
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Keyframe
+from lslam.registration.preprocessing.deskew import deskew
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 
 log = logging.getLogger("lslam")
 # Sentences of reasons in a message, at most.

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from lslam.geometry import se3
-from lslam.integrity.alerts import LARGE, Alert, alerts, stamp_faults
+from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.scan_result import MotionCheck, ScanResult, motion_apart
+from lslam.odometry.integrity.alerts import LARGE, Alert, alerts, stamp_faults
 from lslam.pipeline.manifest import Manifest
-from lslam.types.arrays import Floats, Longs
-from lslam.types.scan_result import MotionCheck, ScanResult, motion_apart
 
 log = logging.getLogger("lslam")
 

@@ -14,16 +14,16 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import InterruptedRunError
 from lslam.core.stopping import is_interrupt
-from lslam.errors import InterruptedRunError
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan import Span
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.warned import Warnings
+from lslam.core.version import __version__
 from lslam.reports.facts import describe
-from lslam.types.run_record import RunRecord
-from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.warned import Warnings
-from lslam.version import __version__
 
 SCHEMA = 1
 # Share of the scans that may leave a direction open before the run counts as degraded.

@@ -10,23 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lslam.config.outputs import MapConfig
+from lslam.core.config.outputs import MapConfig
+from lslam.core.errors import OutputError, cause
+from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.errors import OutputError, cause
-from lslam.formats.atomic import atomic_write, write_text
-from lslam.formats.geojson import write_line
-from lslam.formats.ply_files import write_ply, write_ply_mesh
-from lslam.formats.point_files import MAP_SUFFIXES, write_cloud
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import atomic_write, write_text
+from lslam.io.formats.geojson import write_line
+from lslam.io.formats.ply_files import write_ply, write_ply_mesh
+from lslam.io.formats.point_files import MAP_SUFFIXES, write_cloud
 from lslam.maps.floor_plan import floor_plan
 from lslam.maps.georeference import ProjectedCloud, Projection, to_lat_lon
 from lslam.maps.mesh import surface
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.reports.evaluations import strict
 from lslam.reports.png import grey_png
-from lslam.types.cloud import ArrayCloud, Cloud, in_memory
-from lslam.types.gnss import Georeference
-from lslam.types.trajectory import Trajectory
-from lslam.version import __version__
 
 if TYPE_CHECKING:
     from lslam.pipeline.map_pass import BuiltMap

@@ -11,28 +11,28 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.config.outputs import MapConfig
+from lslam.core.config import Config
+from lslam.core.config.outputs import MapConfig
+from lslam.core.errors import InputError, InterruptedRunError
+from lslam.core.geometry.se3 import poses_at
 from lslam.core.stopping import asking
-from lslam.errors import InputError, InterruptedRunError
-from lslam.frontend.checkpoints import Checkpoints
-from lslam.frontend.register_scans import read_ahead
-from lslam.geometry.se3 import poses_at
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory, thinned
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.state import State
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.floor_plan import TopView, top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
+from lslam.odometry.frontend.checkpoints import Checkpoints
+from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
-from lslam.preprocessing.deskew import deskew_points, knots_over
-from lslam.preprocessing.ground import Z, world_up_of
-from lslam.types.arrays import Floats, Longs
-from lslam.types.cloud import ArrayCloud, Cloud, in_memory, thinned
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
-from lslam.types.state import State
+from lslam.registration.preprocessing.deskew import deskew_points, knots_over
+from lslam.registration.preprocessing.ground import Z, world_up_of
 
 log = logging.getLogger("lslam")
 

@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
-from lslam.formats.point_files import read_cloud, write_cloud
+from lslam.core.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud, Cloud
+from lslam.core.types.gnss import Georeference, OutputCrs
+from lslam.core.types.sequence import Sequence
+from lslam.core.version import __version__
+from lslam.io.formats.point_files import read_cloud, write_cloud
 from lslam.maps.georeference import ProjectedCloud, Projection
 from lslam.pipeline.map_files import MapNote, georeference_note, read_json, write_json
 from lslam.pipeline.map_pass import INTERRUPTED, build_map
 from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
 from lslam.pipeline.run_folder import SPOOL
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud, Cloud
-from lslam.types.gnss import Georeference, OutputCrs
-from lslam.types.sequence import Sequence
-from lslam.version import __version__
 
 INDEX, SCHEMA = "map.json", 1
 # Points that wait for their tiles' files, so that a map of any size needs little memory and few open files.

@@ -10,25 +10,25 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.pose_graph import optimise
+from lslam.backend.graph.problem import PoseGraph, Solution
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.localization.sessions import Chain, Session, tie
+from lslam.backend.loops.detector import Detector
+from lslam.backend.loops.find_loops import warm_up
 from lslam.backend.outcome import judged_by
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import GraphError, InputError, InterruptedRunError, RunFailedError, UsageError
 from lslam.core.stopping import asking
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import LoopCandidate
+from lslam.core.types.scan_result import ScanResult
 from lslam.core.untrusted import parse_json
-from lslam.errors import GraphError, InputError, InterruptedRunError, RunFailedError, UsageError
-from lslam.formats.state_files import Records, read_npz
-from lslam.frontend.checkpoints import Checkpoints
-from lslam.graph.odometry_constraints import corrected
-from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import PoseGraph, Solution
-from lslam.keyframes.store import KeyframeStore
-from lslam.localization.sessions import Chain, Session, tie
-from lslam.loops.detector import Detector
-from lslam.loops.find_loops import warm_up
+from lslam.io.formats.state_files import Records, read_npz
+from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.pipeline.rebuild import EarlierRun, read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES, MANIFEST
-from lslam.types.arrays import Floats
-from lslam.types.constraint import LoopCandidate
-from lslam.types.scan_result import ScanResult
 
 log = logging.getLogger("lslam")
 Stop = Callable[[], bool]

@@ -11,15 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.errors import InputError, InterruptedRunError, LslamError, OutputError
+from lslam.backend.graph.factors import well_conditioned
+from lslam.core.config import Config
+from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError
+from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence as Recording
+from lslam.core.types.trajectory import Trajectory
+from lslam.core.version import __version__
 from lslam.evaluation.evaluate import evaluate
-from lslam.formats.g2o import write_g2o
-from lslam.formats.trajectory_files import write_tum
-from lslam.frontend.checkpoints import Checkpoints
-from lslam.frontend.register_scans import read_ahead, to_trajectory
-from lslam.geometry import se3
-from lslam.graph.factors import well_conditioned
+from lslam.io.formats.g2o import write_g2o
+from lslam.io.formats.trajectory_files import write_tum
+from lslam.odometry.frontend.checkpoints import Checkpoints
+from lslam.odometry.frontend.register_scans import read_ahead, to_trajectory
 from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.map_files import MapNote, write_map
 from lslam.pipeline.map_pass import BuiltMap, MapMaker, scan_poser
@@ -29,12 +35,6 @@ from lslam.pipeline.rebuild import EarlierRun, open_scans
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.reports.merge_html import SessionView, write_page
-from lslam.types.arrays import Floats
-from lslam.types.gnss import Georeference
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence as Recording
-from lslam.types.trajectory import Trajectory
-from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 SCHEMA = 1

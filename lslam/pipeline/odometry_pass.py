@@ -8,12 +8,23 @@ from itertools import pairwise
 
 import numpy as np
 
-from lslam.config import Config
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.loops import find_loops
+from lslam.core.config import Config
+from lslam.core.errors import InputError
+from lslam.core.kernels import jit
 from lslam.core.machine import one_at_a_time
-from lslam.errors import InputError
-from lslam.frontend import inertial_start
-from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.frontend.inertial_start import (
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import Turn
+from lslam.core.types.imu import InertialChain
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan_result import ScanResult
+from lslam.maps import crispness, merge
+from lslam.odometry import create_odometry
+from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.frontend import inertial_start
+from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.odometry.frontend.inertial_start import (
     Inertial,
     begin_inertial,
     close_inertial,
@@ -21,21 +32,15 @@ from lslam.frontend.inertial_start import (
     save_start,
     with_imu_settings,
 )
-from lslam.frontend.keyframing import Keyframing
-from lslam.frontend.motion_models import copy_of, smoother_noise
-from lslam.frontend.register_scans import estimate, is_diverged, to_trajectory
-from lslam.frontend.segments import Begin
-from lslam.frontend.tracker import Tracker
-from lslam.inertial.constant_velocity import ConstantVelocity, MotionModel
-from lslam.inertial.smoothing import SmootherMotion
-from lslam.integrity.monitor import IntegrityMonitor
-from lslam.kernels import jit
-from lslam.keyframes.store import KeyframeStore
-from lslam.loops import find_loops
-from lslam.maps import crispness, merge
-from lslam.odometry import create_odometry
-from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.frontend.keyframing import Keyframing
+from lslam.odometry.frontend.motion_models import copy_of, smoother_noise
+from lslam.odometry.frontend.register_scans import estimate, is_diverged, to_trajectory
+from lslam.odometry.frontend.segments import Begin
+from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.given import GivenPoses
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
+from lslam.odometry.inertial.smoothing import SmootherMotion
+from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import wall_match
@@ -45,11 +50,6 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import helped
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.pipeline.segments import checks_within, join_segments
-from lslam.types.arrays import Floats
-from lslam.types.constraint import Turn
-from lslam.types.imu import InertialChain
-from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
 
 log = logging.getLogger("lslam")
 

@@ -12,14 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config import Config, to_toml
-from lslam.config.outputs import MapConfig
+from lslam.core.config import Config, to_toml
+from lslam.core.config.outputs import MapConfig
+from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.core.types.constraint import LoopCandidate
+from lslam.core.types.imu import IMU_STATES
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Trajectory
+from lslam.core.version import __version__
 from lslam.evaluation.evaluate import Evaluation
 from lslam.evaluation.timing import AFTER, SAVED
-from lslam.formats.atomic import write_text
-from lslam.formats.ply_files import write_ply
-from lslam.formats.trajectory_files import write_kitti, write_tum
-from lslam.geometry import se3
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.ply_files import write_ply
+from lslam.io.formats.trajectory_files import write_kitti, write_tum
 from lslam.pipeline import map_files
 from lslam.pipeline.feature_pass import FeatureCloud
 from lslam.pipeline.map_files import LOCAL
@@ -27,15 +36,6 @@ from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix
-from lslam.types.arrays import Floats
-from lslam.types.building import BuildingMatch, KeyframeMatch, OsmMatches
-from lslam.types.constraint import LoopCandidate
-from lslam.types.imu import IMU_STATES
-from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Calibration
-from lslam.types.trajectory import Trajectory
-from lslam.version import __version__
 
 LOOP_COLUMNS = (
     "keyframe_a", "keyframe_b", "scan_a", "scan_b", "distance_m", "descriptor_distance", "verdict", "stage", "rmse_m",

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.formats.atomic import atomic_write
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
 from lslam.osm.buildings_geojson import read_corrected
@@ -19,8 +21,6 @@ from lslam.pipeline.rebuild import is_gone, read_run, results_of, viewed_run
 from lslam.pipeline.regraph import open_again
 from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure
 from lslam.reports.picture import check_plot_path, house_style, picture
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 
 def plotted_run(

@@ -10,9 +10,9 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.kernels import jit
 from lslam.core.machine import available_cores
-from lslam.kernels import jit
 
 
 @contextmanager
@@ -44,10 +44,10 @@ def helped(config: Config) -> Iterator[Callable[[], None]]:
 
 def main(words: list[str]) -> None:
     """Compile the optimiser's step and the ground's kernels, and those of the map and of loop candidates where named."""
-    from lslam.loops import find_loops
+    from lslam.backend.loops import find_loops
     from lslam.maps import crispness, merge
-    from lslam.preprocessing import ground
     from lslam.registration import optimiser
+    from lslam.registration.preprocessing import ground
 
     optimiser.warm_up()
     ground.warm_up()

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.errors import ConfigError, InputError, UsageError
-from lslam.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
-from lslam.localization.prior_map import PriorMap, make_prior_map
+from lslam.backend.localization.prior_map import PriorMap, make_prior_map
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import ConfigError, InputError, UsageError
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud
+from lslam.io.formats.point_files import MAP_SUFFIXES, SUFFIXES, read_cloud
 from lslam.maps.georeference import Projection
 from lslam.pipeline.map_files import georeference_of, in_own_world, note_of, read_json
 from lslam.pipeline.map_tiles import INDEX, is_tiles, read_tiles
 from lslam.pipeline.merge_runs import read_session
 from lslam.pipeline.rebuild import map_of
 from lslam.pipeline.run_folder import require_run
-from lslam.preprocessing.ground import Z
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud
+from lslam.registration.preprocessing.ground import Z
 
 log = logging.getLogger("lslam")
 # m; coordinates beyond are those of a projection, which a trajectory in float32 plots and maps would lose centimetres of.

@@ -14,14 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config import Config, load_config
-from lslam.core.remote import as_path
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.gnss import Georeference, OutputCrs
+from lslam.core.types.run_record import Crispness, RunRecord
+from lslam.core.types.scan_result import ScanResult, Status
+from lslam.core.types.sequence import Sequence, select
+from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
-from lslam.formats.atomic import write_text
-from lslam.formats.point_files import MAP_SUFFIXES, read_cloud
-from lslam.formats.state_files import read_npz
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.point_files import MAP_SUFFIXES, read_cloud
+from lslam.io.formats.state_files import read_npz
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
+from lslam.io.remote import as_path
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
 from lslam.maps.mesh import require_open3d
@@ -39,19 +47,11 @@ from lslam.pipeline.map_files import (
 )
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
-from lslam.preprocessing.sweep_clock import SweepClock
-from lslam.preprocessing.views import Clocked
-from lslam.readers import open_sequence
+from lslam.registration.preprocessing.sweep_clock import SweepClock
+from lslam.registration.preprocessing.views import Clocked
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.reports.recording import ViewedRun
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference, OutputCrs
-from lslam.types.run_record import Crispness, RunRecord
-from lslam.types.scan_result import ScanResult, Status
-from lslam.types.sequence import Sequence, select
-from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 EVALUATION, REPORT = "evaluation.json", "report.html"

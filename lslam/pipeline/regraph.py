@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lslam.config import Config
-from lslam.config.load import load_config
-from lslam.errors import InputError, UsageError
+from lslam.core.config import Config
+from lslam.core.config.load import load_config
+from lslam.core.errors import InputError, UsageError
+from lslam.core.types.sequence import Sequence
+from lslam.io.readers import open_sequence
 from lslam.pipeline.rebuild import EarlierRun, read_run, recording_of
 from lslam.pipeline.run_folder import require_odometry
-from lslam.readers import open_sequence
-from lslam.types.sequence import Sequence
 
 # Sections that odometry does not look at.
 FREE = ("loops", "graph", "gnss", "osm", "map", "eval", "report")

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config import Config
+from lslam.core.config import Config
+from lslam.core.errors import GateError, InputError, OutputExistsError, RunFailedError, RunFinishedError, cause
 from lslam.core.printable import printable_tree, shown
-from lslam.core.remote import RemotePath
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
-from lslam.errors import GateError, InputError, OutputExistsError, RunFailedError, RunFinishedError, cause
+from lslam.core.version import __version__
+from lslam.io.remote import RemotePath
 from lslam.osm.source import extract_digest
 from lslam.pipeline.job import is_open
 from lslam.pipeline.run_folder import MANIFEST
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
-from lslam.version import __version__
 
 # Keys that change no byte of the result, or only which of its metrics are shown.
 FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")

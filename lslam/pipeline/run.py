@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.core.remote import as_path
-from lslam.errors import InputError
+from lslam.core.config import Config
+from lslam.core.errors import InputError
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
+from lslam.core.types.warned import hearing
+from lslam.io.remote import as_path
 from lslam.pipeline.deliver import in_folder, raise_outcome, write_results
 from lslam.pipeline.job import announce, prepare
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.stages import finalise_poses, score
 from lslam.pipeline.watch import RunOutcome, Watch
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
-from lslam.types.warned import hearing
 
 if TYPE_CHECKING:
     from lslam.pipeline.rebuild import EarlierRun

@@ -12,10 +12,10 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from lslam.core.errors import InputError, OutputError, OutputExistsError, cause
 from lslam.core.machine import lock
 from lslam.core.printable import file_safe
-from lslam.errors import InputError, OutputError, OutputExistsError, cause
-from lslam.formats.atomic import atomic_write
+from lslam.io.formats.atomic import atomic_write
 
 log = logging.getLogger("lslam")
 

@@ -9,17 +9,17 @@ from itertools import groupby
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.geometry import noise, se3
-from lslam.inertial.constant_velocity import ConstantVelocity
-from lslam.keyframes.store import KeyframeStore, PartOfStore
-from lslam.localization.sessions import Chain, Session, Vicinity, tie
-from lslam.localization.start import is_elsewhere
-from lslam.loops.detector import LEAST_REACH
+from lslam.backend.keyframes.store import KeyframeStore, PartOfStore
+from lslam.backend.localization.sessions import Chain, Session, Vicinity, tie
+from lslam.backend.localization.start import is_elsewhere
+from lslam.backend.loops.detector import LEAST_REACH
+from lslam.core.config import Config
+from lslam.core.geometry import noise, se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.scan_result import MotionCheck, ScanResult
+from lslam.core.types.trajectory import Segment
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.pipeline.manifest import Manifest
-from lslam.types.arrays import Floats
-from lslam.types.scan_result import MotionCheck, ScanResult
-from lslam.types.trajectory import Segment
 
 log = logging.getLogger("lslam")
 

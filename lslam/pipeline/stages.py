@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.backend.outcome import BackEnd, view_loop
-from lslam.config import Config
-from lslam.errors import LslamError
+from lslam.core.config import Config
+from lslam.core.errors import LslamError
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.sequence import Sequence
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.maps.crispness import crispness
 from lslam.odometry.base import FeatureSource
@@ -20,8 +22,6 @@ from lslam.pipeline.job import PreparedRun, stoppable
 from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.map_pass import build_map, map_checkpoints
 from lslam.pipeline.run_folder import RunFolder
-from lslam.types.run_record import RunRecord
-from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 

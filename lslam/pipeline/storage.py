@@ -7,9 +7,9 @@ import logging
 import shutil
 from pathlib import Path
 
-from lslam.core.remote import RemotePath
-from lslam.errors import LslamError, OutputError, OutputExistsError
-from lslam.kernels.cache import cache_folder
+from lslam.core.errors import LslamError, OutputError, OutputExistsError
+from lslam.core.kernels.cache import cache_folder
+from lslam.io.remote import RemotePath
 from lslam.pipeline.run_folder import CHECKPOINT, KEYFRAMES, LOCK, MANIFEST, OURS, REPLIES
 
 log = logging.getLogger("lslam")

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import Evaluation
-from lslam.formats.point_files import read_cloud
+from lslam.io.formats.point_files import read_cloud
 from lslam.pipeline.map_files import in_own_world
 from lslam.reports.figures import ON_THE_MAP, PlottedRun, draw_figure
 from lslam.reports.picture import WIDTH, as_html, drawn
 from lslam.reports.plots import first_available
 from lslam.reports.text import summary
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud
-from lslam.types.run_record import RunRecord
-from lslam.types.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

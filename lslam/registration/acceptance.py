@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.history import History
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult

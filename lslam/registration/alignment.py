@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.preprocessing.ground import Z
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
 from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, normal_equations, optimise
+from lslam.registration.preprocessing.ground import Z
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, prior_term, result_of, solve, voxel_terms

@@ -9,13 +9,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.history import History
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
-from lslam.types.stage_clock import StageClock
-from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 

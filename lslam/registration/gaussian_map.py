@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
-from lslam.kernels import gaussians
-from lslam.types.state import State, Stateful
+from lslam.core.errors import InputError
+from lslam.core.kernels import gaussians
+from lslam.core.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR = 1e-4
@@ -66,8 +66,8 @@ class GaussianMap(Stateful):
 
     def shapes(self) -> NDArray[np.float64]:
         """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
-        from lslam.kernels.discs import EXTENT2
-        from lslam.kernels.ndt_residual import describe
+        from lslam.registration.kernels.discs import EXTENT2
+        from lslam.registration.kernels.ndt_residual import describe
 
         if len(self._shapes) < len(self.keys):
             self._shapes = np.zeros((len(self.keys), 14))

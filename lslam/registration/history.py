@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.state import Stateful
 from lslam.registration.rest import Rest
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult
-from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 

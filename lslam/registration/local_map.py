@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.types.state import State, Stateful
 
 # A plane must have been seen across its beams by twice the standard deviation that it is thick: below that, a plane
 # through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.

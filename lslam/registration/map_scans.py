@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.state import Stateful
 from lslam.registration.local_map import LocalMap
-from lslam.types.state import Stateful
+from lslam.registration.preprocessing.prepare import PreparedPoints
 
 Floats = NDArray[np.float64]
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
-from lslam.kernels import facts as at
-from lslam.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
+from lslam.core.geometry import se3
+from lslam.core.kernels import facts as at
+from lslam.core.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
+from lslam.core.types.scan import LEVER_M
 from lslam.registration.robust import Annealing
-from lslam.types.scan import LEVER_M
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lslam.config.odometry import RecoveryConfig
+from lslam.core.config.odometry import RecoveryConfig
 from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt, Policy
 from lslam.registration.solver import RegistrationResult

@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RecoveryConfig, RegistrationConfig
-from lslam.errors import InputError
-from lslam.geometry import se3
-from lslam.preprocessing.prepare import prepare_points
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3
+from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import failed
 from lslam.registration.attempt import Attempt, Policy, Target
 from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
 from lslam.registration.policies import policies_of
+from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.rest_detector import RestDetector
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import VoxelTarget
-from lslam.types.stage_clock import StageClock
-from lslam.types.state import Stateful
 
 Floats = NDArray[np.float64]
 

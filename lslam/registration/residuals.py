@@ -8,11 +8,11 @@ from functools import cached_property
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from lslam.errors import UsageError, nearest
+from lslam.core.errors import UsageError, nearest
 
 if TYPE_CHECKING:
-    from lslam.preprocessing.prepare import PreparedPoints
     from lslam.registration.gaussian_map import GaussianMap
+    from lslam.registration.preprocessing.prepare import PreparedPoints
 
 Arrays = tuple[Any, ...]
 
@@ -96,18 +96,29 @@ class ResidualKind:
         return getattr(import_module(self.module), self.function)  # type: ignore[no-any-return]
 
 
-PLANE = ResidualKind("lslam.kernels.residuals", "linearise")
+PLANE = ResidualKind("lslam.core.kernels.residuals", "linearise")
 RESIDUALS = {
     "plane": PLANE,
     "point": ResidualKind(
-        "lslam.kernels.point_residual", "linearise_point", _with_gaps, is_wide=False, voxel_share=0.625, times_steps=3
+        "lslam.registration.kernels.point_residual",
+        "linearise_point",
+        _with_gaps,
+        is_wide=False,
+        voxel_share=0.625,
+        times_steps=3,
     ),
-    "gicp": ResidualKind("lslam.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True),
+    "gicp": ResidualKind(
+        "lslam.registration.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True
+    ),
     "vgicp": ResidualKind(
-        "lslam.kernels.vgicp_residual", "linearise_vgicp", _with_covariance, _counted_planes, by_surfaces=True
+        "lslam.registration.kernels.vgicp_residual",
+        "linearise_vgicp",
+        _with_covariance,
+        _counted_planes,
+        by_surfaces=True,
     ),
     "ndt": ResidualKind(
-        "lslam.kernels.ndt_residual", "linearise_ndt", _alone, _shapes, by_surfaces=True, times_steps=3
+        "lslam.registration.kernels.ndt_residual", "linearise_ndt", _alone, _shapes, by_surfaces=True, times_steps=3
     ),
 }
 # Point to point in small voxels that pass for no planes, where all axes count alike; nothing that a user chooses.

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.geometry import se3, so3
-from lslam.preprocessing.ground import ground_of, up_of
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.state import State, Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR
 from lslam.registration.local_map import BREADTH
-from lslam.types.state import State, Stateful
+from lslam.registration.preprocessing.ground import ground_of, up_of
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]

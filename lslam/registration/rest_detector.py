@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import so3
+from lslam.core.geometry import so3
+from lslam.core.types.state import Stateful
 from lslam.registration.solver import RegistrationResult
-from lslam.types.state import Stateful
 
 # Squared Mahalanobis distance of six dimensions that two poses of one place exceed once in a thousand scans.
 CHI2_LIMIT = 22.5

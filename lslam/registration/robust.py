@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from lslam.types.state import Stateful
+from lslam.core.types.state import Stateful
 
 # Of what was lately, what stays from scan to scan: a memory of five.
 FORGETTING = 0.8

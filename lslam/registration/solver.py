@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.kernels import prior_residual
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.imu import MotionState
+from lslam.core.types.motion_prior import MotionPrior
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.kernels import prior_residual
 from lslam.registration.optimiser import (
     EVERYWHERE,
     LEAST_MATCHED,
@@ -22,10 +23,9 @@ from lslam.registration.optimiser import (
     Term,
     optimise,
 )
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
-from lslam.types.imu import MotionState
-from lslam.types.motion_prior import MotionPrior
 
 Floats = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.kernels.discs import EXTENT2, source_discs
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.kernels.discs import EXTENT2, source_discs
 
 # m; a sparse sensor's neighbouring rings share a cell of the second size, where the first holds one of them.
 CELL = 1.0

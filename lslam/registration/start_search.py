@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
-from lslam.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
-from lslam.preprocessing.prepare import PreparedPoints, subset, thin
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
 from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
 from lslam.registration.attempt import NEAR_KERNEL, Attempt
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Correspondences, Limits, optimise
+from lslam.registration.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
+from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thin
 from lslam.registration.residuals import MEANS
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve, voxel_terms

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.preprocessing.beams import ring_gap
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
 from lslam.registration.map_scans import MapScans, make_map_scans
 from lslam.registration.optimiser import optimise
+from lslam.registration.preprocessing.beams import ring_gap
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of

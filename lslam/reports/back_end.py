@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lslam.core.geometry import se3
 from lslam.core.printable import counted, metres
-from lslam.geometry import se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.comparison import Table
+from lslam.core.types.run_record import LoopView, RunRecord
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
 from lslam.reports.map_view import PIXELS, Crop, crop_images
 from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart
-from lslam.types.arrays import Floats
-from lslam.types.comparison import Table
-from lslam.types.run_record import LoopView, RunRecord
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

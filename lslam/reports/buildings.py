@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lslam.core.geometry import se2
 from lslam.core.printable import counted
-from lslam.geometry import se2
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
+from lslam.core.types.comparison import Table
+from lslam.core.types.run_record import RunRecord
 from lslam.reports.plots import Figure
 from lslam.reports.svg import MOST_POINTS, Track, plane_chart
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
-from lslam.types.comparison import Table
-from lslam.types.run_record import RunRecord
 
 MOST_WALLS = 2500  # drawn; the page stays small
 MOST_ROWS = 60

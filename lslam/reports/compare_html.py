@@ -11,9 +11,11 @@ from urllib.parse import quote
 
 import numpy as np
 
-from lslam.errors import LslamError
-from lslam.formats.atomic import atomic_write
-from lslam.formats.point_files import read_cloud
+from lslam.core.errors import LslamError
+from lslam.core.types.arrays import Floats
+from lslam.core.types.comparison import Comparison, Drawing, DrawnRun, RunScore
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.point_files import read_cloud
 from lslam.reports import svg
 from lslam.reports.compare_table import recipes, tables
 from lslam.reports.html import flatten
@@ -22,8 +24,6 @@ from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.shell import render
 from lslam.reports.svg import Track, plane_chart
-from lslam.types.arrays import Floats
-from lslam.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 
 WIDEST = 125  # characters of a table that the page shows without scrolling
 STYLES = 12

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core.printable import counted, fixed, metres
-from lslam.formats.atomic import write_text
+from lslam.core.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import write_text
 from lslam.reports.evaluations import strict
 from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
-from lslam.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
-from lslam.version import __version__
 
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "mean time per scan", "health": "scans and runs"}

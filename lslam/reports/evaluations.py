@@ -13,13 +13,13 @@ from dataclasses import asdict
 from typing import Any
 
 from lslam.core.printable import significant
+from lslam.core.types.run_record import Crispness, RunRecord
+from lslam.core.version import __version__
 from lslam.evaluation.evaluate import METRICS, shown_metrics
 from lslam.evaluation.metric import MetricRow
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.reports.grid_text import comma_separated, latex, markdown
-from lslam.types.run_record import Crispness, RunRecord
-from lslam.version import __version__
 
 SCHEMA, VERSION = "lslam-evaluation", 1
 Document = dict[str, Any]

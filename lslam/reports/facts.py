@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan_result import ScanResult
 from lslam.evaluation.timing import StageTime, summarise
-from lslam.types.arrays import Floats
-from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
 
 DIRECTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
 

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError, nearest
-from lslam.geometry import geodesy, se3, so3
+from lslam.core.errors import InputError, UsageError, nearest
+from lslam.core.geometry import geodesy, se3, so3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import CorrectedMap
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.run_record import FeatureView
+from lslam.core.types.trajectory import Trajectory
 from lslam.reports.picture import COLOURS, label, shown_figure
 from lslam.reports.plots import first_available
-from lslam.types.arrays import Floats
-from lslam.types.building import CorrectedMap
-from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference
-from lslam.types.imu import ImuStream
-from lslam.types.run_record import FeatureView
-from lslam.types.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

@@ -9,8 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.comparison import Table
+from lslam.core.types.imu import XYZ
+from lslam.core.types.run_record import Crispness, RunRecord
 from lslam.evaluation.evaluate import shown_metrics
-from lslam.formats.atomic import atomic_write
+from lslam.io.formats.atomic import atomic_write
 from lslam.reports import plots, svg
 from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.reports.buildings import building_pages
@@ -22,10 +26,6 @@ from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render, template
 from lslam.reports.svg import Track
 from lslam.reports.text import imu_rows, localization_rows
-from lslam.types.arrays import Floats, Longs
-from lslam.types.comparison import Table
-from lslam.types.imu import XYZ
-from lslam.types.run_record import Crispness, RunRecord
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.run_record import FeatureView
 from lslam.reports import svg
 from lslam.reports.plots import Figure
 from lslam.reports.png import coloured_png, data_uri, density_png, halved, usual_range
 from lslam.reports.svg import MOST_POINTS, By, Track, plane_chart
-from lslam.types.arrays import Floats, Longs
-from lslam.types.run_record import FeatureView
 
 SIZE_M = 20.0
 MOST_CROPS = 3

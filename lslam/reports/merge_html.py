@@ -8,7 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core.printable import metres
-from lslam.formats.atomic import atomic_write
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.comparison import Table
+from lslam.io.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.reports.compare_html import style_of
 from lslam.reports.map_view import MapFigure, map_figure
@@ -17,9 +20,6 @@ from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render
 from lslam.reports.svg import Track, plane_chart
-from lslam.types.arrays import Floats, Longs
-from lslam.types.cloud import ArrayCloud
-from lslam.types.comparison import Table
 
 MOST_POSES = 5000  # of a session that the script draws
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."

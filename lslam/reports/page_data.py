@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Trajectory
 from lslam.reports.plots import first_available
 from lslam.reports.png import VIRIDIS, usual_range
-from lslam.types.arrays import Floats
-from lslam.types.cloud import ArrayCloud
-from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

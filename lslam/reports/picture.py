@@ -11,16 +11,16 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lslam.core.errors import UsageError
 from lslam.core.printable import printable
-from lslam.errors import UsageError
-from lslam.formats.atomic import atomic_write
+from lslam.io.formats.atomic import atomic_write
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from lslam.core.types.arrays import Floats
     from lslam.evaluation.results import AbsoluteError, Evaluation
-    from lslam.formats.osm_buildings import BuildingExtract
-    from lslam.types.arrays import Floats
+    from lslam.io.formats.osm_buildings import BuildingExtract
 
 
 FORMATS = ("png", "svg", "pdf")

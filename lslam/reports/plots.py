@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
+from lslam.core.types.run_record import RunRecord
 from lslam.reports import svg
 from lslam.reports.facts import RunFacts, stage_matrix
 from lslam.reports.svg import By, Track, plane_chart
-from lslam.types.arrays import Floats
-from lslam.types.run_record import RunRecord
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import AbsoluteError, Evaluation

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import OutputError, cause
 from lslam.core.extras import importing, install_hint
-from lslam.errors import OutputError, cause
-from lslam.types.cloud import ArrayCloud
-from lslam.types.trajectory import Trajectory
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.trajectory import Trajectory
 
 MOST_POINTS = 2_000_000  # what a viewer turns smoothly
 _ESTIMATE, _ODOMETRY = (31, 119, 180), (214, 39, 40)

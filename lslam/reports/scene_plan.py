@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.atomic import atomic_write
+from lslam.io.formats.atomic import atomic_write
 from lslam.reports.picture import house_style
 from lslam.simulation.plan import COARSE, COLOURS, FINE, PATH
 

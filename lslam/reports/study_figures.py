@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lslam.config.config import unit_of, with_unit
+from lslam.core.config.config import unit_of, with_unit
+from lslam.core.types.arrays import Floats
+from lslam.core.types.study import CurveResult, Law, StudyResult, StudyRow
 from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
 from lslam.evaluation.laws import band
 from lslam.reports.picture import COLOURS, house_style, label, pictures
-from lslam.types.arrays import Floats
-from lslam.types.study import CurveResult, Law, StudyResult, StudyRow
 
 POINTS = ("o", ".", "x")  # markers; lines without say nothing
 LOST = "x"

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.config import with_unit
+from lslam.core.config.config import with_unit
 from lslam.core.printable import counted, fixed, metres
+from lslam.core.types.study import CurveResult, Interval, Law, StudyResult, StudyRow
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.curves import normalise
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.evaluations import strict
 from lslam.reports.grid_text import Grid
-from lslam.types.study import CurveResult, Interval, Law, StudyResult, StudyRow
 
 UNKNOWN = "-"
 LABELS = {"ate_se3": "ATE se3", "ate_origin": "ATE origin", "thesis_rmse": "thesis_rmse"}

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lslam.core.printable import counted, metres
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.stage_clock import summed
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.reports.back_end import back_end_rows, before_and_after
 from lslam.reports.facts import Failure, RunFacts, run_facts
-from lslam.types.run_record import RunRecord
-from lslam.types.stage_clock import summed
 
 if TYPE_CHECKING:
     from lslam.evaluation.results import Evaluation

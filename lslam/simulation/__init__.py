@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lslam.errors import OutputError, OutputExistsError, cause
+from lslam.core.errors import OutputError, OutputExistsError, cause
 
 NUMBER = "00"  # of the one sequence in the folder
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
+from lslam.core.types.arrays import Floats
 from lslam.simulation import path as paths
 from lslam.simulation.carpark import build_carpark
 from lslam.simulation.city import City, build_city
@@ -37,7 +38,6 @@ from lslam.simulation.scene_mesh import RayScene, Surface
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 from lslam.simulation.waypoints import WayPoints
-from lslam.types.arrays import Floats
 
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
 SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.ROOF)

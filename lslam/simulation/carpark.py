@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
+from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout
 from lslam.simulation.countryside import add_house, add_wall
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-from lslam.types.arrays import Floats
 
 # A LiDAR's beam of 3 mrad lights a spot some 3 cm wide and 20 cm long on the ground 10 m away: smaller bumps it averages.
 BUMP = 0.25  # m from one bump of the ground to the next

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from lslam.config.section import Section
-from lslam.geometry import portable
+from lslam.core.config.section import Section
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-from lslam.types.arrays import Floats
 
 KERB = 0.12  # m
 MARGIN = 60.0  # m of ground beyond the street on every side

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.geometry import portable
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.city import City, Layout, add_ground
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.houses import house
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-from lslam.types.arrays import Floats
 
 RAIL = (0.45, 0.75)  # m, the lower and the upper edge of a guard rail
 VERGE = -0.06  # m, of grass beside a road without kerbs

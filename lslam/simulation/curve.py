@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable
-from lslam.types.arrays import Floats
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 
 DEGREE = 5
 _REACH = 60  # points from one end after which nothing of it is left: an influence falls by 0.43 from knot to knot
@@ -22,7 +22,7 @@ def interpolating_spline(x: NDArray[Any], y: NDArray[Any], closed: bool = False)
     """
     from scipy.interpolate import BSpline
 
-    from lslam.kernels.banded import solve_banded
+    from lslam.simulation.kernels.banded import solve_banded
 
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if closed:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import portable, se3, so3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import portable, se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import RouteCurve, interpolating_spline, smoothed
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.terrain import Terrain, flat
-from lslam.types.arrays import Floats
 
 GRAVITY = 9.81  # m/s2, for the bank of a turn
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.geometry import portable
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_faces, tube
-from lslam.types.arrays import Floats
 
 BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.geometry import portable
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface
-from lslam.types.arrays import Floats
 
 Quad = list[tuple[float, float, float]]
 

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydantic import Field
 
-from lslam.config.section import Section
-from lslam.errors import UsageError, nearest
-from lslam.geometry import portable, se3, so3
+from lslam.core.config.section import Section
+from lslam.core.errors import UsageError, nearest
+from lslam.core.geometry import portable, se3, so3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.imu import ImuStream
 from lslam.simulation.kinematics import Kinematics, Motion
-from lslam.types.arrays import Floats
-from lslam.types.imu import ImuStream
 
 GRAVITY = 9.80665  # m/s2, downwards along the city's -z
 

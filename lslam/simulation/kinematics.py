@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from lslam.config.section import Section
-from lslam.geometry import portable, se3, so3
+from lslam.core.config.section import Section
+from lslam.core.geometry import portable, se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import interpolating_spline
-from lslam.types.arrays import Floats
 
 SPACING = 0.02  # s between the knots: scans at 10 Hz fall on knots, where the spline meets the path exactly
 STANDING_ACCELERATION = 2.0  # m/s2, the most that moving off from a standing start adds

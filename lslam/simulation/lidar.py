@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Bools, Floats
+from lslam.core.types.scan import Scan
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
 from lslam.simulation.scene_mesh import RayScene, Surface
-from lslam.types.arrays import Bools, Floats
-from lslam.types.scan import Scan
 
 # Share of the light of a 905 nm laser that comes back from each surface met squarely.
 REFLECTIVITY = np.zeros(len(Surface), np.float32)

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lslam.config.section import Section
-from lslam.errors import UsageError, nearest
-from lslam.geometry import portable, se3, so3
-from lslam.types.arrays import Floats
+from lslam.core.config.section import Section
+from lslam.core.errors import UsageError, nearest
+from lslam.core.geometry import portable, se3, so3
+from lslam.core.types.arrays import Floats
 
 
 @dataclass(frozen=True)

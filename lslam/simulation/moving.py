@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable, se3
+from lslam.core.geometry import portable, se3
+from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture
 from lslam.simulation.city import KERB
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.lidar import MovingMesh
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface, tube
 from lslam.simulation.terrain import Terrain
-from lslam.types.arrays import Floats
 
 MODELS = 6  # different cars and different people
 BUS = (11.0, 2.5, 3.3)  # m

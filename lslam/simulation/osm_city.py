@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from lslam.errors import InputError
-from lslam.geometry import portable
+from lslam.core.errors import InputError
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
 from lslam.simulation.city import KERB, MARGIN, City, Layout, Lots, add_garden_trees, add_street_furniture
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, Footprint, footprint_polygon, is_canopy
 
 CELL = 1.0  # m, of the ground
 MOST_CELLS = 1_500_000

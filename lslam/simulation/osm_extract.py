@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, OutputError, cause
-from lslam.formats.osm_buildings import buildings_of, height_of
-from lslam.formats.osm_data import DECIMALS, AreaMaker, OsmData, Place
-from lslam.formats.osm_files import write_osm
-from lslam.geometry.geodesy import from_local
+from lslam.core.errors import InputError, OutputError, cause
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, footprints_of
+from lslam.io.formats.osm_buildings import buildings_of, height_of
+from lslam.io.formats.osm_data import DECIMALS, AreaMaker, OsmData, Place
+from lslam.io.formats.osm_files import write_osm
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_perturb import MapFaults, Perturbation, draw_perturbation, perturb, write_perturbation
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, footprints_of
 
 EXACT, PERTURBED = "map.osm", "map_perturbed.osm"
 RECORD = "truth/map_perturbation.json"  # below truth/: no method may read it

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.errors import InputError
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, Footprint, footprint_polygon, footprints_of
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.errors import InputError
-from lslam.formats.atomic import write_text
-from lslam.geometry import portable
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, Footprint, footprint_polygon, footprints_of
+from lslam.io.formats.atomic import write_text
 
 SCHEMA = "lslam-osm-perturbation-1"
 

@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
-from lslam.formats.osm_buildings import BuildingExtract, distance_text, read_buildings, right_place
-from lslam.formats.osm_data import OsmData
-from lslam.geometry import portable
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.building import Building, footprint_polygon
+from lslam.io.formats.osm_buildings import BuildingExtract, distance_text, read_buildings, right_place
+from lslam.io.formats.osm_data import OsmData
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.moving import Mover
 from lslam.simulation.osm_city import OsmCity, build_osm_city
@@ -23,8 +25,6 @@ from lslam.simulation.routes import TIGHTEST, Route, beside, given_route
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.waypoints import WayPoints
-from lslam.types.arrays import Floats, Longs
-from lslam.types.building import Building, footprint_polygon
 
 log = logging.getLogger("lslam")
 

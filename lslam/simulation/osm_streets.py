@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.osm_buildings import is_underground
-from lslam.formats.osm_data import OsmData
-from lslam.geometry.geodesy import to_local
+from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import Building, footprint_polygon, is_canopy
+from lslam.io.formats.osm_buildings import is_underground
+from lslam.io.formats.osm_data import OsmData
 from lslam.simulation.curve import RouteCurve, smooth_curve
-from lslam.types.arrays import Floats
-from lslam.types.building import Building, footprint_polygon, is_canopy
 
 _ROADS = ("motorway", "trunk", "primary", "secondary", "tertiary")
 DRIVABLE = (

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable, se3, so3
+from lslam.core.geometry import portable, se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import RouteCurve, interpolating_spline
 from lslam.simulation.terrain import Terrain
-from lslam.types.arrays import Floats
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.simulation.city import City
 from lslam.simulation.scene_mesh import RayScene, Surface
-from lslam.types.arrays import Floats, Longs
 
 Image = NDArray[np.uint8]
 

@@ -18,19 +18,19 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core.errors import OutputError, OutputExistsError, cause
+from lslam.core.types.scan import Scan
 from lslam.core.untrusted import parse_json
-from lslam.errors import OutputError, OutputExistsError, cause
-from lslam.formats.atomic import write_text
-from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, scan_files, write_calib, write_scan, write_times
-from lslam.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
-from lslam.formats.trajectory_files import write_kitti
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.kitti_layout import PER_POINT, POINTS, in_camera, scan_files, write_calib, write_scan, write_times
+from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
+from lslam.io.formats.trajectory_files import write_kitti
 from lslam.simulation import NUMBER, check_target, part_of
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.sensors import GNSS_FILE, IMU_FILE, TRUTH, write_readings, write_truth
-from lslam.types.scan import Scan
-from lslam.version import __version__
 
 MANIFEST = "manifest.json"
 SCHEMA = 1

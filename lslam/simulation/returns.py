@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lslam.config.section import Section
-from lslam.geometry import portable
+from lslam.core.config.section import Section
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Bools, Floats
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.scene_mesh import SceneMesh, Surface
-from lslam.types.arrays import Bools, Floats
 
 Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
 LAYERS = 8  # surfaces of volumes that a beam passes, at most

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.errors import UsageError
-from lslam.geometry import portable
+from lslam.core.errors import UsageError
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.indoors import room_line, stairs_line
 from lslam.simulation.path import SpeedProfile, drive, suspension
 from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
 from lslam.simulation.terrain import flat
 from lslam.simulation.waypoints import WayPoints
-from lslam.types.arrays import Floats
 
 SPARE = 60.0  # m of street before the start and after the end of an open line
 TURN = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock

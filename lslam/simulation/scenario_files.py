@@ -10,19 +10,19 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from lslam.config.load import setting_value, shipped
-from lslam.config.section import Section
+from lslam.core.config.load import setting_value, shipped
+from lslam.core.config.section import Section
+from lslam.core.errors import ConfigError, InputError, UsageError, cause, nearest
+from lslam.core.geometry import portable
 from lslam.core.printable import toml_text
+from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import parse_toml
-from lslam.errors import ConfigError, InputError, UsageError, cause, nearest
-from lslam.formats.kitti_layout import PER_POINT, POINTS
-from lslam.geometry import portable
+from lslam.io.formats.kitti_layout import PER_POINT, POINTS
 from lslam.simulation.city import Layout
 from lslam.simulation.imu import ImuFaults
 from lslam.simulation.kinematics import Vibration
 from lslam.simulation.lidar_models import LIDARS, LidarMount
 from lslam.simulation.returns import Returns
-from lslam.types.arrays import Floats
 
 Shape = Callable[[np.random.Generator], Floats]
 

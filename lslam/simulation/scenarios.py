@@ -11,8 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import portable, se3, so3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import portable, se3, so3
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Calibration, Scans
+from lslam.core.types.trajectory import Trajectory
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
 from lslam.simulation.imu import ImuModel, imu_named
@@ -26,12 +32,6 @@ from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.scene_mesh import RayScene
 from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
 from lslam.simulation.waypoints import WayPoints, read_way_points
-from lslam.types.arrays import Floats, Longs
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import ImuStream
-from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Scans
-from lslam.types.trajectory import Trajectory
 
 FASTEST = 40.0  # m/s
 LONGEST_STAND = 600.0  # s

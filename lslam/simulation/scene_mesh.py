@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable
-from lslam.types.arrays import Floats, Longs
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats, Longs
 
 
 class Surface(IntEnum):

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.errors import UsageError
+from lslam.core.geometry import geodesy, portable, se3
 from lslam.core.printable import toml_text
-from lslam.errors import UsageError
-from lslam.formats.atomic import write_text
-from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv
-from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import geodesy, portable, se3
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv
+from lslam.io.formats.trajectory_files import write_tum
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
 from lslam.simulation.kinematics import Motion
-from lslam.types.arrays import Floats, Longs
-from lslam.types.gnss import GnssStream
-from lslam.types.trajectory import Trajectory
 
 # lat, lon (deg), height (m) of the city's origin unless a scenario has its own: open ground at Karlsruhe.
 ORIGIN = np.array([49.0, 8.4, 115.0])

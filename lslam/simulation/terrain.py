@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable
-from lslam.types.arrays import Floats
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 
 
 @dataclass(frozen=True)

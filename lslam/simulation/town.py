@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.geometry import portable
+from lslam.core.geometry import portable
+from lslam.core.types.arrays import Floats
 from lslam.simulation.city import (
     KERB,
     City,
@@ -22,7 +23,6 @@ from lslam.simulation.city import (
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
-from lslam.types.arrays import Floats
 
 SHORTEST = 30.0  # m of a side street
 LONGEST = 110.0

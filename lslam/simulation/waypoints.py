@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.errors import InputError, cause, nearest
+from lslam.core.geometry import portable
+from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
-from lslam.errors import InputError, cause, nearest
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import portable
-from lslam.geometry.geodesy import to_local
-from lslam.types.arrays import Floats
+from lslam.io.formats.trajectory_files import read_trajectory
 
 APART = 3.0  # m between the way-points taken from a trajectory
 LONGEST = 50_000.0  # m between neighbours

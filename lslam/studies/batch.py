@@ -9,18 +9,18 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from lslam.config import Config
-from lslam.config.study import BatchConfig, BatchJob, parse_batch
+from lslam.core.config import Config
+from lslam.core.config.study import BatchConfig, BatchJob, parse_batch
+from lslam.core.errors import InputError, UsageError
 from lslam.core.printable import file_safe, toml_text
-from lslam.errors import InputError, UsageError
+from lslam.core.types.sequence import Sequence as Recording
+from lslam.core.types.trajectory import Trajectory
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
 from lslam.studies.expanded_study import ExpandedStudy, check_same
 from lslam.studies.grid import Cell, Job, cells_of, expand, label_of, run_folder
 from lslam.studies.output import BATCH, OutputOptions
 from lslam.studies.subjects import unique_labels
 from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, settings_of
-from lslam.types.sequence import Sequence as Recording
-from lslam.types.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -17,15 +17,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lslam.core.errors import InputError, OutputError, RunFailedError, UsageError, cause
 from lslam.core.extras import install_command
-from lslam.core.remote import RemotePath, as_path
 from lslam.core.untrusted import whole_number
-from lslam.errors import InputError, OutputError, RunFailedError, UsageError, cause
+from lslam.core.version import __version__
+from lslam.io.remote import RemotePath, as_path
 from lslam.studies.grid import Job
 from lslam.studies.jobs import clear_attempt, ensure_state, simulate_scenes
 from lslam.studies.runner import StudyProgress
 from lslam.studies.worker import WorkerContext, execute
-from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 _ANSWER_S, _WORKERS_S = 10, 30

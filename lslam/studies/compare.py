@@ -11,13 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.config.outputs import EvalConfig
-from lslam.errors import InterruptedRunError, LslamError
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import InterruptedRunError, LslamError
+from lslam.core.types.arrays import Floats
+from lslam.core.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
+from lslam.core.types.sequence import Sequence as Recording
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import AbsoluteError
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.readers import open_sequence
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.reports import compare_html, compare_table
 from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
 from lslam.studies.jobs import finished, pool_of, run_jobs
@@ -27,10 +31,6 @@ from lslam.studies.plan import Plan, check_plan
 from lslam.studies.results import IMU, collect_run, metrics_of
 from lslam.studies.runner import StudyProgress
 from lslam.studies.subjects import Scene, Subject, scans_needed, simulate_once, with_range
-from lslam.types.arrays import Floats
-from lslam.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
-from lslam.types.sequence import Sequence as Recording
-from lslam.types.trajectory import Trajectory
 
 log = logging.getLogger("lslam")
 PREFERRED = EvalConfig(align=("se3", "origin"))

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.errors import RunFailedError
 from lslam.core.printable import lasting
-from lslam.errors import RunFailedError
-from lslam.readers import open_sequence
+from lslam.core.types.arrays import Floats
+from lslam.io.readers import open_sequence
 from lslam.studies.grid import Job
 from lslam.studies.jobs import Local
 from lslam.studies.results import Results
@@ -22,7 +23,6 @@ from lslam.studies.runner import StudyProgress
 from lslam.studies.subjects import drive_of, simulate_once, used
 from lslam.studies.sweep import write_study_report
 from lslam.studies.variants import Variant
-from lslam.types.arrays import Floats
 
 # Scans of the shorter and the longer pilot: what they differ by is what scans cost, the rest what a run costs by itself.
 _SHORT, _LONG = 12, 36

@@ -6,17 +6,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lslam.config.load import read_toml
+from lslam.core.config.load import read_toml
+from lslam.core.errors import InterruptedRunError, LslamError, OutputExistsError
+from lslam.core.types.study import StudyRow
 from lslam.core.untrusted import parse_toml
-from lslam.errors import InterruptedRunError, LslamError, OutputExistsError
-from lslam.formats.atomic import write_text
+from lslam.io.formats.atomic import write_text
 from lslam.studies.grid import Job
 from lslam.studies.jobs import Engine, finished
 from lslam.studies.output import OutputOptions, lock_output, release_output
 from lslam.studies.results import Results
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import Variant
-from lslam.types.study import StudyRow
 
 
 @dataclass(frozen=True)

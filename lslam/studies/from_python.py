@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from lslam.core.types.comparison import Comparison
 from lslam.reports import compare_table
 from lslam.reports.picture import as_html
 from lslam.studies import compare as compared
@@ -14,7 +15,6 @@ from lslam.studies.output import COMPARISON, require_free
 from lslam.studies.plan import Plan
 from lslam.studies.subjects import find_subjects
 from lslam.studies.variants import Imu, find_variants
-from lslam.types.comparison import Comparison
 
 
 @dataclass(frozen=True)

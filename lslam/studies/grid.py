@@ -7,23 +7,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lslam.config import Config
-from lslam.config.input import AS_CONFIGURED, ScanRange
-from lslam.config.study import StudySequence
+from lslam.core.config import Config
+from lslam.core.config.input import AS_CONFIGURED, ScanRange
+from lslam.core.config.study import StudySequence
+from lslam.core.errors import InputError, UsageError
 from lslam.core.printable import file_safe
-from lslam.core.remote import RemotePath, as_path
-from lslam.errors import InputError, UsageError
-from lslam.formats.bag_listing import stem_of
+from lslam.io.formats.bag_listing import stem_of
+from lslam.io.readers import open_sequence
+from lslam.io.readers.lookup import find_folder
+from lslam.io.readers.raw_drive import with_imu
+from lslam.io.remote import RemotePath, as_path
 from lslam.pipeline.resume import imu_digest, input_digest, job_digest, listing_digest
-from lslam.readers import open_sequence
-from lslam.readers.lookup import find_folder
-from lslam.readers.raw_drive import with_imu
 from lslam.studies.output import SIMULATED, OutputOptions
 from lslam.studies.subjects import Scene, check_range, drive_of, scans_needed, scene_digest, scene_folder, with_range
 from lslam.studies.variants import Variant, free_name
 
 if TYPE_CHECKING:
-    from lslam.types.trajectory import Trajectory
+    from lslam.core.types.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from lslam.core.remote import RemotePath
+from lslam.io.remote import RemotePath
 from lslam.pipeline.storage import spool_of
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state

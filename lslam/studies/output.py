@@ -6,7 +6,7 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.errors import OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import OutputError, OutputExistsError, UsageError, cause
 
 SIMULATED = "simulated"
 # The file that makes a folder one of ours.

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from lslam.types.comparison import Paired, RunScore, Spread, SummaryRow
+from lslam.core.types.comparison import Paired, RunScore, Spread, SummaryRow
 
 TIE_M = 0.01
 FEWEST_PAIRS = 6

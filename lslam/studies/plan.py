@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
 
 if TYPE_CHECKING:
+    from lslam.core.types.trajectory import Trajectory
     from lslam.studies.subjects import Subject
     from lslam.studies.variants import Variant
-    from lslam.types.trajectory import Trajectory
 
 ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
 

@@ -12,19 +12,19 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import InputError
 from lslam.core.extras import install_command
-from lslam.core.remote import RemotePath
+from lslam.core.types.comparison import Group, Metric, RunScore
+from lslam.core.types.study import StudyRow
 from lslam.core.untrusted import parse_json
-from lslam.errors import InputError
 from lslam.evaluation.evaluate import METRICS
 from lslam.evaluation.timing import Timing, read_timing
+from lslam.io.remote import RemotePath
 from lslam.reports.compare_table import HEALTH
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import FINAL, State, read_state, read_study_csv, write_study_csv, write_study_parquet
 from lslam.studies.variants import Variant
-from lslam.types.comparison import Group, Metric, RunScore
-from lslam.types.study import StudyRow
 
 log = logging.getLogger("lslam")
 

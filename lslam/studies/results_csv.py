@@ -16,12 +16,12 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
 
-from lslam.config.study import StudyMetric
+from lslam.core.config.study import StudyMetric
+from lslam.core.errors import InputError, cause
 from lslam.core.printable import printable_tree
+from lslam.core.types.study import StudyRow, Value
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.errors import InputError, cause
-from lslam.formats.atomic import atomic_write, write_text
-from lslam.types.study import StudyRow, Value
+from lslam.io.formats.atomic import atomic_write, write_text
 
 # What a repetition would end with again; everything else is tried anew.
 FINAL = ("done", "degraded", "diverged")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lslam.config.load import shipped
-from lslam.config.study import StudyConfig, parse_study, read_study
+from lslam.core.config.load import shipped
+from lslam.core.config.study import StudyConfig, parse_study, read_study
+from lslam.core.errors import UsageError, nearest
 from lslam.core.untrusted import parse_toml
-from lslam.errors import UsageError, nearest
 
 
 def study_names() -> tuple[str, ...]:

@@ -7,9 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.config.study import ExpectedFinding, StudyConfig, read_study
+from lslam.core.config.study import ExpectedFinding, StudyConfig, read_study
+from lslam.core.errors import InputError, RunFailedError
 from lslam.core.printable import toml_text
-from lslam.errors import InputError, RunFailedError
+from lslam.core.types.study import StudyResult, StudyRow
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
 from lslam.studies.jobs import Engine
@@ -18,7 +19,6 @@ from lslam.studies.results import RESULTS
 from lslam.studies.results_csv import read_study_csv
 from lslam.studies.runner import StudyProgress
 from lslam.studies.variants import study_variants
-from lslam.types.study import StudyResult, StudyRow
 
 log = logging.getLogger("lslam")
 

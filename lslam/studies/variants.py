@@ -10,11 +10,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lslam.config import Config, load_config
-from lslam.config.load import known_presets
-from lslam.config.study import Point, StudyConfig
+from lslam.core.config import Config, load_config
+from lslam.core.config.load import known_presets
+from lslam.core.config.study import Point, StudyConfig
+from lslam.core.errors import ConfigError, UsageError, nearest
 from lslam.core.printable import file_safe
-from lslam.errors import ConfigError, UsageError, nearest
 from lslam.odometry import Coupling, coupling_of, known_methods
 from lslam.pipeline.check import check_config
 

@@ -18,9 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.core.remote import RemotePath
-from lslam.core.stopping import current, is_interrupt
-from lslam.errors import (
+from lslam.core.errors import (
     GateError,
     InputError,
     InterruptedRunError,
@@ -29,12 +27,14 @@ from lslam.errors import (
     RunFailedError,
     RunFinishedError,
 )
+from lslam.core.stopping import current, is_interrupt
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence, SequenceView
+from lslam.io.remote import RemotePath
 from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
 from lslam.pipeline.storage import spool_of
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, write_state
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence, SequenceView
 
 # Bytes of scans a process keeps at most, and its share of what was free when it began.
 _MOST, _SHARE = 2 * 10**9, 0.2
@@ -237,7 +237,7 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
 
 
 def _opening(job: Job) -> Callable[[], Sequence]:
-    from lslam.readers import open_sequence
+    from lslam.io.readers import open_sequence
     from lslam.studies.subjects import simulate_once
 
     def opening() -> Sequence:

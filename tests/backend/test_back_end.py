@@ -13,19 +13,19 @@ from stub_sequences import Stub
 
 from lslam.backend import optimise
 from lslam.backend.added_drift import with_drift
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
-from lslam.config import Config, load_config
-from lslam.formats.g2o import write_g2o
-from lslam.geometry import geodesy, se3, so3
-from lslam.geometry.se3 import umeyama
-from lslam.keyframes.store import KeyframeStore
-from lslam.types.constraint import Constraint, LoopCandidate
-from lslam.types.gnss import GnssStream
-from lslam.types.imu import GravityDirection, ImuDiagnostics
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Calibration
-from lslam.types.trajectory import Keyframe
+from lslam.core.config import Config, load_config
+from lslam.core.geometry import geodesy, se3, so3
+from lslam.core.geometry.se3 import umeyama
+from lslam.core.types.constraint import Constraint, LoopCandidate
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.imu import GravityDirection, ImuDiagnostics
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.g2o import write_g2o
 
 # Two laps of 400 m, a scan each metre, a keyframe every other scan.
 Floats = NDArray[np.float64]

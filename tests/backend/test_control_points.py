@@ -9,14 +9,14 @@ import pytest
 
 from lslam.backend.control_points import contradicting, control_residuals, where_held, with_control
 from lslam.backend.georeferencing import Placement
-from lslam.config import Config
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
+from lslam.core.config import Config
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.constraint import ControlPoint, Instant
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Keyframe
 from lslam.maps.georeference import Projection, to_wgs84
-from lslam.types.constraint import ControlPoint, Instant
-from lslam.types.gnss import Georeference
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Keyframe
 
 ORIGIN = np.array([49.0112, 8.4229, 115.0])
 TRUE = Georeference(ORIGIN, se3.make(so3.exp(np.array([0.0, 0.0, 0.7])), np.array([30.0, -12.0, 2.0])), 25832)

@@ -9,9 +9,9 @@ import pytest
 
 from lslam.backend.final_checks import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.backend.fix_faults import Fixes
-from lslam.geometry import geodesy
-from lslam.types.constraint import ControlPoint, Instant
-from lslam.types.gnss import Georeference
+from lslam.core.geometry import geodesy
+from lslam.core.types.constraint import ControlPoint, Instant
+from lslam.core.types.gnss import Georeference
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 POINTS = [ControlPoint(Instant("line 2", scan=0), np.zeros(3), np.full(3, 0.05), 25832)] * 3

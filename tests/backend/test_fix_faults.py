@@ -10,15 +10,15 @@ import pytest
 from stub_sequences import Stub
 
 from lslam.backend.georeferencing import Placement, place
-from lslam.config import Config
-from lslam.geometry import geodesy, se3, so3
-from lslam.graph.fix_errors import NO_HEIGHT
-from lslam.graph.odometry_constraints import odometry_constraints
-from lslam.graph.problem import PoseGraph
-from lslam.types.gnss import GnssStream
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Calibration
-from lslam.types.trajectory import Keyframe
+from lslam.backend.graph.fix_errors import NO_HEIGHT
+from lslam.backend.graph.odometry_constraints import odometry_constraints
+from lslam.backend.graph.problem import PoseGraph
+from lslam.core.config import Config
+from lslam.core.geometry import geodesy, se3, so3
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Keyframe
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 COUNT = 400

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.levelling import floor_planes, up_directions, world_up
-from lslam.config.backend import GraphConfig
-from lslam.geometry import se3, so3
-from lslam.keyframes.store import KeyframeStore
-from lslam.types.imu import GravityDirection, ImuDiagnostics
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Keyframe
+from lslam.core.config.backend import GraphConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import GravityDirection, ImuDiagnostics
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Keyframe
 
 
 def ground(height: float, tilt: float = 0.0) -> np.ndarray:

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from stub_sequences import Stub
 
 from lslam.backend.levelling import find_level, level_results
-from lslam.config import Config, load_config
+from lslam.core.config import Config, load_config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import GravityDirection, ImuDiagnostics
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.frontend.register_scans import to_trajectory
-from lslam.geometry import se3, so3
-from lslam.types.imu import GravityDirection, ImuDiagnostics
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Trajectory
+from lslam.odometry.frontend.register_scans import to_trajectory
 
 Floats = NDArray[np.float64]
 TILT = so3.from_euler_rpy(np.deg2rad([7.0, -11.0, 0.0]))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import AROUND, BackEnd, view_loop
-from lslam.geometry import se3
-from lslam.keyframes.store import KeyframeStore
+from lslam.core.geometry import se3
+from lslam.core.types.constraint import Constraint, LoopCandidate, Verdict
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.trajectory import Keyframe, Trajectory
 from lslam.reports.back_end import loop_figures
-from lslam.types.constraint import Constraint, LoopCandidate, Verdict
-from lslam.types.run_record import RunRecord
-from lslam.types.trajectory import Keyframe, Trajectory
 
 COUNT, DRIFT, WALL = 60, 0.05, 7.0
 SOLVED = BackEnd([], [], constraints=[Constraint(0, 1, np.eye(4), np.eye(6))])

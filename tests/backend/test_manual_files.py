@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.manual import read_control_points, read_named_pairs
-from lslam.errors import InputError
+from lslam.core.errors import InputError
 
 PAIRS = "scan_a,scan_b,verdict\n"
 POINTS = "scan,x,y,z,sigma,crs\n"

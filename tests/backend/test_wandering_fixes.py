@@ -12,17 +12,17 @@ import pytest
 from stub_sequences import Stub
 from test_back_end import CITY, COUNT, EVERY, LOOPS, ORIGIN, candidate, config, drifted, on_earth, recording, store_of
 
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.manual import KeyframePairs
 from lslam.backend.optimise import run_back_end
-from lslam.frontend.checkpoints import Checkpoints
-from lslam.geometry import geodesy, se3
-from lslam.geometry.se3 import umeyama
-from lslam.keyframes.store import KeyframeStore
+from lslam.core.geometry import geodesy, se3
+from lslam.core.geometry.se3 import umeyama
+from lslam.core.types.constraint import LoopCandidate
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.pipeline import back_end_pass
 from lslam.simulation.sensors import GnssModel
 from lslam.simulation.sensors import _errors as gnss_errors
-from lslam.types.constraint import LoopCandidate
-from lslam.types.stage_clock import KeyframeClocks
 
 
 def wandering(seed: int) -> Stub:

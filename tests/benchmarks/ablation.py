@@ -31,15 +31,15 @@ from recorded import thinned
 from scores import ate, origin, rotation_rpe
 from sparse import length
 
-from lslam.config import load_config
-from lslam.errors import UsageError
-from lslam.frontend import tracker
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.core.config import load_config
+from lslam.core.errors import UsageError
+from lslam.core.types.scan import Scan
 from lslam.odometry import create_odometry, feature_policies
+from lslam.odometry.frontend import tracker
+from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.registration import local_map, residuals, solver, start_search
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
 
 Floats = NDArray[np.float64]
 Case = tuple[str, list[Scan], Floats]

@@ -20,7 +20,7 @@ from peers import PEERS, drive
 from recorded import Case, thinned
 from scores import ate, rotation_rpe
 
-from lslam.geometry import se3
+from lslam.core.geometry import se3
 from lslam.simulation.scenarios import simulate
 
 PEERS_SHOWN = ("icp", "kiss-icp", "small-gicp")

@@ -16,7 +16,7 @@ import tables
 from methods import judged
 from traced import Traced, traced
 
-from lslam.types.scan import Scan
+from lslam.core.types.scan import Scan
 
 METHODS = "icp,icp+preprocess.least_line=0,kiss-icp,small-gicp"
 # m, to either side, ahead and behind, and above the ground, which is so far below the sensor.

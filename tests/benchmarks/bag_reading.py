@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence
+from lslam.io.readers import open_sequence
 from lslam.pipeline.convert.convert_sequence import convert_sequence
-from lslam.readers import open_sequence
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
 
 
 class Repeated:

@@ -18,13 +18,13 @@ import tables
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config import load_config
-from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import se3, so3
+from lslam.core.config import load_config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import write_tum
 from lslam.pipeline.localise_pass import Reanchoring
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 FIRST, SPEED = 120, 14.0

@@ -22,23 +22,23 @@ from numpy.typing import NDArray
 from recorded import PLACES, TRUTH_AT_S
 from scores import ate, origin
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.load import load_config
-from lslam.errors import LslamError
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.point_times import with_point_times
-from lslam.geometry import se3, so3
-from lslam.geometry.se3 import poses_at
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.load import load_config
+from lslam.core.errors import LslamError
+from lslam.core.geometry import se3, so3
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Calibration, Sequence
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
+from lslam.odometry.frontend.point_times import with_point_times
 from lslam.pipeline.deliver import in_folder
 from lslam.pipeline.job import prepare
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.watch import Watch
-from lslam.readers import open_sequence
 from lslam.simulation.scenarios import simulate
-from lslam.types.imu import ImuStream
-from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Sequence
-from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 

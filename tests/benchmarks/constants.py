@@ -28,44 +28,53 @@ import numpy as np
 import tables
 from constant_drives import ROOT, RUNS, load
 
-from lslam.config.load import load_config
+from lslam.core.config.load import load_config
 
 # What a scan passes: files, and which runs tell of their numbers.
 PATH: dict[str, tuple[str, ...]] = {
     "points": (
-        "registration/*.py", "frontend/tracker.py", "frontend/segments.py", "frontend/joint.py", "frontend/scene_scale.py",
-        "inertial/constant_velocity.py", "odometry/sanity.py", "odometry/uncertainty.py", "odometry/deskew_uncertainty.py",
-        "frontend/windows.py", "inertial/course.py",
-        "odometry/scan_outcome.py", "odometry/icp.py", "preprocessing/prepare.py", "preprocessing/deskew.py",
-        "preprocessing/ground.py", "preprocessing/weather_filter.py", "kernels/gauss_newton.py", "kernels/gaussians.py",
-        "kernels/residuals.py", "kernels/ground.py", "kernels/voxel.py",
+        "registration/*.py", "odometry/frontend/tracker.py", "odometry/frontend/segments.py", "odometry/frontend/joint.py",
+        "odometry/frontend/scene_scale.py", "odometry/inertial/constant_velocity.py", "odometry/sanity.py",
+        "odometry/uncertainty.py", "odometry/deskew_uncertainty.py", "odometry/frontend/windows.py",
+        "odometry/inertial/course.py", "odometry/scan_outcome.py", "odometry/icp.py",
+        "registration/preprocessing/prepare.py", "registration/preprocessing/deskew.py",
+        "registration/preprocessing/ground.py", "registration/preprocessing/weather_filter.py",
+        "core/kernels/gauss_newton.py", "core/kernels/gaussians.py", "core/kernels/residuals.py", "core/kernels/ground.py",
+        "core/kernels/voxel.py",
     ),
     "features": (
-        "odometry/feature_*.py", "odometry/loam.py", "preprocessing/features.py", "kernels/curvature.py",
-        "kernels/feature_grid.py", "kernels/feature_residuals.py", "kernels/lines.py",
+        "odometry/feature_*.py", "odometry/loam.py", "registration/preprocessing/features.py",
+        "registration/kernels/curvature.py", "odometry/kernels/feature_grid.py", "odometry/kernels/feature_residuals.py",
+        "odometry/kernels/lines.py",
     ),
     "imu": (
-        "inertial/fusion.py", "inertial/gyroscope.py", "inertial/imu_estimate.py", "inertial/imu_noise.py",
-        "inertial/saturation.py", "inertial/initialise.py", "inertial/integrate.py",
+        "odometry/inertial/fusion.py", "odometry/inertial/gyroscope.py", "odometry/inertial/imu_estimate.py",
+        "odometry/inertial/imu_noise.py", "odometry/inertial/saturation.py", "odometry/inertial/initialise.py",
+        "odometry/inertial/integrate.py",
     ),
-    "checks": ("integrity/*.py", "types/scan_result.py"),
+    "checks": ("odometry/integrity/*.py", "core/types/scan_result.py"),
 }  # fmt: skip
 # Of other methods, of `localize`, of the whole recording, of what is off unless asked for, and what is no quantity: dimensions,
 # indices, marks, bits, constants of nature.
 NOT_OF_IT = {
     "registration/source_covariance.py", "registration/map_scans.py", "registration/acceptance.py MAP_MIN_OVERLAP",
     "registration/acceptance.py MAP_MIN_INLIERS", "registration/voxel_target.py SPARSE_SHARE",
-    "registration/start_search.py NO_PLANES", "kernels/voxel.py OFFSET", "kernels/voxel.py MASK", "kernels/gaussians.py FREE",
-    "kernels/gaussians.py EMPTY", "kernels/gaussians.py BLOB", "kernels/ground.py EMPTY", "kernels/lines.py NO_LINE",
-    "kernels/curvature.py EDGE", "kernels/curvature.py LESS_EDGE", "kernels/curvature.py NEITHER",
-    "kernels/curvature.py LESS_PLANE", "kernels/curvature.py PLANE", "preprocessing/features.py MAY_BE_EDGE",
-    "preprocessing/features.py MAY_BE_FLAT", "preprocessing/features.py MAY_BE_PLANE", "inertial/imu_estimate.py GRAVITY",
-    "integrity/alerts.py AXES", "preprocessing/ground.py Z", "inertial/integrate.py PERFECT", "inertial/gyroscope.py MOUNTING",
-    "registration/optimiser.py EVERYWHERE", "odometry/feature_solver.py NONE", "preprocessing/prepare.py NO_TIMES",
-    "kernels/gaussians.py USED", "kernels/gaussians.py FREED", "kernels/gaussians.py HAND", "kernels/gaussians.py LIVE",
-    "frontend/scene_scale.py USUAL_RANGE_M", "integrity/directions.py _ROWS", "integrity/directions.py _COLUMNS",
-    "inertial/gyroscope.py MOUNTING_SIGMA", "inertial/gyroscope.py OFFSET_SIGMA", "inertial/gyroscope.py OFFSET_WALK",
-    "registration/optimiser.py LEAST_MATCHED", "inertial/imu_estimate.py PLACE_NOISE", "inertial/imu_estimate.py TURN_NOISE",
+    "registration/start_search.py NO_PLANES", "core/kernels/voxel.py OFFSET", "core/kernels/voxel.py MASK",
+    "core/kernels/gaussians.py FREE", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
+    "core/kernels/ground.py EMPTY", "odometry/kernels/lines.py NO_LINE", "registration/kernels/curvature.py EDGE",
+    "registration/kernels/curvature.py LESS_EDGE", "registration/kernels/curvature.py NEITHER",
+    "registration/kernels/curvature.py LESS_PLANE", "registration/kernels/curvature.py PLANE",
+    "registration/preprocessing/features.py MAY_BE_EDGE", "registration/preprocessing/features.py MAY_BE_FLAT",
+    "registration/preprocessing/features.py MAY_BE_PLANE", "odometry/inertial/imu_estimate.py GRAVITY",
+    "odometry/integrity/alerts.py AXES", "registration/preprocessing/ground.py Z",
+    "odometry/inertial/integrate.py PERFECT", "odometry/inertial/gyroscope.py MOUNTING",
+    "registration/optimiser.py EVERYWHERE", "odometry/feature_solver.py NONE",
+    "registration/preprocessing/prepare.py NO_TIMES", "core/kernels/gaussians.py USED", "core/kernels/gaussians.py FREED",
+    "core/kernels/gaussians.py HAND", "core/kernels/gaussians.py LIVE", "odometry/frontend/scene_scale.py USUAL_RANGE_M",
+    "odometry/integrity/directions.py _ROWS", "odometry/integrity/directions.py _COLUMNS",
+    "odometry/inertial/gyroscope.py MOUNTING_SIGMA", "odometry/inertial/gyroscope.py OFFSET_SIGMA",
+    "odometry/inertial/gyroscope.py OFFSET_WALK", "registration/optimiser.py LEAST_MATCHED",
+    "odometry/inertial/imu_estimate.py PLACE_NOISE", "odometry/inertial/imu_estimate.py TURN_NOISE",
 }  # fmt: skip
 # Keys of sections that every scan passes, those that the scene's size decides aside.
 KEYS = {
@@ -80,7 +89,7 @@ KEYS = {
         "registration.weak_share",
     ),
 }  # fmt: skip
-CONFIG = {"preprocess": "config/input.py", "registration": "config/odometry.py"}
+CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odometry.py"}
 COSINES = {"UPRIGHT"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
 LACK = {"FORGETTING", "RELAXING", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
@@ -152,7 +161,7 @@ def is_number(value: ast.expr) -> bool:
 def changed(name: str, file: str, text: str, factor: float) -> str:
     """The expression of another value."""
     short = name.split(".")[-1]
-    folder = file.split("/")[0]
+    folder = Path(file).parent.name
     kinds = {short, f"{short} {folder}"}
     if kinds & COSINES:
         return f"float(np.cos({factor} * np.arccos({text})))"
@@ -217,7 +226,7 @@ def measure(work: Path, wanted: list[Number]) -> dict[str, Any]:
         for word, factor in FACTORS.items():
             if word in kept:
                 continue
-            if number.file.startswith("config/"):
+            if number.file.startswith("core/config/"):
                 kept[word] = run_with(package, work, number.runs, [key_changed(number.name, factor)])
             else:
                 file = package / "lslam" / number.file
@@ -225,7 +234,7 @@ def measure(work: Path, wanted: list[Number]) -> dict[str, Any]:
                 file.write_text(edited(before, number, factor), encoding="utf-8")
                 kept[word] = run_with(package, work, number.runs, [])
                 file.write_text(before, encoding="utf-8")
-                if number.file.startswith("kernels/"):
+                if "/kernels/" in number.file:
                     for folder in set((work / "kernels").iterdir()) - shipped_kernels:
                         shutil.rmtree(folder)
                 os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))

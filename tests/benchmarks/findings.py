@@ -16,9 +16,9 @@ from pathlib import Path
 
 import tables
 
+from lslam.core.types.study import StudyResult
 from lslam.studies.study_files import find_study, study_names
 from lslam.studies.sweep import report_folder
-from lslam.types.study import StudyResult
 
 
 def swept(study: str, seeds: list[int], folder: Path) -> list[StudyResult]:

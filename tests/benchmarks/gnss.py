@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 from traced import Traced, run_on, traced
 
-from lslam.geometry import geodesy, se3
-from lslam.geometry.se3 import umeyama
+from lslam.core.geometry import geodesy, se3
+from lslam.core.geometry.se3 import umeyama
 from lslam.simulation.sensors import ORIGIN, GnssModel
 
 Floats = NDArray[np.float64]

@@ -12,8 +12,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from graph_builders import ate, graph_of, truth
 
-from lslam.config.backend import GraphConfig
-from lslam.graph.pose_graph import optimise
+from lslam.backend.graph.pose_graph import optimise
+from lslam.core.config.backend import GraphConfig
 
 LAPS = 10
 

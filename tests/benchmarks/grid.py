@@ -31,20 +31,20 @@ from scores import ate, rotation_rpe
 from traced import Traced
 
 from lslam import Registration
-from lslam.config import load_config
-from lslam.config.load import known_presets
-from lslam.errors import RunFailedError
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.geometry.se3 import poses_at
+from lslam.core.config import load_config
+from lslam.core.config.load import known_presets
+from lslam.core.errors import RunFailedError
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.pipeline.run import RunOutcome, Watch, run
-from lslam.readers import open_sequence
 from lslam.simulation import NUMBER
 from lslam.simulation.record import record
 from lslam.simulation.scenario_files import scenario_names
 from lslam.simulation.scenarios import simulate
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 OURS = ("icp", "icp-point", "gicp", "vgicp", "ndt", "loam", "loam-odom", "floam", "lego-loam")
 PEERS = ("kiss-icp", "small-gicp", "small-vgicp", "genz-icp")

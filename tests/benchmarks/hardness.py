@@ -29,13 +29,13 @@ from recorded import untwisted
 from scores import rotation_rpe
 
 from lslam import Registration
-from lslam.config import Config
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.core.config import Config
+from lslam.core.geometry import se3
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.maps.crispness import crispness
 from lslam.maps.merge import MapMerger
 from lslam.odometry import create_odometry
-from lslam.readers import open_sequence
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

@@ -21,16 +21,16 @@ import numpy as np
 import tables
 from numpy.typing import NDArray
 
-from lslam.config import load_config
-from lslam.errors import LslamError
+from lslam.core.config import load_config
+from lslam.core.errors import LslamError
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.pipeline.run import run
-from lslam.readers import open_sequence
 from lslam.studies.subjects import Scene, simulate_once
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 # Poses (N, 4, 4) in any world, and seconds per scan (N,).

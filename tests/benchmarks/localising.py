@@ -23,13 +23,13 @@ import tables
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config import load_config
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.geometry.se3 import umeyama
-from lslam.keyframes.store import KeyframeStore
-from lslam.localization.place_search import PlaceSearch
-from lslam.localization.start import PlaceFinder
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.localization.place_search import PlaceSearch
+from lslam.backend.localization.start import PlaceFinder
+from lslam.core.config import load_config
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import umeyama
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.pipeline.prior_map_files import read_prior_map
 from lslam.simulation.record import record
 from lslam.simulation.routes import FIRST_VISIT, Visit

@@ -16,8 +16,8 @@ import tables
 from scores import ate, origin
 from traced import run_on, traced
 
-from lslam.errors import LslamError
-from lslam.geometry import se3
+from lslam.core.errors import LslamError
+from lslam.core.geometry import se3
 
 
 def main() -> None:

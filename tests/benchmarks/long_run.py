@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.readers import open_sequence
+from lslam.io.readers import open_sequence
 
 WINDOWS = 10
 STAGES = ("read", "prepare", "register", "update", "keyframe", "back end: loops")

@@ -14,8 +14,8 @@ import tables
 from gnss import KINDS
 from traced import Traced, run_on, traced
 
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.types.trajectory import Trajectory
 
 
 def judged(drive: Traced, settings: list[str]) -> tuple[float, float, int]:

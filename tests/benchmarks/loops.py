@@ -16,17 +16,17 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.backend import KeyframesConfig, LoopsConfig
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
-from lslam.keyframes.select import keyframe_cloud
-from lslam.keyframes.store import KeyframeStore
-from lslam.loops.find_loops import find_loops
-from lslam.loops.scan_context import PlaceIndex
+from lslam.backend.keyframes.select import keyframe_cloud
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.loops.find_loops import find_loops
+from lslam.backend.loops.scan_context import PlaceIndex
+from lslam.core.config.backend import KeyframesConfig, LoopsConfig
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.trajectory import Keyframe
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.trajectory import Keyframe
 
 Floats = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ import time
 
 import numpy as np
 
-from lslam.errors import UsageError
-from lslam.geometry.se3 import poses_at
+from lslam.core.errors import UsageError
+from lslam.core.geometry.se3 import poses_at
+from lslam.io.readers import open_sequence
 from lslam.maps import merge
 from lslam.pipeline.map_pass import motion_within
-from lslam.preprocessing.deskew import deskew_points
-from lslam.readers import open_sequence
+from lslam.registration.preprocessing.deskew import deskew_points
 
 
 def main() -> None:

@@ -20,17 +20,17 @@ import tables
 from tight import cell, one
 from traced import Traced
 
-from lslam.geometry import se3
-from lslam.inertial import imu_cleaning, saturation
-from lslam.inertial.course import Course
-from lslam.inertial.filter import FilterMotion
-from lslam.inertial.fusion import InertialMotion
+from lslam.core.geometry import se3
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.trajectory import Trajectory
 from lslam.odometry import elastic_constraints, lips, loam_livox, plane_association, plane_factors, plane_segmentation
 from lslam.odometry.elastic_constraints import NOTHING, LastSweep
+from lslam.odometry.inertial import imu_cleaning, saturation
+from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.filter import FilterMotion
+from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.imu import ImuStream
-from lslam.types.trajectory import Trajectory
 
 Patch = tuple[object, str, Any]
 

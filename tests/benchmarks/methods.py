@@ -15,7 +15,7 @@ from collections import Counter
 import tables
 from traced import Traced, run_on, traced
 
-from lslam.errors import LslamError
+from lslam.core.errors import LslamError
 
 METHODS = (
     "icp,icp-point,gicp,vgicp,ndt,icp-svd,loam-odom,loam,loam+recovery.fallback=all-points,floam,lego-loam,"

@@ -19,9 +19,9 @@ import numpy as np
 import tables
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.errors import LslamError
-from lslam.geometry import geodesy, se3, so3
+from lslam.core.config.config import Config
+from lslam.core.errors import LslamError
+from lslam.core.geometry import geodesy, se3, so3
 from lslam.pipeline.run import RunOutcome, run
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.osm_perturb import MapFaults

@@ -30,13 +30,13 @@ import tables
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config import Config
-from lslam.config.load import load_config
+from lslam.core.config import Config
+from lslam.core.config.load import load_config
+from lslam.core.geometry import geodesy, se2
 from lslam.evaluation.thesis import planar
 from lslam.evaluation.timing import read_timing_rows
-from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy, se2
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import map_errors, read_perturbation

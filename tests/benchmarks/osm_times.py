@@ -16,19 +16,19 @@ from time import thread_time
 import numpy as np
 from osm import SPACING, true_poses
 
-from lslam.config.backend import KeyframesConfig, OsmConfig
-from lslam.config.input import PreprocessConfig
-from lslam.formats.osm_buildings import read_buildings
-from lslam.geometry import se2
-from lslam.keyframes.select import keyframe_cloud
-from lslam.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.select import keyframe_cloud
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.config.backend import KeyframesConfig, OsmConfig
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import se2
+from lslam.core.types.building import KeyframeMatch
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.readers import open_sequence
 from lslam.osm.location import see_walls
 from lslam.osm.wall_match import match_buildings, match_keyframe, warm_up
 from lslam.osm.walls import OsmMap
-from lslam.readers import open_sequence
-from lslam.types.building import KeyframeMatch
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.trajectory import Keyframe
 
 SIGMA = np.array([0.7, 0.7, np.radians(1.5)])
 LIMITS = {"wall extraction": 20.0, "global match": 50.0, "local match": 1.0}

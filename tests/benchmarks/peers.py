@@ -20,18 +20,18 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import Config, load_config
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.geometry import se3
-from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.core.config import Config, load_config
+from lslam.core.geometry import se3
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
 from lslam.odometry import create_odometry, small_gicp
 from lslam.odometry import open3d as open3d_method
+from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.sanity import measurable
-from lslam.preprocessing.prepare import clean_points
-from lslam.preprocessing.rings import decide_rings
-from lslam.types.imu import ImuStream
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
+from lslam.registration.preprocessing.prepare import clean_points
+from lslam.registration.preprocessing.rings import decide_rings
 
 Floats = NDArray[np.float64]
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

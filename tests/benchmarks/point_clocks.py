@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.input import PreprocessConfig
-from lslam.frontend.point_times import with_point_times
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.types.scan import Scan
+from lslam.odometry.frontend.point_times import with_point_times
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
 
 COUNT, SECONDS = 26, 0.1
 LIDAR = replace(LIDARS["vlp16"], columns=900)

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import Config
-from lslam.config.input import PreprocessConfig
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.point_times import with_point_times
-from lslam.frontend.register_scans import estimate
-from lslam.geometry.se3 import poses_at
+from lslam.core.config import Config
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
-from lslam.preprocessing.deskew import deskew_points, knots_over
-from lslam.preprocessing.rings import decide_rings
-from lslam.readers import open_sequence
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
+from lslam.odometry.frontend.point_times import with_point_times
+from lslam.odometry.frontend.register_scans import estimate
+from lslam.registration.preprocessing.deskew import deskew_points, knots_over
+from lslam.registration.preprocessing.rings import decide_rings
 
 Floats = NDArray[np.float64]
 # Name, clouds, true poses (N, 4, 4).

@@ -36,9 +36,9 @@ READER = """
 import time
 from pathlib import Path
 import numpy as np
-from lslam.types.sequence import Calibration
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 FILE = "sleep.txt"
 GRID = np.stack(np.meshgrid(np.arange(1, 21), np.arange(1, 21), [0.0]), -1).reshape(-1, 3).astype(np.float32)
 class Sleeping:

@@ -20,10 +20,10 @@ import tables
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config import load_config
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.geometry.se3 import umeyama
+from lslam.core.config import load_config
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import umeyama
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.pipeline.merged_folder import merge_into
 from lslam.pipeline.watch import Watch
 from lslam.simulation.record import record

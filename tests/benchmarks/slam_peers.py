@@ -21,10 +21,10 @@ import numpy as np
 from inertial_peers import score, shares_of, truth_of
 from numpy.typing import NDArray
 
-from lslam.config import load_config
+from lslam.core.config import load_config
+from lslam.core.types.sequence import Sequence
+from lslam.io.readers import open_sequence
 from lslam.pipeline.run import run
-from lslam.readers import open_sequence
-from lslam.types.sequence import Sequence
 
 WORKER = Path(__file__).with_name("kiss_slam_worker.py")
 

@@ -29,7 +29,7 @@ from peers import CORES, LOOKED_AT, OURS, PEERS, Beginning, timed
 from recorded import PLACES
 from speed_tables import Rounds, rows_of_processes, rows_of_ratios, rows_of_times, rows_published
 
-from lslam.readers import open_sequence
+from lslam.io.readers import open_sequence
 
 Floats = NDArray[np.float64]
 INSIDE = ("velodyne_points/data", "velodyne", "data", ".")

@@ -15,15 +15,15 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import load_config
-from lslam.frontend.register_scans import estimate
-from lslam.kernels import voxel
+from lslam.core.config import load_config
+from lslam.core.kernels import voxel
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence
+from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
-from lslam.preprocessing.prepare import NO_TIMES
-from lslam.readers import open_sequence
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence
+from lslam.odometry.frontend.register_scans import estimate
+from lslam.registration.preprocessing.prepare import NO_TIMES
 
 Floats = NDArray[np.float64]
 

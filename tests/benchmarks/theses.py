@@ -15,7 +15,7 @@ from itertools import product
 import tables
 from traced import Traced, run_on, traced
 
-from lslam.errors import LslamError
+from lslam.core.errors import LslamError
 from lslam.evaluation.associate import associate
 from lslam.evaluation.thesis import axis_errors
 

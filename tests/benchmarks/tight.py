@@ -28,11 +28,11 @@ from nees import errors, nees
 from numpy.typing import NDArray
 from traced import Traced, run_on, traced
 
-from lslam.errors import LslamError
-from lslam.formats.atomic import write_text
-from lslam.geometry import se3
+from lslam.core.errors import LslamError
+from lslam.core.geometry import se3
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.atomic import write_text
 from lslam.simulation.sensors import GnssModel
-from lslam.types.trajectory import Trajectory
 
 SCENARIOS = "walk,urban-hard,residential-hard,corridor,carpark,quadrotor,stairs"
 METHODS = "icp,icp+imu.use=true,fast-lio2,dlo+imu.use=true,rko-lio"

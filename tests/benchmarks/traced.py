@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from lslam.config import load_config
+from lslam.core.config import load_config
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
 
 
 class Traced:

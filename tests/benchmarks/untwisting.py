@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from recorded import PLACES
 from scores import rotation_rpe
 
-from lslam.config import load_config
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry.se3 import poses_at
+from lslam.core.config import load_config
+from lslam.core.geometry.se3 import poses_at
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.pipeline.run import run
-from lslam.readers import open_sequence
 
 METHODS = "icp,gicp,vgicp,ndt,icp-point,loam,floam,loam-odom"
 

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.backend import OsmConfig
+from lslam.core.config.backend import OsmConfig
+from lslam.io.readers import open_sequence
 from lslam.maps.merge import MapMerger
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer
-from lslam.readers import open_sequence
 
 
 def help_ms(tries: int = 10) -> float:

@@ -19,17 +19,17 @@ import numpy as np
 from scores import ate
 
 from lslam.backend import added_drift
+from lslam.backend.loops.find_loops import find_loops
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
-from lslam.config import Config, load_config
+from lslam.core.config import Config, load_config
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.associate import associate
-from lslam.frontend.register_scans import to_trajectory
-from lslam.loops.find_loops import find_loops
+from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.pipeline.job import prepare
 from lslam.pipeline.odometry_pass import estimate_poses
 from lslam.pipeline.watch import Watch
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Trajectory
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 

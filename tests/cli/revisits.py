@@ -11,9 +11,9 @@ from calling import lslam
 from made_once import MadeOnce
 from numpy.typing import NDArray
 
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.geometry.se3 import umeyama
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import umeyama
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.simulation.record import record
 from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenarios import SimulatedDrive, simulate

@@ -14,8 +14,8 @@ import pytest
 from calling import COMMAND, Done, assert_one_sentence, environment, lslam, sample_copy
 
 from lslam.cli.batch import _line, command
-from lslam.config.study import BatchConfig, read_batch
-from lslam.errors import ConfigError, LslamError, OutputExistsError
+from lslam.core.config.study import BatchConfig, read_batch
+from lslam.core.errors import ConfigError, LslamError, OutputExistsError
 from lslam.studies.batch import expand_batch, run_words
 from lslam.studies.output import OutputOptions
 from lslam.studies.results_csv import read_study_csv

@@ -11,7 +11,7 @@ from unittest import mock
 import pytest
 from calling import Done, lslam, sample_copy
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
 from lslam.studies.results_csv import read_study_csv
 from lslam.studies.subjects import unique_labels
 

@@ -19,7 +19,7 @@ import pytest
 from calling import COMMAND, SAMPLE, assert_one_sentence, environment, lslam, sample_copy, strict_json
 
 from lslam.cli.compare import command
-from lslam.errors import InputError, UsageError
+from lslam.core.errors import InputError, UsageError
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from calling import SAMPLE, assert_one_sentence, lslam, manifest, strict_json
 
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.readers import open_sequence
+from lslam.core.geometry import se3
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 
 CALIB = SAMPLE / "sequences" / "00" / "calib.txt"
 POSES = SAMPLE / "poses" / "00.txt"

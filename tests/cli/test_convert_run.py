@@ -23,9 +23,9 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial import cKDTree
 from shapely.geometry.base import BaseGeometry
 
-from lslam.formats.trajectory_files import read_trajectory, write_tum
-from lslam.geometry import se3, so3
-from lslam.geometry.geodesy import from_local
+from lslam.core.geometry import se3, so3
+from lslam.core.geometry.geodesy import from_local
+from lslam.io.formats.trajectory_files import read_trajectory, write_tum
 from lslam.pipeline.convert.convert_run import PATHS, convert_run
 from lslam.pipeline.rebuild import open_scans, read_run
 

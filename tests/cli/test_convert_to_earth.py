@@ -14,11 +14,11 @@ from defusedxml import ElementTree
 from fastkml import KML
 from fastkml.utils import find_all
 
-from lslam.formats.stamp_texts import utc_of
-from lslam.formats.trajectory_files import read_trajectory, write_tum
-from lslam.geometry import se3
-from lslam.geometry.geodesy import from_local
-from lslam.types.trajectory import Trajectory
+from lslam.core.geometry import se3
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.stamp_texts import utc_of
+from lslam.io.formats.trajectory_files import read_trajectory, write_tum
 
 KML_NS, GX_NS = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"
 GPX_NS = "{http://www.topografix.com/GPX/1/1}"

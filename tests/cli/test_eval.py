@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from calling import Done, lslam
 
-from lslam.formats.trajectory_files import write_euroc, write_kitti, write_tum
-from lslam.geometry import se3
-from lslam.types.trajectory import Trajectory
+from lslam.core.geometry import se3
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import write_euroc, write_kitti, write_tum
 
 
 def evaluated(*words: object) -> Done:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, manifest, strict_json
 
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
+from lslam.core.types.gnss import Georeference
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.maps.georeference import Projection
-from lslam.readers import open_sequence
-from lslam.types.gnss import Georeference
 
 # 4 % and 12 deg/100 m: beyond the gates of loops and beyond what odometry may drift.
 DRIFT = ("--set", "debug.drift=true", "--set", "debug.drift_percent=4", "--set", "debug.drift_deg_per_100m=12")

@@ -12,14 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import SAMPLE, lslam
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
 from sequence_builders import cloud, kitti_root, raw_drive
 
-from lslam.formats.stamped_csv import read_imu_csv, write_imu_csv
+from lslam.core.types.imu import ImuStream
+from lslam.io.formats.stamped_csv import read_imu_csv, write_imu_csv
+from lslam.io.readers import open_sequence
 from lslam.pipeline.doctor.inspect import inspect
-from lslam.readers import open_sequence
-from lslam.types.imu import ImuStream
 
 
 def test_page_and_json(tmp_path: Path) -> None:

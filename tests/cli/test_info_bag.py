@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bag_builders import KINDS, START_NS, SUFFIX, bag, clouds, imu, together, transforms
 from calling import assert_one_sentence, lslam, strict_json
 from rosbags.highlevel import AnyReader
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "readers"))
-from bag_builders import KINDS, START_NS, SUFFIX, bag, clouds, imu, together, transforms
-
-from lslam.formats.bag_files import Bag, open_bag
+from lslam.io.formats.bag_files import Bag, open_bag
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.doctor.inspect import examine_bag

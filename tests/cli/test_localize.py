@@ -12,10 +12,10 @@ from calling import SAMPLE, assert_one_sentence, lslam, strict_json
 from made_once import MadeOnce
 from revisits import Floats, frame_from_town, place_visits, town_poses
 
-from lslam.formats.point_files import read_cloud, write_cloud
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.types.cloud import ArrayCloud
+from lslam.core.geometry import se3
+from lslam.core.types.cloud import ArrayCloud
+from lslam.io.formats.point_files import read_cloud, write_cloud
+from lslam.io.formats.trajectory_files import read_trajectory
 
 GRID = np.array([512_000.0, 5_427_000.0, 0.0])
 

@@ -12,7 +12,7 @@ import pytest
 from calling import COMMAND, assert_one_sentence, environment, lslam, lslam_process, strict_json
 
 from lslam.cli.main import COMMANDS
-from lslam.config.odometry import TIGHTLY_COUPLED
+from lslam.core.config.odometry import TIGHTLY_COUPLED
 from lslam.odometry import METHODS
 
 
@@ -30,7 +30,7 @@ def test_help_is_instant_and_imports_nothing_heavy() -> None:
     # Debian's interpreter has a sitecustomize of its own.
     assert {root for root in roots if not root.startswith("_")} - {"sitecustomize"} == {"lslam", "click"}
     ours = {name for name in imported if name.split(".")[0] == "lslam"}
-    small = {"lslam.errors", "lslam.core", "lslam.core.machine", "lslam.core.stopping", "lslam.version"}
+    small = {"lslam.core.errors", "lslam.core", "lslam.core.machine", "lslam.core.stopping", "lslam.core.version"}
     assert ours == {"lslam", "lslam.cli", "lslam.cli.main", *small}
     # A bare interpreter has some 30 modules, click and what it needs of the standard library some 80.
     assert len(imported) < 200

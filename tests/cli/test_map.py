@@ -15,16 +15,16 @@ import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, sample_copy, strict_json
 
 from lslam.cli.main import cli
-from lslam.errors import InputError, LslamError, OutputError
-from lslam.formats.point_files import read_cloud
-from lslam.geometry.geodesy import from_local
+from lslam.core.errors import InputError, LslamError, OutputError
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.gnss import Georeference
+from lslam.io.formats.point_files import read_cloud
+from lslam.io.readers import open_sequence
 from lslam.pipeline import rebuild
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.map_files import georeference_note
 from lslam.pipeline.run_folder import held
-from lslam.readers import open_sequence
-from lslam.types.gnss import Georeference
 
 COUNT = 10
 

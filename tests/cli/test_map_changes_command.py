@@ -13,15 +13,15 @@ from made_once import MadeOnce
 from numpy.typing import NDArray
 from revisits import place_visits, town_poses, visit_drive
 
-from lslam.formats.point_files import read_points
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.geometry.se3 import umeyama
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import umeyama
+from lslam.core.types.gnss import Georeference
+from lslam.io.formats.point_files import read_points
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
-from lslam.types.gnss import Georeference
 
 # Length, width and height of the box, m: well below a whole number of cells of 0.4 m, so that noise fills no further one.
 BOX = np.array([1.7, 1.3, 1.3])

@@ -13,18 +13,18 @@ from calling import SAMPLE, assert_one_sentence, lslam, strict_json
 from made_once import MadeOnce
 from revisits import frame_from_town, place_visits, run, town_poses
 
-from lslam.config import load_config
-from lslam.errors import InterruptedRunError
-from lslam.formats.point_files import read_cloud
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
-from lslam.geometry.se3 import umeyama
-from lslam.localization.sessions import by_georeference
+from lslam.backend.localization.sessions import by_georeference
+from lslam.core.config import load_config
+from lslam.core.errors import InterruptedRunError
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import umeyama
+from lslam.core.types.gnss import Georeference
+from lslam.io.formats.point_files import read_cloud
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps.georeference import Projection
 from lslam.pipeline.merge_runs import read_session
 from lslam.pipeline.merged_folder import merge_into
 from lslam.pipeline.watch import Watch
-from lslam.types.gnss import Georeference
 
 SAME = ("sessions/monday-run.tum", "sessions/tuesday-run.tum", "loops.csv", "graph.g2o", "map.ply")
 

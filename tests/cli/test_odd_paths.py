@@ -13,8 +13,8 @@ import pytest
 from calling import SAMPLE, lslam, manifest
 
 from lslam.core.printable import printable
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.readers import open_sequence
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux",

@@ -16,7 +16,7 @@ from calling import SAMPLE, assert_one_sentence, environment, lslam, lslam_proce
 from click.testing import CliRunner
 
 from lslam.cli.main import cli
-from lslam.errors import LslamError
+from lslam.core.errors import LslamError
 
 FAKE = Path(__file__).resolve().parents[1] / "osm" / "overpass_server.py"
 VILLAGE = Path(__file__).resolve().parents[1] / "simulation" / "osm_village.py"

@@ -10,7 +10,7 @@ import pytest
 from calling import SAMPLE, assert_one_sentence, lslam
 
 import lslam as lslam_api
-from lslam.config import load_config
+from lslam.core.config import load_config
 from lslam.evaluation.results import AbsoluteError
 from lslam.pipeline.plot_run import plotted_run
 from lslam.reports.figures import draw_figure

@@ -25,8 +25,8 @@ from calling import (
     strict_json,
 )
 
-from lslam.formats.point_files import read_points
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.io.formats.point_files import read_points
+from lslam.io.formats.trajectory_files import read_trajectory
 
 ALL = {
     "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply", "map.json", "timing.csv", "scans.csv",

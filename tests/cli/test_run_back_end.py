@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, manifest, sample_copy, strict_json
 
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy
+from lslam.core.geometry import geodesy
+from lslam.io.formats.trajectory_files import read_trajectory
 
 PART = ("--count", 40, "-q", "--set", "map.write=false", "--set", "report.html=false")
 

@@ -15,10 +15,10 @@ import pytest
 from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest, sample_copy, strict_json
 from point_writers import write_points
 
-from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import se3, so3
-from lslam.readers import open_sequence
-from lslam.types.trajectory import Trajectory
+from lslam.core.geometry import se3, so3
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import write_tum
+from lslam.io.readers import open_sequence
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from calling import COMMAND, SAMPLE, environment, lslam_process, manifest
 
-from lslam.kernels import jit
+from lslam.core.kernels import jit
 
 STARTS = 4
 # The fewest kernels that make a map: those of a map of given poses.

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from calling import SAMPLE, Done, assert_one_sentence, lslam, manifest
 
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy, se2
+from lslam.core.geometry import geodesy, se2
+from lslam.io.formats.trajectory_files import read_trajectory
 
 FOLDER = SAMPLE / "sequences" / "00"
 PART = ("--count", 45, "-q", "--no-loops", "--set", "map.write=false", "--set", "report.html=false")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from calling import COMMAND, SAMPLE, assert_one_sentence, environment, lslam, manifest
 
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
 
 LAPS = 12
 Child = subprocess.Popen[str]

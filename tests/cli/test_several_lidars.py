@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from calling import lslam, strict_json
 
-from lslam.geometry import se3
+from lslam.core.geometry import se3
+from lslam.io.readers import open_sequence
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
-from lslam.readers import open_sequence
 
 SAMPLE = Path(__file__).parents[2] / "sample_data"
 T_FRONT_REAR = se3.make(np.diag([-1.0, -1.0, 1.0]), np.array([-2.0, 0.0, 0.0]))

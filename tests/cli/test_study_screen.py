@@ -14,7 +14,7 @@ from rich.console import Console
 
 from lslam.cli import console
 from lslam.cli.console import BestTable, TimeLeft, bars, best_so_far
-from lslam.types.study import StudyRow
+from lslam.core.types.study import StudyRow
 
 ROWS = [
     StudyRow(

@@ -13,9 +13,9 @@ import pytest
 from calling import COMMAND, assert_one_sentence, environment, lslam
 
 from lslam.cli.sweep import command
-from lslam.errors import LslamError
+from lslam.core.errors import LslamError
+from lslam.core.types.study import StudyRow
 from lslam.studies.results_csv import read_study_csv
-from lslam.types.study import StudyRow
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from calling import assert_one_sentence, lslam
 
+from lslam.core.types.study import StudyRow
 from lslam.studies.results_csv import write_study_csv
-from lslam.types.study import StudyRow
 
 STUDY = """
 summary = "every n-th scan"

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from lslam.cli.main import cli
-from lslam.errors import InputError, OutputError, OutputExistsError
-from lslam.formats.point_files import read_cloud
-from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import se3, so3
+from lslam.core.errors import InputError, OutputError, OutputExistsError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.point_files import read_cloud
+from lslam.io.formats.trajectory_files import write_tum
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
 from lslam.pipeline.rebuild import viewed_run
 from lslam.reports.recording import MOST_POINTS, by_height
-from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference
-from lslam.types.trajectory import Trajectory
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (400, 3))
 

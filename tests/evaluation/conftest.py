@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from evaluation_drives import disturb, drive
 
-from lslam.types.trajectory import Trajectory
+from lslam.core.types.trajectory import Trajectory
 
 
 @pytest.fixture(scope="session")

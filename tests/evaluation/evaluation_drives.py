@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.geometry import se3
-from lslam.types.trajectory import Trajectory
+from lslam.core.geometry import se3
+from lslam.core.types.trajectory import Trajectory
 
 STEP_NS = 100_000_000
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lslam.config.study import ExpectedFinding
+from lslam.core.config.study import ExpectedFinding
+from lslam.core.types.study import FindingVerdict, StudyRow
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.types.study import FindingVerdict, StudyRow
 
 Formula = Callable[[float], float]
 

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.results import describe
 from lslam.evaluation.thesis import axis_errors
-from lslam.geometry import se3, so3
-from lslam.types.trajectory import Trajectory
 
 TRUTH, ESTIMATE = drive().poses, disturb(drive()).poses
 ALL = ("none", "origin", "se3", "sim3", "posyaw")

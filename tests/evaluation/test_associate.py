@@ -10,9 +10,9 @@ from evaluation_drives import disturb, drive
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.associate import associate, estimate_offset, nearest_one_to_one, time_range
-from lslam.types.trajectory import Trajectory
 
 stamps = st.lists(st.integers(0, 10_000), min_size=1, max_size=30, unique=True).map(
     lambda v: np.array(sorted(v), np.int64)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
 from lslam.evaluation.timing import read_timing, read_timing_rows
 from lslam.pipeline.outputs import timing_text
 

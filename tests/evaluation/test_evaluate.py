@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from evaluation_drives import disturb
 
-from lslam.config.outputs import EvalConfig
-from lslam.errors import InputError
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import Evaluation, evaluate
 from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis
-from lslam.formats.calibration_files import read_odometry_calib
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3, so3
-from lslam.types.sequence import Calibration
-from lslam.types.trajectory import Trajectory
+from lslam.io.formats.calibration_files import read_odometry_calib
+from lslam.io.formats.trajectory_files import read_trajectory
 
 T_CAM_LIDAR = se3.make(R_BODY_CAMERA.T @ so3.exp(np.array([0.01, -0.02, 0.015])), np.array([-0.005, -0.07, -0.33]))
 

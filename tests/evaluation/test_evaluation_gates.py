@@ -9,12 +9,12 @@ import pytest
 from evaluation_drives import STEP_NS, drive
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.associate import _peaks, associate, estimate_offset
 from lslam.evaluation.frames import R_BODY_CAMERA, body_rotation, main_axis, reconcile
 from lslam.evaluation.thesis import planar
-from lslam.geometry import se3, so3
-from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.core.geometry import se3, so3
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.frames import body_turn
-from lslam.geometry import se3, so3
-from lslam.types.trajectory import Trajectory
 
 Floats = NDArray[np.float64]
 ARM = np.array([0.8, -0.3, 1.2])

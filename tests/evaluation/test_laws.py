@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lslam.core.types.arrays import Floats
+from lslam.core.types.study import LawKind
 from lslam.evaluation.laws import band, fit_law, rival
-from lslam.types.arrays import Floats
-from lslam.types.study import LawKind
 
 SKIPS = np.arange(1.0, 21.0)
 SHARES = np.arange(0.1, 1.01, 0.1)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from cli.calling import lslam
 
-from lslam.config.outputs import EvalConfig
-from lslam.errors import InputError
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.formats.trajectory_files import read_trajectory, write_tum
-from lslam.geometry import se3
-from lslam.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import read_trajectory, write_tum
 
 COUNT = 120
 NS = 1_700_000_000_000_000_000 + np.arange(COUNT) * 100_000_000

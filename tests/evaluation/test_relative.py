@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from evaluation_drives import drive
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation import parse_delta
 from lslam.evaluation.kitti_drift import kitti_drift
 from lslam.evaluation.relative import by_index, by_path, by_time, relative_error
 from lslam.evaluation.thesis import axis_errors, planar
-from lslam.geometry import se3, so3
-from lslam.types.trajectory import Trajectory
 
 
 def seconds(t: Trajectory) -> np.ndarray:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from study_rows import rows_of
 
-from lslam.config.study import ExpectedFinding
+from lslam.core.config.study import ExpectedFinding
+from lslam.core.types.study import StudyRow
 from lslam.evaluation.curves import curves_of, divergence, elbow, lost_above, optimum, registration_ms
 from lslam.evaluation.sensitivity import evaluate_study
-from lslam.types.study import StudyRow
 
 SKIPS = range(1, 21)
 

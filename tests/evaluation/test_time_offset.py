@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from cli.calling import lslam
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.time_offset import fit_offset
-from lslam.formats.trajectory_files import write_tum
-from lslam.geometry import se3, so3
-from lslam.geometry.se3 import poses_at
-from lslam.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import write_tum
 
 SCANS, STEP_NS = 300, 100_000_000
 Floats = np.ndarray

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from study_rows import by_seed, outcome, rows_of, verdict
 
-from lslam.config.study import Kind
-from lslam.types.study import FindingVerdict, StudyRow
+from lslam.core.config.study import Kind
+from lslam.core.types.study import FindingVerdict, StudyRow
 
 SKIPS = range(1, 21)
 DISTANCES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5)

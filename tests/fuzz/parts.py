@@ -8,16 +8,16 @@ from pathlib import Path
 
 import lz4.frame
 import numpy as np
+from bag_builders import START_NS, STEP_NS, Fill, bag, clouds, imu, scan, together, transforms
 from fuzz.cases import Files, Parser
 from fuzz.sequences import read_sequence
-from readers.bag_builders import START_NS, STEP_NS, Fill, bag, clouds, imu, scan, together, transforms
-from readers.packet_builders import ouster_packets, velodyne_scans
-from readers.pcap_builders import OusterSpec, ouster, ouster_imu, velodyne
+from packet_builders import ouster_packets, velodyne_scans
+from pcap_builders import OusterSpec, ouster, ouster_imu, velodyne
 
-from lslam.formats.bag_chunks import zstd
+from lslam.core.types.scan import Scan
+from lslam.io.formats.bag_chunks import zstd
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
-from lslam.types.scan import Scan
 
 _METADATA = (
     b"rosbag2_bagfile_information:\n  version: 4\n  relative_file_paths:\n    - rec_0.mcap\n    - rec_1.db3.zstd\n"

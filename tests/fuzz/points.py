@@ -10,15 +10,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from formats.test_point_records import packed, revolution
 from fuzz.cases import Files, Parser
-from point_writers import write_pcd
+from point_writers import packed, revolution, write_pcd
 
-from lslam.formats.ply_files import write_ply
-from lslam.formats.point_files import read_cloud, read_points, write_cloud
-from lslam.formats.pointcloud2 import decode_livox, decode_pointcloud2
-from lslam.formats.state_files import read_npz, write_npz
-from lslam.types.cloud import ArrayCloud
+from lslam.core.types.cloud import ArrayCloud
+from lslam.io.formats.ply_files import write_ply
+from lslam.io.formats.point_files import read_cloud, read_points, write_cloud
+from lslam.io.formats.pointcloud2 import decode_livox, decode_pointcloud2
+from lslam.io.formats.state_files import read_npz, write_npz
 
 _N = 30
 

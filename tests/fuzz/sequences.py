@@ -6,18 +6,18 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from formats.test_point_records import packed, revolution
+from bag_builders import bag, clouds, imu, together, transforms
 from fuzz.cases import Files, Parser, files_in
-from readers.bag_builders import bag, clouds, imu, together, transforms
-from readers.pcap_builders import velodyne, write_pcap
-from readers.sequence_builders import T_CAM0_LIDAR, kitti_root, raw_drive, scans
+from pcap_builders import velodyne, write_pcap
+from point_writers import packed, revolution
+from sequence_builders import T_CAM0_LIDAR, kitti_root, raw_drive, scans
 
-from lslam.errors import InputError
-from lslam.formats.bag_files import INFO_TOPIC
-from lslam.geometry import se3
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3
+from lslam.io.formats.bag_files import INFO_TOPIC
+from lslam.io.readers import open_sequence
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
-from lslam.readers import open_sequence
 
 _SCANS = 3
 
@@ -69,7 +69,7 @@ def _packed_bag(compression: str) -> Callable[[Path], list[Files]]:
         writer.set_compression(Writer.CompressionFormat[compression.upper()])
         with writer:
             connection = writer.add_connection("/points", kind, typestore=store)
-            from readers.bag_builders import scan
+            from bag_builders import scan
 
             for k in range(_SCANS):
                 one = scan(k, 40)

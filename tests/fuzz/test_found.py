@@ -9,10 +9,10 @@ from fuzz.cases import lay_out
 from fuzz.parsers import PARSERS
 from fuzz.texts import CORRECTED
 
-from lslam.config.study import Range
-from lslam.errors import InputError, LslamError
+from lslam.core.config.study import Range
+from lslam.core.errors import InputError, LslamError
+from lslam.io.readers import open_sequence
 from lslam.pipeline.rebuild import read_run
-from lslam.readers import open_sequence
 
 DIGITS = b"9" * 5000
 DEEP = b"[" * 5000

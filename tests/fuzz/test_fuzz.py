@@ -18,7 +18,7 @@ from fuzz.cases import Parser
 from fuzz.parsers import PARSERS
 from fuzz.trial import attempt, little_memory
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
 
 COUNT = -(-2000 // len(PARSERS))
 

@@ -7,38 +7,38 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from formats.osm_builders import ExtractMaker
 from fuzz.cases import Files, Parser
+from osm_builders import ExtractMaker
 
 from lslam.backend.manual import read_control_points, read_named_pairs
-from lslam.config import load_config
-from lslam.config.load import to_toml
-from lslam.config.study import read_batch, read_study
-from lslam.errors import LslamError
+from lslam.core.config import load_config
+from lslam.core.config.load import to_toml
+from lslam.core.config.study import read_batch, read_study
+from lslam.core.errors import LslamError
+from lslam.core.types.study import StudyRow
+from lslam.core.version import __version__
 from lslam.evaluation.timing import read_timing
-from lslam.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
-from lslam.formats.geojson import read_line
-from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.oxts_files import read_oxts
-from lslam.formats.sequence_toml import read_sequence_toml
-from lslam.formats.stamped_csv import read_gnss_csv, read_imu_csv
-from lslam.formats.state_files import read_state, write_state
-from lslam.formats.time_columns import read_stamps
-from lslam.formats.trajectory_files import read_times, read_trajectory
+from lslam.io.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
+from lslam.io.formats.geojson import read_line
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.formats.oxts_files import read_oxts
+from lslam.io.formats.sequence_toml import read_sequence_toml
+from lslam.io.formats.stamped_csv import read_gnss_csv, read_imu_csv
+from lslam.io.formats.state_files import read_state, write_state
+from lslam.io.formats.time_columns import read_stamps
+from lslam.io.formats.trajectory_files import read_times, read_trajectory
+from lslam.io.readers.name_stamps import stamps_in_names
 from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
-from lslam.readers.name_stamps import stamps_in_names
 from lslam.simulation.osm_perturb import read_perturbation
 from lslam.simulation.record import read_mark
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.waypoints import read_way_points
 from lslam.studies import results_csv
 from lslam.studies.results_csv import read_study_csv, write_study_csv
-from lslam.types.study import StudyRow
-from lslam.version import __version__
 
 _ROOT = Path(__file__).resolve().parents[2]
 _SAMPLE = _ROOT / "sample_data" / "sequences" / "00"

@@ -18,7 +18,7 @@ from typing import Any
 
 from fuzz.cases import Files, Parser, lay_out
 
-from lslam.errors import LslamError
+from lslam.core.errors import LslamError
 
 SECONDS = 5.0
 BYTES = 10**9

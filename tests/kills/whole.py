@@ -13,14 +13,14 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
-from formats.g2o_reader import read_g2o
+from g2o_reader import read_g2o
 
-from lslam.config import Config
-from lslam.formats.osm_files import read_osm
-from lslam.formats.point_files import read_cloud
-from lslam.formats.state_files import read_state
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.state_classes import STATE_CLASSES
+from lslam.core.config import Config
+from lslam.io.formats.osm_files import read_osm
+from lslam.io.formats.point_files import read_cloud
+from lslam.io.formats.state_files import read_state
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
 
 # What is appended to: a log, the lock, and rows of which a checkpoint says how many count.
 GROWING = ("log.txt", ".lock", *(f"checkpoint/{part}/" for part in ("map", "occupancy", "edges", "planes")))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.core.types.scan import Scan
 from lslam.simulation import lidar
 from lslam.simulation.scenarios import SimulatedDrive
-from lslam.types.scan import Scan
 
 
 class MovingTruth:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.core.errors import ConfigError, InterruptedRunError
+from lslam.core.geometry import se3
 from lslam.core.stopping import asking
-from lslam.errors import ConfigError, InterruptedRunError
-from lslam.geometry import se3
 from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.occupancy import Evidence, OccupancyMapper
 

@@ -7,15 +7,15 @@ import pytest
 from moving_truth import MovingTruth
 from numpy.typing import NDArray
 
-from lslam.config import load_config
-from lslam.geometry import se3, so3
-from lslam.kernels.see_through import nearest_ranges, vote
+from lslam.core.config import load_config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.scan_result import ScanResult
 from lslam.maps import clean
 from lslam.maps.clean import CUBE, OFFSETS, SHARE, Cleaner, PosedScan, spread
+from lslam.maps.kernels.see_through import nearest_ranges, vote
 from lslam.pipeline.map_pass import build_map, motion_within
-from lslam.preprocessing.deskew import deskew_points
+from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan_result import ScanResult
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.errors import InputError, UsageError
+from lslam.core.errors import InputError, UsageError
+from lslam.core.types.cloud import ArrayCloud
 from lslam.maps.crispness import compare
-from lslam.types.cloud import ArrayCloud
 
 
 def test_equals_brute_force() -> None:

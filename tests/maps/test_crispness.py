@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.cloud import ArrayCloud
 from lslam.maps.crispness import crispness
 from lslam.maps.merge import MapMerger
-from lslam.types.cloud import ArrayCloud
 
 
 def plane(sigma: float, count: int = 40_000, seed: int = 0) -> NDArray[np.float64]:
@@ -106,7 +106,7 @@ def test_nothing_to_score() -> None:
 
 def test_the_sample_data_of_a_drive_is_crisper_at_true_poses(recordings: object) -> None:
     """Real scans: poses disturbed by 5 cm and 0.3 deg blur the map."""
-    from lslam.formats.trajectory_files import read_trajectory
+    from lslam.io.formats.trajectory_files import read_trajectory
 
     drive: Path = recordings("kitti_raw_0048") / "2011_09_26" / "2011_09_26_drive_0048_sync"  # type: ignore[operator]
     poses = read_trajectory(drive / "reference_lidar.tum").poses

@@ -11,15 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
-from lslam.errors import UsageError
-from lslam.formats.las_files import read_las
-from lslam.geometry import se3, so3
-from lslam.geometry.crs_names import parse_crs
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.geometry.crs_names import parse_crs
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.las_files import read_las
 from lslam.maps.georeference import Projection, to_lat_lon, utm_epsg
 from lslam.pipeline.map_files import MapNote, write_geojson, write_map
-from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference
-from lslam.types.trajectory import Trajectory
 
 KARLSRUHE = np.array([49.0113, 8.4256, 116.4])
 
@@ -116,7 +116,7 @@ def test_the_trajectory_as_geojson(tmp_path: Path) -> None:
     np.testing.assert_allclose(places[:, [1, 0]], expected[:, :2], atol=0.51e-7)
     np.testing.assert_allclose(places[:, 2], expected[:, 2], atol=0.51e-3)
     for count, kind in ((1, "Point"), (0, None)):
-        from lslam.formats.geojson import write_line
+        from lslam.io.formats.geojson import write_line
 
         write_line(tmp_path / "t.geojson", expected[:count], {})
         geometry = json.loads((tmp_path / "t.geojson").read_text())["features"][0]["geometry"]

@@ -13,13 +13,13 @@ import pytest
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
-from lslam.geometry.geodesy import geoid_heights, local_crs
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.geometry.geodesy import geoid_heights, local_crs
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.gnss import Georeference
 from lslam.maps.georeference import Projection, to_wgs84
 from lslam.pipeline.map_files import MapNote, georeference_note, georeference_of, in_own_world, write_map
-from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference
 from tests.maps.geoid_grids import write_gtx
 
 KARLSRUHE = np.array([49.0113, 8.4256, 116.4])
@@ -96,7 +96,7 @@ def test_a_plane_without_heights_says_none(tmp_path: Path) -> None:
 BY_PROJ = """
 import sys, numpy as np
 from lslam.maps.georeference import Projection, to_wgs84
-from lslam.types.gnss import Georeference
+from lslam.core.types.gnss import Georeference
 import pyproj
 pyproj.datadir.append_data_dir(sys.argv[1])
 p = Projection(Georeference(np.array([49.0113, 8.4256, 116.4]), np.eye(4), 32632, height_epsg=5773))

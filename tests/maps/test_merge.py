@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import ConfigError, InputError
-from lslam.geometry import se3, so3
+from lslam.core.errors import ConfigError, InputError
+from lslam.core.geometry import se3, so3
 from lslam.maps.merge import MapMerger, MergedMap, warm_up
 
 Scans = list[tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]]
@@ -168,7 +168,7 @@ def test_other_layouts_and_types_are_accepted() -> None:
 
 
 def test_warm_up_compiles_all_that_a_run_needs() -> None:
-    from lslam.kernels.voxel_average import accumulate, enter
+    from lslam.maps.kernels.voxel_average import accumulate, enter
 
     warm_up()
     scans = make_scans(2, 200_000)

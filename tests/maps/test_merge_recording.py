@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.core.geometry import se3
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps.floor_plan import top_view
 from lslam.maps.merge import MapMerger
 

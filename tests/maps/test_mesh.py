@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lslam.config import load_config
-from lslam.errors import InputError
-from lslam.formats.ply_files import write_ply_mesh
+from lslam.core.config import load_config
+from lslam.core.errors import InputError
+from lslam.core.types.cloud import ArrayCloud
+from lslam.io.formats.ply_files import write_ply_mesh
 from lslam.maps.mesh import Mesh, denoise, surface
 from lslam.pipeline.check import check_config
-from lslam.types.cloud import ArrayCloud
 
 
 @pytest.mark.usefixtures("open3d")

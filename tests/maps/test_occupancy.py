@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import ConfigError
-from lslam.geometry import se3, so3
+from lslam.core.errors import ConfigError
+from lslam.core.geometry import se3, so3
 from lslam.maps.floor_plan import FREE, OCCUPIED, UNKNOWN, floor_plan
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.pipeline.map_files import write_occupancy
@@ -160,7 +160,7 @@ def test_a_floor_plan_shows_walls_ways_and_what_nobody_saw() -> None:
 def test_files_hold_every_cell(tmp_path: Path) -> None:
     from matplotlib.image import imread
 
-    from lslam.formats.point_files import read_points
+    from lslam.io.formats.point_files import read_points
 
     mapper = OccupancyMapper(0.4, 1.0, 40.0)
     mapper.add(street(True), np.eye(4))

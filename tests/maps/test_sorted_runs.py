@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from resident import resident_mb
 
-from lslam.errors import OutputError
-from lslam.geometry import se3
+from lslam.core.errors import OutputError
+from lslam.core.geometry import se3
+from lslam.core.types.cloud import bounds
 from lslam.maps import sorted_runs
 from lslam.maps.merge import MapMerger, MergedMap
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
-from lslam.types.cloud import bounds
 
 Scan = tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32]]
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from lslam.core.types.cloud import CloudBlock, thinned
 from lslam.maps.floor_plan import top_view
-from lslam.types.cloud import CloudBlock, thinned
 
 
 def test_every_point_is_counted_in_its_pixel() -> None:

@@ -1,6 +1,6 @@
 """`python -m tests.mutants --count 300 --seed N`: of small faults put into the program, how many the tests notice.
 
-Mutants are drawn from graph/, loops/, inertial/, evaluation/ and registration/, and `--kernels` of them from the compiled
+Mutants are drawn from `PACKAGES`, and `--kernels` of them from the compiled
 kernels that registration calls. Each is run in a copy of the project, alone, against the test files that run its line.
 Results are lines of JSON in `--out`: what is there already is not tried again, or with `--again` only what survived. The
 tests of the command line and of whole runs are not asked, unless `--also`: the share is a lower bound.
@@ -22,7 +22,7 @@ from typing import Any
 from mutants.sites import Mutant, mutants
 from mutants.trial import PROJECT, Copy
 
-PACKAGES = ("graph", "loops", "inertial", "evaluation", "registration")
+PACKAGES = ("backend/graph", "backend/loops", "odometry/inertial", "evaluation", "registration")
 
 
 def registration_kernels() -> list[str]:
@@ -30,11 +30,11 @@ def registration_kernels() -> list[str]:
     found: list[str] = []
     texts = [path.read_text() for path in (PROJECT / "lslam" / "registration").glob("*.py")]
     while texts:
-        for stem in re.findall(r"lslam\.kernels(?:\.| import )(\w+)", texts.pop()):
-            if stem not in ("jit", *found):
-                found.append(stem)
-                texts.append((PROJECT / "lslam" / "kernels" / f"{stem}.py").read_text())
-    return [f"lslam/kernels/{stem}.py" for stem in sorted(found)]
+        for room, stem in re.findall(r"lslam\.(\w+)\.kernels(?:\.| import )(\w+)", texts.pop()):
+            if stem != "jit" and (file := f"lslam/{room}/kernels/{stem}.py") not in found:
+                found.append(file)
+                texts.append((PROJECT / file).read_text())
+    return sorted(found)
 
 
 def drawn(count: int, seed: int, kernels: float) -> list[Mutant]:
@@ -63,7 +63,7 @@ def read(out: Path) -> dict[str, dict[str, Any]]:
 def summary(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield "| package | mutants | killed | share |"
     yield "|---|---|---|---|"
-    package = [row["mutant"].split("/")[1] for row in rows]
+    package = [row["mutant"].partition("/")[2].rpartition("/")[0] for row in rows]
     for name in (*sorted(set(package)), "all"):
         killed = [row["is_killed"] for row, its in zip(rows, package, strict=True) if name in (its, "all")]
         yield f"| {name} | {len(killed)} | {sum(killed)} | {100 * sum(killed) / len(killed):.0f} % |"

@@ -66,7 +66,7 @@ def test_a_seed_draws_the_same_mutants_again() -> None:
     first, other = drawn(40, 3, 0.25), drawn(40, 4, 0.25)
     assert first == drawn(40, 3, 0.25)
     assert first != other
-    assert sum(m.file.startswith("lslam/kernels/") for m in first) == 10
+    assert sum("/kernels/" in m.file for m in first) == 10
 
 
 @pytest.mark.parametrize(("new", "is_killed"), [("2", True), ("1.0", False)])

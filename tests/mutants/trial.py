@@ -18,7 +18,7 @@ from typing import Any
 from mutants.sites import Mutant
 
 PROJECT = Path(__file__).resolve().parents[2]
-TESTS = ("graph", "loops", "inertial", "evaluation", "registration", "kernels", "oracle")
+TESTS = ("backend/graph", "backend/loops", "odometry/inertial", "evaluation", "registration", "core/kernels", "oracle")
 RESIDUALS = "lslam/registration/residuals.py"
 PYTEST = ["-o", "addopts=", "-x", "-q", "--tb=no", "--hypothesis-seed=0", "-p", "no:cacheprovider", "-W", "ignore"]
 
@@ -68,7 +68,7 @@ class Copy:
         source, stat = path.read_bytes(), path.stat()
         text = mutant.of(source)
         names = self.tests_of(mutant, covered)
-        is_kernel = mutant.file.startswith("lslam/kernels/")
+        is_kernel = "/kernels/" in mutant.file
         limit = 60 + 300 * is_kernel + 5 * sum(covered[name]["seconds"] for name in names)
         with tempfile.TemporaryDirectory(dir=self.root) as cache:
             try:
@@ -95,7 +95,7 @@ class Copy:
         runs is not seen: it has those that import it, or a kernel that imports it, or look residuals up in their table.
         """
         named: list[str] = []
-        if mutant.file.startswith("lslam/kernels/"):
+        if "/kernels/" in mutant.file:
             named = self._tests_of_kernel(Path(mutant.file).stem, covered)
             names = [name for name, told in covered.items() if name in named or RESIDUALS in told["lines"]]
         else:
@@ -106,9 +106,9 @@ class Copy:
         return sorted(names, key=lambda name: (stem not in name, name not in named, covered[name]["seconds"]))
 
     def _tests_of_kernel(self, stem: str, covered: dict[str, Any]) -> list[str]:
-        kernels = {path.stem: path.read_text() for path in (self.root / "lslam" / "kernels").glob("*.py")}
-        users = {stem} | {user for user, text in kernels.items() if f"lslam.kernels.{stem} import" in text}
-        pattern = re.compile("|".join(rf"lslam\.kernels\.{user}\b|kernels import .*\b{user}\b" for user in users))
+        kernels = {path.stem: path.read_text() for path in (self.root / "lslam").glob("*/kernels/*.py")}
+        users = {stem} | {user for user, text in kernels.items() if f".kernels.{stem} import" in text}
+        pattern = re.compile("|".join(rf"\.kernels\.{user}\b|kernels import .*\b{user}\b" for user in users))
         return [name for name in covered if pattern.search((self.root / name).read_text())]
 
 

@@ -9,16 +9,16 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.sequence import Sequence
 from lslam.evaluation.absolute import absolute_error
 from lslam.evaluation.relative import by_path, error_transforms
-from lslam.geometry import se3, so3
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
-from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]
 

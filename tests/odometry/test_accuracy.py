@@ -10,7 +10,7 @@ from drives import ate, coasting, drive, nees_per_dof, poses_of, standing
 from numpy.typing import NDArray
 
 from lslam import Registration
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 

@@ -12,14 +12,14 @@ import small_gicp
 from drives import ate, standing
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.frontend.register_scans import estimate
+from lslam.core.config.config import Config
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
-from lslam.preprocessing.prepare import clean_points
+from lslam.odometry.frontend.register_scans import estimate
+from lslam.registration.preprocessing.prepare import clean_points
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 BASELINES = ("small-gicp", "open3d-gicp")

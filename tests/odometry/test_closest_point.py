@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from analytic_scenes import random_pose
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 from lslam.odometry import closest_point
 
 RNG = np.random.default_rng(0)

@@ -11,14 +11,13 @@ from analytic_scenes import pose_at, room
 from numpy.typing import NDArray
 from stub_sequences import Stub, sample
 
-from lslam.config import load_config
-from lslam.formats.state_files import read_state, write_state
-from lslam.frontend.inertial_start import begin_inertial
-from lslam.frontend.register_scans import estimate, read_ahead
-from lslam.frontend.state_classes import STATE_CLASSES
-from lslam.frontend.tracker import Tracker
-from lslam.geometry import se3, so3
-from lslam.inertial.fusion import InertialMotion
+from lslam.core.config import load_config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Span
+from lslam.core.types.scan_result import ScanResult
+from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.elastic import PARTS, SweepPoints, register_elastic
@@ -32,15 +31,16 @@ from lslam.odometry.elastic_constraints import (
     LastSweep,
 )
 from lslam.odometry.elastic_sweep import ElasticSweep
-from lslam.preprocessing.deskew import deskew_points, knots_over
-from lslam.preprocessing.prepare import prepare_points
+from lslam.odometry.frontend.inertial_start import begin_inertial
+from lslam.odometry.frontend.register_scans import estimate, read_ahead
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.tracker import Tracker
+from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.registration.preprocessing.deskew import deskew_points, knots_over
+from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.robust import Annealing
 from lslam.simulation.scenarios import simulate
-from lslam.types.imu import ImuStream
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Span
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 COUNT = 24

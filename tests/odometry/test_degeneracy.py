@@ -10,15 +10,15 @@ import pytest
 from drives import ate, drive
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.frontend.register_scans import estimate
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.geometry import se3
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Sequence, select
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.studies.worker import ScanStore, SequenceCache
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import Sequence, select
 
 Floats = NDArray[np.float64]
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config import load_config
-from lslam.geometry import se3, so3
+from lslam.core.config import load_config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.deskew_uncertainty import DeskewUncertainty
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.pipeline.run import run
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
 
 SPAN = 0.1
 

@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import load_config
-from lslam.frontend.register_scans import estimate
+from lslam.core.config import load_config
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.dlo import Dlo
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.scan_result import ScanResult
 
 COUNT = 40
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.geometry import se3, so3
+from lslam.core.config.config import Config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Deskewing
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
 
 
 @pytest.mark.parametrize("method", ["gicp", "loam-odom"])

@@ -11,13 +11,13 @@ import pytest
 from stub_sequences import Stub, sample
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InputError
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.imu import ImuStream
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")
@@ -101,13 +101,13 @@ def test_an_imu_that_is_too_slow_for_a_filter_ends_the_run_before_anything_is_re
 
 
 def test_fast_lio2_resumes_to_the_last_bit(tmp_path: Path) -> None:
-    """The states of the filter are part of the checkpoint; see `tests/frontend/test_resumable_state.py`."""
-    from lslam.formats.state_files import read_state, write_state
-    from lslam.frontend.inertial_start import begin_inertial
-    from lslam.frontend.register_scans import read_ahead
-    from lslam.frontend.state_classes import STATE_CLASSES
-    from lslam.frontend.tracker import Tracker
+    """The states of the filter are part of the checkpoint; see `tests/odometry/frontend/test_resumable_state.py`."""
+    from lslam.io.formats.state_files import read_state, write_state
     from lslam.odometry import create_odometry
+    from lslam.odometry.frontend.inertial_start import begin_inertial
+    from lslam.odometry.frontend.register_scans import read_ahead
+    from lslam.odometry.frontend.state_classes import STATE_CLASSES
+    from lslam.odometry.frontend.tracker import Tracker
 
     sequence, config = walk(16), config_of("fast-lio2")
 

@@ -9,21 +9,21 @@ import pytest
 from analytic_scenes import distance, random_pose
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.odometry import LoamConfig, RecoveryConfig
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import LoamConfig, RecoveryConfig
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan
+from lslam.core.types.stage_clock import StageClock
 from lslam.odometry.all_points import ALL_POINTS, FED
 from lslam.odometry.feature_policies import LessPlanar, feature_policies
 from lslam.odometry.feature_scan import feature_scan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, remap_solution, solve_on_scan
 from lslam.odometry.feature_steps import ScanStep, joint_step, two_steps, upright_directions
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
-from lslam.preprocessing.features import Features, extract_features
+from lslam.registration.preprocessing.features import Features, extract_features
 from lslam.registration.registration import Registration
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
-from lslam.types.scan import Scan
-from lslam.types.stage_clock import StageClock
 
 Floats = NDArray[np.float64]
 

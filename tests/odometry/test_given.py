@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.geometry import se3
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan, Span
+from lslam.core.types.trajectory import Trajectory
 from lslam.odometry.given import GivenMotion, GivenPoses
-from lslam.types.scan import Scan, Span
-from lslam.types.trajectory import Trajectory
 
 STEP = 100_000_000
 TWIST = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.1])

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.geometry import se3
-from lslam.inertial.constant_velocity import ConstantVelocity
+from lslam.core.config.config import Config
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.icp import Icp, create
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 BAD = 15

@@ -11,13 +11,13 @@ from drives import ate, standing
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lslam.config.config import Config
-from lslam.frontend.register_scans import estimate
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.odometry.icp_svd import align_closed_form, as_partners, create, keep_pairs
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
 
 Floats = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
 from lslam.odometry.keyframe_submap import NEAREST, ON_HULL, KeyframeSubmap, hull_of, spacing_of
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.registration.preprocessing.prepare import PreparedPoints
 
 Floats = NDArray[np.float64]
 

@@ -12,14 +12,14 @@ import pytest
 from drives import ate
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.errors import InputError
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
 from lslam.odometry.kiss import Kiss, create
-from lslam.preprocessing.prepare import gate_points
+from lslam.registration.preprocessing.prepare import gate_points
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
 
 pytest.importorskip("kiss_icp")
 Floats = NDArray[np.float64]

@@ -12,21 +12,21 @@ from stub_sequences import Stub, sample
 from warmed_kernels import recorded
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InputError, UsageError
-from lslam.formats.state_files import read_state, write_state
-from lslam.frontend.inertial_start import begin_inertial
-from lslam.frontend.register_scans import read_ahead
-from lslam.frontend.state_classes import STATE_CLASSES
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.inertial.window_motion import WindowMotion
-from lslam.kernels import positive
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, UsageError
+from lslam.core.kernels import positive
+from lslam.core.types.imu import ImuStream
+from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.inertial_start import begin_inertial
+from lslam.odometry.frontend.register_scans import read_ahead
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.pipeline.check import check_config
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.imu import ImuStream
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "imu.start_s=1")

@@ -12,28 +12,28 @@ import pytest
 from stub_sequences import Stub, sample
 
 import lslam
+from lslam.backend.graph.factors import well_conditioned
+from lslam.backend.graph.odometry_constraints import odometry_constraints
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
-from lslam.config import Config, load_config
-from lslam.errors import InputError
-from lslam.formats.state_files import read_state, write_state
-from lslam.frontend.inertial_start import begin_inertial
-from lslam.frontend.register_scans import read_ahead
-from lslam.frontend.state_classes import STATE_CLASSES
-from lslam.frontend.tracker import Tracker
-from lslam.graph.factors import well_conditioned
-from lslam.graph.odometry_constraints import odometry_constraints
-from lslam.keyframes.store import KeyframeStore
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.inertial_start import begin_inertial
+from lslam.odometry.frontend.register_scans import read_ahead
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.lio_sam import LioSam, LioSamOfPoints
 from lslam.pipeline import back_end_pass
 from lslam.simulation.imu import IMUS
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.sensors import GnssModel
-from lslam.types.imu import ImuStream
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Keyframe
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 QUIET = ("map.write=false", "report.html=false", "loops.use=false", "odometry.integrity=false", "imu.start_s=1")

@@ -13,26 +13,26 @@ from stub_sequences import Stub, sample
 from warmed_kernels import recorded
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InputError, UsageError
-from lslam.formats.state_files import read_state, write_state
-from lslam.frontend.inertial_start import Inertial, begin_inertial
-from lslam.frontend.register_scans import read_ahead
-from lslam.frontend.state_classes import STATE_CLASSES
-from lslam.frontend.tracker import Tracker
-from lslam.geometry import se3
-from lslam.geometry.normal_equations import Normal
-from lslam.inertial.constant_velocity import middle_of
-from lslam.inertial.linked_motion import LinkedMotion
-from lslam.kernels import positive
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry import se3
+from lslam.core.geometry.normal_equations import Normal
+from lslam.core.kernels import positive
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.inertial_start import Inertial, begin_inertial
+from lslam.odometry.frontend.register_scans import read_ahead
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.tracker import Tracker
+from lslam.odometry.inertial.constant_velocity import middle_of
+from lslam.odometry.inertial.linked_motion import LinkedMotion
 from lslam.odometry.lips import Lips
 from lslam.odometry.sanity import fault
 from lslam.simulation.scenarios import simulate
-from lslam.types.imu import ImuStream
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 COUNT = 20
 
@@ -60,7 +60,7 @@ def tracker() -> Tracker:
 
 
 def begin_again() -> Inertial:
-    from lslam.frontend.inertial_start import motion_of
+    from lslam.odometry.frontend.inertial_start import motion_of
 
     begun = start().start
     assert begun is not None
@@ -106,7 +106,7 @@ def test_planes_are_registered_over_a_gap_and_a_lost_scan() -> None:
     kept = (imu.stamps_ns < 1_000_000_000) | (imu.stamps_ns > 1_400_000_000)
     assert part.start is not None
     silent = replace(part.start, imu=ImuStream(imu.stamps_ns[kept], imu.accel[kept], imu.gyro[kept]))
-    from lslam.frontend.inertial_start import motion_of
+    from lslam.odometry.frontend.inertial_start import motion_of
 
     motion = Inertial(motion_of(silent, config_of()), silent)
     scans = [*walk().scans[:8], "gone", *walk().scans[9:]]

@@ -13,22 +13,22 @@ import pytest
 from drives import ate, coasting, standing
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.errors import InputError
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.all_points import ALL_POINTS
 from lslam.odometry.feature_policies import LessPlanar
+from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.loam import Loam
-from lslam.preprocessing.deskew import deskew_points
-from lslam.preprocessing.features import FeaturePoints, Features
 from lslam.registration.policies import AtRest
+from lslam.registration.preprocessing.deskew import deskew_points
+from lslam.registration.preprocessing.features import FeaturePoints, Features
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 

@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from lslam.config import load_config
-from lslam.formats.state_files import read_state, write_state
-from lslam.frontend.register_scans import estimate
-from lslam.frontend.state_classes import STATE_CLASSES
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.geometry import se3
+from lslam.core.config import load_config
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
+from lslam.io.formats.state_files import read_state, write_state
+from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.register_scans import estimate
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.loam_livox import TRUST, joined, line_weights
-from lslam.readers import open_sequence
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 COUNT = 12

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from lslam.config.config import Config
-from lslam.errors import UsageError
+from lslam.core.config.config import Config
+from lslam.core.errors import UsageError
 from lslam.odometry import METHODS, create_odometry, known_methods
 from lslam.odometry.base import Traits
 from lslam.registration.residuals import RESIDUALS

@@ -7,10 +7,10 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from lslam.config import load_config
-from lslam.config.odometry import TIGHTLY_COUPLED
-from lslam.frontend.register_scans import estimate
+from lslam.core.config import load_config
+from lslam.core.config.odometry import TIGHTLY_COUPLED
 from lslam.odometry import METHODS, create_odometry
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.simulation.scenarios import simulate
 
 FOREIGN = {"kiss-icp", "small-gicp", "open3d-gicp", "poses"}

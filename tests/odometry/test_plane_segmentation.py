@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from analytic_scenes import bushes, pose_at, random_pose, room, seen_from
 
-from lslam.geometry import se3
+from lslam.core.geometry import se3
 from lslam.odometry import closest_point
 from lslam.odometry.plane_segmentation import PlaneExtractor, turned
 

@@ -12,15 +12,15 @@ import pytest
 from drives import ate, coasting, final_yaw_deg, poses_of, prepared, registered, rotation_rpe, standing
 from numpy.typing import NDArray
 
-from lslam.config import Config
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.register_scans import estimate
-from lslam.geometry import se3
+from lslam.core.config import Config
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence, select
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
-from lslam.readers import open_sequence
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.registration.solver import RegistrationResult
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence, select
 
 Floats = NDArray[np.float64]
 Recordings = Callable[[str], Path]

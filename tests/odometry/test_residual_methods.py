@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drives import ate, coasting, drive, nees_per_dof, poses_of, standing
 
-from lslam.config.odometry import RegistrationConfig, Residual
+from lslam.core.config.odometry import RegistrationConfig, Residual
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 

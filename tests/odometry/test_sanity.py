@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
+from lslam.core.types.scan import FARTHEST_M, Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
+from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.sanity import measurable, plausible
-from lslam.types.scan import FARTHEST_M, Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 PERIOD_NS = 100_000_000

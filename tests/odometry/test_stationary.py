@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.geometry import se3, so3
+from lslam.core.config.config import Config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.stationary import StationaryDetector
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 Floats = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ import pytest
 from drives import standing
 from numpy.typing import NDArray
 
-from lslam.config import load_config
+from lslam.core.config import load_config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.sequence import select
 from lslam.evaluation.absolute import absolute_error
-from lslam.frontend.register_scans import estimate
-from lslam.geometry import se3, so3
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.sequence import select
 
 Floats = NDArray[np.float64]
 # m of thesis_rmse; 0.007 to 0.053 m were found, and the thesis prints 0.4 to 2.2 m for the whole flights.

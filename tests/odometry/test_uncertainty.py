@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
+from lslam.core.geometry import se3
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.solver import RegistrationResult
 

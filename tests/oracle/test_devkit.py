@@ -10,7 +10,7 @@ import make_golden
 import pytest
 
 from lslam.evaluation.kitti_drift import kitti_drift
-from lslam.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
 
 
 def test_synthetic_equals_the_formula() -> None:

@@ -13,12 +13,12 @@ import make_golden
 import numpy as np
 import pytest
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.relative import by_index, by_path, error_transforms
 from lslam.evaluation.results import Evaluation
-from lslam.formats.trajectory_files import read_trajectory, write_tum
-from lslam.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import read_trajectory, write_tum
 
 GOLDEN = json.loads(make_golden.GOLDEN.read_text())
 CONFIG = EvalConfig(align=make_golden.ALIGNMENTS, delta=make_golden.DELTAS)

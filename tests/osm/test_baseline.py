@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from wall_scenes import block, box_at, plain, turned
 
-from lslam.geometry import se2
+from lslam.core.geometry import se2
+from lslam.core.types.building import Building, Footprint
 from lslam.osm.baseline_matcher import flatten_scan, lay_building, lay_scan, outline_points
 from lslam.osm.walls import walls_of
-from lslam.types.building import Building, Footprint
 
 Floats = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.errors import UsageError
-from lslam.geometry.geodesy import to_local
+from lslam.core.errors import UsageError
+from lslam.core.geometry.geodesy import to_local
 from lslam.osm.bounds import Bounds, around
 
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from overpass_server import FakeOverpass, house, running
 
-from lslam.config.backend import OsmConfig
-from lslam.errors import InputError
-from lslam.formats.osm_buildings import buildings_of
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import InputError
+from lslam.core.types.building import Building
+from lslam.io.formats.osm_buildings import buildings_of
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer
 from lslam.osm.overpass import fetch_buildings, from_overpass
 from lslam.osm.walls import OsmMap
-from lslam.types.building import Building
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
 DRIVE = np.column_stack([np.arange(0.0, 400.0, 2.0), np.zeros(200)])

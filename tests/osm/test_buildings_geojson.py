@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from formats.osm_builders import ORIGIN, square_at
+from osm_builders import ORIGIN, square_at
 
-from lslam.errors import InputError, OutputError
-from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.osm_data import ATTRIBUTION
+from lslam.core.errors import InputError, OutputError
+from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.formats.osm_data import ATTRIBUTION
 from lslam.osm.buildings_geojson import read_corrected, write_corrected
-from lslam.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 
 YES = {"building": "yes"}
 

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from defusedxml import ElementTree
-from formats.osm_builders import ORIGIN, ExtractMaker, square_at
 from numpy.typing import NDArray
+from osm_builders import ORIGIN, ExtractMaker, square_at
 
-from lslam.errors import InputError
-from lslam.formats.osm_buildings import buildings_of
-from lslam.formats.osm_data import ATTRIBUTION, Member, OsmData, Way
-from lslam.formats.osm_files import read_osm, write_osm
+from lslam.core.errors import InputError
+from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap
+from lslam.io.formats.osm_buildings import buildings_of
+from lslam.io.formats.osm_data import ATTRIBUTION, Member, OsmData, Way
+from lslam.io.formats.osm_files import read_osm, write_osm
 from lslam.osm.corrected_elements import corrected_osm
 from lslam.osm.overpass import from_overpass
-from lslam.types.building import Building, BuildingCorrection, CorrectedMap
 
 Floats = NDArray[np.float64]
 

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from shapely import Polygon
 
-from lslam.config.backend import OsmConfig
-from lslam.geometry import se2
+from lslam.core.config.backend import OsmConfig
+from lslam.core.geometry import se2
+from lslam.core.types.building import Building, BuildingMatch, CorrectedMap, Footprint, KeyframeMatch, OsmMatches
 from lslam.osm.corrections import correct_buildings
 from lslam.osm.wall_match import match_walls
 from lslam.osm.walls import walls_of
-from lslam.types.building import Building, BuildingMatch, CorrectedMap, Footprint, KeyframeMatch, OsmMatches
 
 Floats = NDArray[np.float64]
 Mode = Literal["prior", "rigid", "non-rigid", "two-level"]

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from test_wall_drift import MAP, SEEN, WAY, odometry, sighted
 
-from lslam.config.backend import GraphConfig
-from lslam.geometry import se2
-from lslam.graph.drift import LASTING, MEMORY, SIZES, linear_basis, rate_roots, walk_root
-from lslam.graph.factors import PLANAR
-from lslam.graph.problem import PoseGraph
+from lslam.backend.graph.drift import LASTING, MEMORY, SIZES, linear_basis, rate_roots, walk_root
+from lslam.backend.graph.factors import PLANAR
+from lslam.backend.graph.problem import PoseGraph
+from lslam.core.config.backend import GraphConfig
+from lslam.core.geometry import se2
 from lslam.osm import wall_drift
 from lslam.osm.wall_drift import SCALES, DriftFit, Sizes, WallSightings, _effects, find_wall_drift, without_drift
 

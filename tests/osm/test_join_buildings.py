@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import Config
-from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se3
-from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import PoseGraph, PositionFix
+from lslam.backend.graph.pose_graph import optimise
+from lslam.backend.graph.problem import PoseGraph, PositionFix
+from lslam.core.config import Config
+from lslam.core.geometry import se3
+from lslam.core.types.building import Building, Footprint
+from lslam.core.types.constraint import Constraint
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.baseline_matcher import run_baseline
-from lslam.types.building import Building, Footprint
-from lslam.types.constraint import Constraint
-from lslam.types.stage_clock import KeyframeClocks
 
 
 class NothingSeen:

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from wall_scenes import box_at, plain, upright
 
-from lslam.config import Config, load_config
-from lslam.config.backend import OsmConfig
-from lslam.formats.osm_buildings import BuildingExtract
-from lslam.geometry import se2, se3, so3
-from lslam.graph.problem import Solution
-from lslam.keyframes.store import KeyframeStore
+from lslam.backend.graph.problem import Solution
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.config import Config, load_config
+from lslam.core.config.backend import OsmConfig
+from lslam.core.geometry import se2, se3, so3
+from lslam.core.types.building import Building, Footprint, KeyframeMatch
+from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm import location
 from lslam.osm.location import Located, finish, locate
 from lslam.osm.wall_match import match_keyframe
 from lslam.osm.walls import OsmMap
-from lslam.types.building import Building, Footprint, KeyframeMatch
-from lslam.types.trajectory import Keyframe
 
 Outline = list[tuple[float, float]]
 ORIGIN = np.array([49.0, 8.4, 115.0])

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from shapely import intersection, length, linestrings, union_all
 from wall_scenes import box_at
 
-from lslam.geometry import se2
+from lslam.core.geometry import se2
+from lslam.core.types.building import Building, Footprint, KeyframeMatch, footprint_polygon
 from lslam.osm.corrections import absent_buildings, new_walls
 from lslam.osm.walls import walls_of
-from lslam.types.building import Building, Footprint, KeyframeMatch, footprint_polygon
 
 Floats = NDArray[np.float64]
 

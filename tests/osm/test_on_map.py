@@ -11,21 +11,21 @@ import pytest
 from test_location import HOUSES, ORIGIN, Outline, config, driven, extract_of, street
 
 from lslam.backend.georeferencing import Placement
+from lslam.backend.graph.problem import PoseGraph
+from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import Given, solve
-from lslam.config import Config
-from lslam.config.load import load_config
-from lslam.errors import UsageError
-from lslam.geometry import se2, se3
-from lslam.graph.problem import PoseGraph
-from lslam.keyframes.store import KeyframeStore
+from lslam.core.config import Config
+from lslam.core.config.load import load_config
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se2, se3
+from lslam.core.types.constraint import Constraint
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.scan_result import ScanResult
 from lslam.osm import MATCHERS
 from lslam.osm.hold import find_on_map, hold_by_buildings, on_map, sightings
 from lslam.osm.location import Located, locate
 from lslam.osm.source import OsmServer
 from lslam.pipeline.check import check_config
-from lslam.types.constraint import Constraint
-from lslam.types.gnss import Georeference
-from lslam.types.scan_result import ScanResult
 
 SURE = np.diag([1e-6] * 3 + [1e-8] * 3)
 

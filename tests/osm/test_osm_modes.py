@@ -14,19 +14,19 @@ from building_errors import BuildingError, building_errors
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config import Config
-from lslam.config.load import load_config
+from lslam.core.config import Config
+from lslam.core.config.load import load_config
+from lslam.core.geometry import geodesy, se2, se3
+from lslam.core.types.building import CorrectedMap, KeyframeMatch
+from lslam.core.types.stage_clock import KeyframeClocks
 from lslam.evaluation.timing import read_timing_rows
-from lslam.formats.osm_buildings import buildings_of, read_buildings
-from lslam.formats.osm_files import read_osm
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy, se2, se3
+from lslam.io.formats.osm_buildings import buildings_of, read_buildings
+from lslam.io.formats.osm_files import read_osm
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm import location
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.track import OsmTrack
 from lslam.simulation.osm_perturb import map_errors, read_perturbation
-from lslam.types.building import CorrectedMap, KeyframeMatch
-from lslam.types.stage_clock import KeyframeClocks
 
 Floats = NDArray[np.float64]
 

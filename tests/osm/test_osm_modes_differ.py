@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from wrong_maps import MODES, OFF, SHIFT, Found, on
 
-from lslam.frontend.keyframing import Keyframing
-from lslam.frontend.register_scans import estimate
-from lslam.integrity.monitor import IntegrityMonitor
-from lslam.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.types.scan_result import MotionCheck, ScanResult
+from lslam.core.types.trajectory import Keyframe
+from lslam.odometry.frontend.keyframing import Keyframing
+from lslam.odometry.frontend.register_scans import estimate
+from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.pipeline import odometry_pass
-from lslam.types.scan_result import MotionCheck, ScanResult
-from lslam.types.trajectory import Keyframe
 
 # Half as many keyframes: what is common to the map shows as well; of single houses each needs all that saw it.
 SPARSE = ("keyframes.distance=4",)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from wall_scenes import box_at
 
-from lslam.config.backend import OsmConfig
-from lslam.kernels import segments, wall_matching
+from lslam.core.config.backend import OsmConfig
+from lslam.core.types.building import Building, Footprint, KeyframeMatch
+from lslam.osm.kernels import segments, wall_matching
 from lslam.osm.wall_match import match_buildings, match_keyframe, shares, warm_up
 from lslam.osm.walls import OsmMap
-from lslam.types.building import Building, Footprint, KeyframeMatch
 
 CORNERS = [box_at(4, 6, 10, 8), box_at(-14, 5, 9, 9), box_at(2, -16, 12, 7)]
 TOWN = OsmMap([Building(f"way/{n}", (Footprint(np.array(ring, float)),)) for n, ring in enumerate(CORNERS)])

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import lslam
-from lslam.config import load_config
-from lslam.geometry import geodesy, se2
-from lslam.readers import open_sequence
+from lslam.core.config import load_config
+from lslam.core.geometry import geodesy, se2
+from lslam.io.readers import open_sequence
 
 # Where a point of the recording's world, whose axes are east and north, lies on the Earth (README of the recording).
 PLACE, POINT = np.array([59.348268650, 18.073204280, 0.0]), np.array([64.3932532565158, 66.4832330946657, 38.514])

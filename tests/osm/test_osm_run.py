@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InputError, InterruptedRunError, OutputExistsError
-from lslam.formats.osm_files import read_osm
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.checkpoints import CheckpointSchedule
-from lslam.geometry import geodesy
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, InterruptedRunError, OutputExistsError
+from lslam.core.geometry import geodesy
+from lslam.io.formats.osm_files import read_osm
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.odometry.frontend.checkpoints import CheckpointSchedule
 from lslam.osm import source
 from lslam.osm.bounds import Bounds
 from lslam.pipeline.watch import Watch

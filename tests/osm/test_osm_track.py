@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from lslam.geometry import se2
+from lslam.core.geometry import se2
+from lslam.core.types.building import KeyframeMatch
 from lslam.osm.track import OsmTrack
-from lslam.types.building import KeyframeMatch
 
 MAP = np.array([0.5, 0.5, 0.02])
 

@@ -12,8 +12,8 @@ from shapely import LineString, Point, unary_union
 from shapely.affinity import rotate, scale, translate
 from wall_scenes import box_at
 
+from lslam.core.types.building import Building, Footprint, footprint_polygon
 from lslam.osm.overlap import STEEPEST, Untangled, remove_overlaps
-from lslam.types.building import Building, Footprint, footprint_polygon
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from overpass_server import FakeOverpass, running
 
-from lslam.config.backend import OsmConfig
-from lslam.errors import InputError
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import InputError
 from lslam.osm.bounds import Bounds
 from lslam.osm.overpass import OverpassReply, fetch_buildings, from_overpass, kept_reply, query
 

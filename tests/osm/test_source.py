@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from stub_sequences import Stub
 
-from lslam.config import Config
-from lslam.config.backend import OsmConfig
-from lslam.errors import InputError, UsageError
-from lslam.geometry import geodesy, se2
+from lslam.core.config import Config
+from lslam.core.config.backend import OsmConfig
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry import geodesy, se2
+from lslam.core.types.gnss import GnssStream
 from lslam.osm import source
 from lslam.osm.bounds import Bounds
 from lslam.osm.buffer import OsmBuffer
 from lslam.osm.source import OsmFile, OsmServer, open_osm
-from lslam.types.gnss import GnssStream
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 

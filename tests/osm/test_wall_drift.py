@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from graph_builders import ate, truth
 
-from lslam.config.backend import GraphConfig
-from lslam.geometry import se2, se3, so3
-from lslam.graph.pose_graph import optimise
-from lslam.graph.problem import PlanarPrior, PoseGraph
+from lslam.backend.graph.pose_graph import optimise
+from lslam.backend.graph.problem import PlanarPrior, PoseGraph
+from lslam.core.config.backend import GraphConfig
+from lslam.core.geometry import se2, se3, so3
+from lslam.core.types.constraint import Constraint
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
-from lslam.types.constraint import Constraint
 
 COUNT = 100
 REAL = truth(COUNT, 1)

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from test_walls import SAMPLE, submap
 from wall_scenes import Floats, box_at, turned
 
-from lslam.config.backend import OsmConfig
-from lslam.formats.osm_buildings import read_buildings
-from lslam.kernels import wall_matching
+from lslam.core.config.backend import OsmConfig
+from lslam.core.types.building import Building, Footprint
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.readers import open_sequence
+from lslam.osm.kernels import wall_matching
 from lslam.osm.wall_match import LIKENESS, WallMatch, find_heading, match_walls
 from lslam.osm.walls import find_walls, walls_of
-from lslam.readers import open_sequence
-from lslam.types.building import Building, Footprint
 
 SIGMA = np.array([1.5, 1.5, np.radians(4.0)])
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from wall_scenes import Floats, block, box_at, misfit, noisy, plain, turned, upright
 
-from lslam.config.backend import OsmConfig
-from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.core.config.backend import OsmConfig
+from lslam.core.geometry import se3
+from lslam.core.types.building import Building, Footprint
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.osm.walls import Walls, find_walls, walls_of
-from lslam.readers import open_sequence
-from lslam.types.building import Building, Footprint
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 HOUSE = box_at(6, -4, 12, 9)

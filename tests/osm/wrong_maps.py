@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config.load import load_config
-from lslam.formats.osm_buildings import read_buildings
-from lslam.formats.osm_files import write_osm
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy, se2
+from lslam.core.config.load import load_config
+from lslam.core.geometry import geodesy, se2
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.formats.osm_files import write_osm
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.simulation.osm_extract import osm_from_buildings
 from lslam.simulation.osm_perturb import Change, Perturbation, map_errors, perturb

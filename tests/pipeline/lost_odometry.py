@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.config import Config
-from lslam.frontend.tracker import Loaded, Tracker
-from lslam.geometry import se3, so3
+from lslam.core.config import Config
+from lslam.core.geometry import se3, so3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Traits
-from lslam.types.motion_prior import MotionPrior
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
+from lslam.odometry.frontend.tracker import Loaded, Tracker
 
 Floats = NDArray[np.float64]
 # What is claimed of a true step (4, 4), and of the seconds that it took.

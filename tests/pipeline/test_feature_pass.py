@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config import load_config
-from lslam.errors import UsageError
-from lslam.formats.ply_files import write_ply
-from lslam.formats.point_files import read_points
+from lslam.core.config import load_config
+from lslam.core.errors import UsageError
+from lslam.io.formats.ply_files import write_ply
+from lslam.io.formats.point_files import read_points
 from lslam.pipeline.check import check_config
 from lslam.pipeline.run import run
 from lslam.reports.text import summary

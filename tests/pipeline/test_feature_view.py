@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from stub_sequences import Stub, sample
 
-from lslam.config import load_config
-from lslam.frontend.register_scans import estimate
-from lslam.geometry import se3
+from lslam.core.config import load_config
+from lslam.core.geometry import se3
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.pipeline.feature_pass import MOST_SCANS, view_features
 from lslam.pipeline.run import run
 from lslam.reports.map_view import feature_figures
-from lslam.types.scan_result import ScanResult
 
 CONFIG = load_config(None, ["odometry.method=floam", "map.write=false"], {})
 

@@ -7,9 +7,9 @@ import io
 
 import numpy as np
 
+from lslam.core.types.imu import IMU_STATES, ImuDiagnostics, ImuState
+from lslam.core.types.scan_result import ScanResult
 from lslam.pipeline.outputs import imu_states_text
-from lslam.types.imu import IMU_STATES, ImuDiagnostics, ImuState
-from lslam.types.scan_result import ScanResult
 
 
 def test_a_state_stands_beside_its_sigma_and_scans_without_one_are_left_out() -> None:

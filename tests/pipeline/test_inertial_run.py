@@ -13,15 +13,18 @@ import pytest
 from numpy.typing import NDArray
 from stub_sequences import Standstill, Stub
 
-from lslam.config import Config, load_config
-from lslam.errors import GateError, InputError
+from lslam.core.config import Config, load_config
+from lslam.core.errors import GateError, InputError
+from lslam.core.geometry import se3
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import select
 from lslam.evaluation.timing import read_timing_rows
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.inertial_start import begin_inertial, close_inertial
-from lslam.frontend.register_scans import estimate
-from lslam.geometry import se3
-from lslam.inertial.fusion import InertialMotion
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.inertial_start import begin_inertial, close_inertial
+from lslam.odometry.frontend.register_scans import estimate
+from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.pipeline.doctor import Finding
 from lslam.pipeline.doctor.examine_turns import examine_turns
 from lslam.pipeline.run import run
@@ -29,9 +32,6 @@ from lslam.pipeline.watch import RunOutcome
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.imu import ImuStream
-from lslam.types.scan_result import ScanResult
-from lslam.types.sequence import select
 
 pytestmark = pytest.mark.usefixtures("shared_first_poses")
 COUNT = 60

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InterruptedRunError
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InterruptedRunError
 from lslam.pipeline.watch import Watch
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InputError, InterruptedRunError, RunFailedError
-from lslam.formats.point_files import read_cloud, write_cloud
-from lslam.geometry import se3
-from lslam.keyframes.store import KeyframeStore
-from lslam.localization.place_search import PlaceSearch
-from lslam.localization.prior_map import make_prior_map
-from lslam.localization.start import PlaceFinder
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.localization.place_search import PlaceSearch
+from lslam.backend.localization.prior_map import make_prior_map
+from lslam.backend.localization.start import PlaceFinder
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, InterruptedRunError, RunFailedError
+from lslam.core.geometry import se3
+from lslam.core.types.cloud import ArrayCloud
+from lslam.io.formats.point_files import read_cloud, write_cloud
 from lslam.pipeline.localise_pass import Reanchoring
 from lslam.pipeline.prior_map_files import read_prior_map
 from lslam.pipeline.watch import Watch
-from lslam.types.cloud import ArrayCloud
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
 SAME = ("trajectory.tum", "covariances.npz", "localization.csv", "trajectory_odometry.tum", "evaluation.json")

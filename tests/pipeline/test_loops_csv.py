@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.errors import OutputError
+from lslam.core.errors import OutputError
+from lslam.core.types.constraint import Constraint, LoopCandidate
 from lslam.pipeline.outputs import LOOP_COLUMNS, write_loops
-from lslam.types.constraint import Constraint, LoopCandidate
 
 SCANS = [0, 3, 6, 9, 12]
 COVARIANCE = np.diag([0.01, 0.04, 0.01, 1e-6, 1e-6, np.deg2rad(0.5) ** 2])

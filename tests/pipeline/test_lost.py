@@ -14,21 +14,21 @@ import pytest
 from lost_odometry import Corruption, Lost, freeze, slip, yaw_ramp
 from stub_sequences import SAMPLE, Stub
 
-from lslam.config import Config, load_config
-from lslam.errors import GateError, RunFailedError
-from lslam.integrity.monitor import IntegrityMonitor
+from lslam.core.config import Config, load_config
+from lslam.core.errors import GateError, RunFailedError
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import MotionCheck, ScanResult
+from lslam.core.types.sequence import Sequence, select
+from lslam.io.readers import open_sequence
+from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.pipeline import job
 from lslam.pipeline.lost_scans import MOST_SAID, mark_lost, mark_lost_finally
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.run import run
 from lslam.pipeline.watch import RunOutcome, Watch
-from lslam.readers import open_sequence
 from lslam.reports.text import summary
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
-from lslam.types.scan_result import MotionCheck, ScanResult
-from lslam.types.sequence import Sequence, select
 
 BEGIN = 30
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from stub_sequences import Stub
 
-from lslam.config import Config, load_config
-from lslam.errors import InterruptedRunError, OutputError, UsageError
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InterruptedRunError, OutputError, UsageError
+from lslam.core.types.scan_result import ScanResult, Status
 from lslam.pipeline.check import check_config
 from lslam.pipeline.manifest import Manifest, describe_deskew, peak_memory_mb
-from lslam.types.scan_result import ScanResult, Status
 
 
 def results(*statuses: Status) -> list[ScanResult]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.config import load_config
+from lslam.core.config import load_config
+from lslam.core.types.cloud import in_memory
+from lslam.core.types.scan import Scan
+from lslam.core.types.scan_result import ScanResult
 from lslam.pipeline.map_pass import build_map, without_box
 from lslam.simulation.scenarios import simulate
-from lslam.types.cloud import in_memory
-from lslam.types.scan import Scan
-from lslam.types.scan_result import ScanResult
 
 
 def test_the_box_of_the_vehicle_takes_its_points_with_all_they_have() -> None:

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from lslam.errors import InputError, LslamError, OutputError, OutputExistsError
-from lslam.formats.point_files import read_cloud
+from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.gnss import Georeference
+from lslam.io.formats.point_files import read_cloud
 from lslam.maps.georeference import Projection
 from lslam.pipeline import map_tiles
 from lslam.pipeline.map_files import MapNote
 from lslam.pipeline.map_tiles import check_tiles, is_tiles, read_tiles, write_tiles
-from lslam.types.cloud import ArrayCloud
-from lslam.types.gnss import Georeference
 
 NOTE = MapNote("drive", 0.2)
 POINTS = np.random.default_rng(3).uniform([-70, -30, -2], [90, 45, 6], (5000, 3))
@@ -43,7 +43,7 @@ def test_few_points_in_memory_give_the_same_tiles(tmp_path: Path, monkeypatch: p
     (many := tmp_path / "many").mkdir()
     write_tiles(one, CLOUD, NOTE, 20.0, "ply")
     monkeypatch.setattr(map_tiles, "BUFFERED", 100)
-    monkeypatch.setattr("lslam.types.cloud.BLOCK", 64)
+    monkeypatch.setattr("lslam.core.types.cloud.BLOCK", 64)
     write_tiles(many, CLOUD, NOTE, 20.0, "ply")
     assert sorted(p.name for p in one.iterdir()) == sorted(p.name for p in many.iterdir())
     for path in one.iterdir():

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from resident import resident_mb
 
-from lslam.config import load_config
-from lslam.frontend.checkpoints import Checkpoints, OdometryCheckpoints
-from lslam.frontend.keyframing import Keyframing
-from lslam.frontend.register_scans import estimate
-from lslam.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.config import load_config
+from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
+from lslam.odometry.frontend.keyframing import Keyframing
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan_result import ScanResult
 
 SHARES_TOWNS = False
 # A stand-in for the promise (50 MB from scan 500 to scan 2,000) that takes seconds: a fifth of the scans, a fifth of

@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 import lslam
-from lslam.config import load_config
-from lslam.config.config import Config
-from lslam.frontend.register_scans import estimate
+from lslam.core.config import load_config
+from lslam.core.config.config import Config
+from lslam.core.types.sequence import Sequence
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.register_scans import estimate
 from lslam.registration import local_map
 from lslam.simulation.scenarios import simulate
 from lslam.studies.worker import ScanStore, SequenceCache
-from lslam.types.sequence import Sequence
 
 Floats = NDArray[np.float64]
 

@@ -13,13 +13,13 @@ from click.testing import CliRunner
 from point_writers import write_points
 
 from lslam.cli.main import cli
-from lslam.config import load_config
-from lslam.errors import InputError
-from lslam.geometry import se3
-from lslam.geometry.se3 import poses_at
+from lslam.core.config import load_config
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3
+from lslam.core.geometry.se3 import poses_at
+from lslam.io.readers import open_sequence
 from lslam.pipeline.rebuild import open_scans, read_run
 from lslam.pipeline.run import run
-from lslam.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from lslam.config import Config
-from lslam.loops import find_loops
+from lslam.backend.loops import find_loops
+from lslam.core.config import Config
 from lslam.maps import crispness, merge
 from lslam.odometry import create_odometry
 from lslam.pipeline import precompile

@@ -15,12 +15,12 @@ import pytest
 from stub_sequences import Standstill, Stub, noise, sample, with_points
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, UsageError
+from lslam.core.config import Config, load_config
+from lslam.core.errors import GateError, InputError, InterruptedRunError, OutputError, RunFailedError, UsageError
+from lslam.core.types.scan import Scan
 from lslam.evaluation.evaluate import Evaluation
 from lslam.pipeline import job
 from lslam.pipeline.watch import RunOutcome, Watch
-from lslam.types.scan import Scan
 
 ONLY_MAP = {"schema", "version", "lslam", "estimate", "map"}  # of evaluation.json without ground truth
 ALL = {

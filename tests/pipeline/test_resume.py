@@ -16,16 +16,23 @@ import pytest
 from stub_sequences import Stub, noise, sample, with_points
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import GateError, InterruptedRunError, OutputExistsError, RunFailedError, RunFinishedError, UsageError
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend import checkpoints
-from lslam.frontend.checkpoints import CheckpointSchedule
+from lslam.core.config import Config, load_config
+from lslam.core.errors import (
+    GateError,
+    InterruptedRunError,
+    OutputExistsError,
+    RunFailedError,
+    RunFinishedError,
+    UsageError,
+)
+from lslam.core.types.scan import Scan
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps import clean
+from lslam.odometry.frontend import checkpoints
+from lslam.odometry.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline.watch import Watch
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
 
 COUNT = 16
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.errors import OutputError, OutputExistsError
+from lslam.core.errors import OutputError, OutputExistsError
 from lslam.pipeline.run_folder import LOCK, MANIFEST, RunFolder, default_folder
 
 Usage = namedtuple("Usage", "total used free")

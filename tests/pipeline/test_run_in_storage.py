@@ -10,9 +10,9 @@ import pytest
 from storages import Counted, counted
 from stub_sequences import sample
 
-from lslam.config import Config
-from lslam.core.remote import RemotePath
-from lslam.errors import InterruptedRunError, OutputExistsError, RunFinishedError, StorageError
+from lslam.core.config import Config
+from lslam.core.errors import InterruptedRunError, OutputExistsError, RunFinishedError, StorageError
+from lslam.io.remote import RemotePath
 from lslam.pipeline.run import run
 from lslam.pipeline.storage import spool_of
 from lslam.pipeline.watch import Watch

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from stub_sequences import Stub, sample
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InterruptedRunError
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.frontend.checkpoints import CheckpointSchedule
-from lslam.localization import start
+from lslam.backend.localization import start
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InterruptedRunError
+from lslam.core.types.scan import Scan
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.odometry.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
-from lslam.types.trajectory import Trajectory
 
 # 13 m/s in a bend: 1.5 s of scans are missing there.
 COUNT, GAP, MISSING = 95, 30, 15
@@ -222,7 +222,7 @@ def test_without_a_frame_of_most_scans_the_run_is_lost(tmp_path: Path) -> None:
         scan = stub.scans[i]
         assert isinstance(scan, Scan)
         stub.scans[i] = replace(scan, points=scan.points * scale)
-    with pytest.raises(lslam.errors.RunFailedError, match="not tied"):
+    with pytest.raises(lslam.core.errors.RunFailedError, match="not tied"):
         lslam.run(stub, config(), out=tmp_path / "out")
     assert len(columns(tmp_path / "out")["status"]) == 24
     assert manifest(tmp_path / "out")["status"] == "diverged"

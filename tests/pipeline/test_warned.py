@@ -15,14 +15,14 @@ import pytest
 from stub_sequences import sample
 
 import lslam
-from lslam.config import Config, load_config
-from lslam.errors import InterruptedRunError
-from lslam.frontend.checkpoints import CheckpointSchedule
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InterruptedRunError
+from lslam.core.types.sequence import StatedTimes
+from lslam.core.types.warned import MOST_ALIKE, hearing, warnings_so_far
+from lslam.odometry.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import deliver
 from lslam.pipeline.doctor.inspect import inspect
 from lslam.pipeline.watch import Watch
-from lslam.types.sequence import StatedTimes
-from lslam.types.warned import MOST_ALIKE, hearing, warnings_so_far
 
 PACKAGE = Path(lslam.__file__).parent
 LOG = logging.getLogger("lslam")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
 from lslam.registration.acceptance import PRIOR_COVARIANCE, Acceptance, correction
 from lslam.registration.history import History
 from lslam.registration.solver import RegistrationResult

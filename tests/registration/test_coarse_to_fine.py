@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from perturbed_scans import with_other_noise
 from recovery_drives import driven
 
-from lslam.config.odometry import RecoveryConfig
-from lslam.geometry import se3
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.core.config.odometry import RecoveryConfig
+from lslam.core.geometry import se3
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from analytic_scenes import pose_at, room
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH, LocalMap
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.simulation.scenarios import simulate
 

@@ -7,10 +7,10 @@ import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.errors import UsageError
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import UsageError
 from lslam.registration.map_scans import LastKeyframes
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 
 Floats = NDArray[np.float64]

@@ -7,9 +7,9 @@ from analytic_scenes import pose_at
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from lslam.config.input import PreprocessConfig
-from lslam.geometry import se3
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import se3
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.start_search import NEAR, NonGroundPoints, ground_under, on_ground, sought
 
 Floats = NDArray[np.float64]

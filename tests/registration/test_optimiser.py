@@ -10,16 +10,16 @@ from analytic_scenes import bushes, is_near, random_pose, seen_from
 from analytic_scenes import room as lit_room
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
-from lslam.kernels import facts as at
-from lslam.kernels.jit import kernel
-from lslam.kernels.linearisation import Floats, Pose, Search, Settings, Sums, Width
-from lslam.kernels.residuals import Voxels, add_row, nearest, octant_slots
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.kernels import facts as at
+from lslam.core.kernels.jit import kernel
+from lslam.core.kernels.linearisation import Floats, Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.residuals import Voxels, add_row, nearest, octant_slots
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Correspondences, Limits, OptimiserResult, Term, optimise
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS, ResidualKind, residual_named
 from lslam.registration.robust import Annealing

@@ -8,12 +8,12 @@ from analytic_scenes import distance, is_near, pose_at, room, seen_from
 from numpy.typing import NDArray
 from recovery_drives import driven
 
-from lslam.config import load_config
-from lslam.config.config import Config
-from lslam.config.odometry import NO_RECOVERY, RecoveryConfig, rest_alone
-from lslam.geometry import se3
-from lslam.preprocessing.prepare import prepare_points
+from lslam.core.config import load_config
+from lslam.core.config.config import Config
+from lslam.core.config.odometry import NO_RECOVERY, RecoveryConfig, rest_alone
+from lslam.core.geometry import se3
 from lslam.registration.policies import AtRest, CoarseToFine, policies_of
+from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import StartSearch

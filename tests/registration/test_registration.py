@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig
-from lslam.errors import InputError
-from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import se3, so3
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 

@@ -11,13 +11,13 @@ import pytest
 from analytic_scenes import corridor, distance, is_near, pose_at, random_pose, room, seen_from
 from numpy.typing import NDArray
 
-from lslam.config.config import Config
-from lslam.config.input import PreprocessConfig
-from lslam.config.odometry import RegistrationConfig, Residual
-from lslam.geometry import se3
+from lslam.core.config.config import Config
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RegistrationConfig, Residual
+from lslam.core.geometry import se3
 from lslam.odometry.icp import registration_of
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.preprocessing.prepare import prepare_points
+from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS as TABLE
 from lslam.registration.residuals import residual_named

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.geometry import se3, so3
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import se3, so3
 from lslam.registration.rest import PlanWalls, Rest, Votes
 
 Floats = NDArray[np.float64]

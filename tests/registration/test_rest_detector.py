@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.config.input import PreprocessConfig
-from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import prepare_points
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import se3, so3
+from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.rest_detector import RestDetector
 from lslam.registration.solver import RegistrationResult

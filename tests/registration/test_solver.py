@@ -18,11 +18,11 @@ from analytic_scenes import (
 )
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
-from lslam.geometry import se3, so3
-from lslam.preprocessing.prepare import PreparedPoints
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3, so3
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 

@@ -7,7 +7,7 @@ import pytest
 from analytic_scenes import is_near, random_pose, room, seen_from
 from numpy.typing import NDArray
 
-from lslam.config.odometry import RegistrationConfig
+from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.registration import Registration
 from lslam.registration.source_covariance import NEIGHBOURS, Neighbourhood, source_covariance
 

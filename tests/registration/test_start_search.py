@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from recovery_drives import driven, seen_by
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 from lslam.registration.registration import Registration
 from lslam.registration.start_search import MUCH, is_much_more, start_offsets
 from lslam.simulation.scenarios import simulate

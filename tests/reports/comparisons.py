@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from point_writers import write_points
 
-from lslam.types.comparison import (
+from lslam.core.types.comparison import (
     Comparison,
     Difference,
     Drawing,

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.geometry import se3, so3
-from lslam.types.cloud import ArrayCloud
-from lslam.types.run_record import RunRecord
-from lslam.types.scan_result import ScanResult
-from lslam.types.trajectory import Trajectory
+from lslam.core.geometry import se3, so3
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.trajectory import Trajectory
 
 MakeRecord = Callable[..., RunRecord]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.cloud import ArrayCloud
 from lslam.maps.floor_plan import top_view
 from lslam.reports.merge_html import SessionView, write_page
-from lslam.types.cloud import ArrayCloud
 
 
 def sessions(scans: int = 50) -> list[SessionView]:

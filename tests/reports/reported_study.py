@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from lslam.types.study import StudyRow
+from lslam.core.types.study import StudyRow
 
 SKIP, SHARE = "input.skip_frames", "preprocess.random_share"
 

@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.geometry import se3
+from lslam.core.types.building import OsmMatches
+from lslam.core.types.constraint import LoopCandidate
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.run_record import LoopSurroundings, LoopView, RunRecord
 from lslam.evaluation.evaluate import evaluate
-from lslam.geometry import se3
 from lslam.reports.back_end import back_end_figures, back_end_rows, loop_figures
-from lslam.types.building import OsmMatches
-from lslam.types.constraint import LoopCandidate
-from lslam.types.gnss import Georeference
-from lslam.types.run_record import LoopSurroundings, LoopView, RunRecord
 
 
 def test_a_run_without_a_back_end_says_nothing(make_record: Callable[..., RunRecord]) -> None:

@@ -8,9 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.reports.back_end import back_end_rows
-from lslam.reports.buildings import MOST_ROWS, building_figures, building_pages, building_tables, drift_tables
-from lslam.types.building import (
+from lslam.core.types.building import (
     Building,
     BuildingCorrection,
     BuildingMatch,
@@ -19,7 +17,9 @@ from lslam.types.building import (
     KeyframeMatch,
     OsmMatches,
 )
-from lslam.types.run_record import RunRecord
+from lslam.core.types.run_record import RunRecord
+from lslam.reports.back_end import back_end_rows
+from lslam.reports.buildings import MOST_ROWS, building_figures, building_pages, building_tables, drift_tables
 
 Floats = NDArray[np.float64]
 

@@ -15,12 +15,12 @@ import pytest
 from comparisons import comparison, drawing, row, walls
 from test_html import parse
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.types.comparison import Spread
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
 from lslam.reports.map_view import Crop, choose_crops, crop_images
 from lslam.studies.results import metrics_of
-from lslam.types.comparison import Spread
 
 
 def test_one_row_per_method_with_spread_failures_and_words_for_what_is_missing(tmp_path: Path) -> None:

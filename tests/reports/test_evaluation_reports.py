@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config.outputs import EvalConfig
-from lslam.errors import OutputError, UsageError
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.errors import OutputError, UsageError
+from lslam.core.geometry import se3
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
-from lslam.geometry import se3
 from lslam.reports import evaluations, picture
-from lslam.types.trajectory import Trajectory
 
 STAGE = StageTime(0.01, 0.02, 0.03, 0.011, 1.0)
 TIMING = Timing("timing.csv", 150, STAGE, {"read": STAGE}, 0.1, 0)

@@ -17,13 +17,13 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lslam.errors import OutputError
+from lslam.core.errors import OutputError
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.reports.html import flatten, render_report, write_report
-from lslam.types.cloud import ArrayCloud
-from lslam.types.run_record import RunRecord
-from lslam.types.trajectory import Trajectory
 
 MakeRecord = Callable[..., RunRecord]
 VOID = {"meta", "br", "link", "img", "hr", "input"}

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from conftest import MakeRecord
 
+from lslam.core.types.imu import ImuDiagnostics, ImuState, ImuStream
 from lslam.reports import html as module
 from lslam.reports import svg
 from lslam.reports.html import imu_figures
-from lslam.types.imu import ImuDiagnostics, ImuState, ImuStream
 
 
 def state(k: int, is_calibrated: bool) -> ImuState:

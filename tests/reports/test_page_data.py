@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.reports.html import render_report, with_new_map
 from lslam.reports.page_data import cloud_data, scan_data
 from lslam.reports.png import palette
-from lslam.types.cloud import ArrayCloud
-from lslam.types.run_record import RunRecord
 
 MakeRecord = Callable[..., RunRecord]
 

@@ -19,6 +19,8 @@ from comparisons import comparison, drawing
 from merged_sessions import sessions, write
 from reported_study import study_rows
 
+from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.results import Evaluation
 from lslam.evaluation.sensitivity import evaluate_study
@@ -27,8 +29,6 @@ from lslam.reports.html import write_report
 from lslam.reports.picture import COLOURS
 from lslam.reports.png import palette
 from lslam.reports.study_html import write_study_files
-from lslam.types.cloud import ArrayCloud
-from lslam.types.run_record import RunRecord
 
 pytest.importorskip("selenium")
 image_module = pytest.importorskip("PIL.Image")

@@ -7,8 +7,8 @@ from math import nan
 
 import pytest
 
+from lslam.core.types.study import StudyRow
 from lslam.reports.study_table import batch_table, best_points, best_table
-from lslam.types.study import StudyRow
 
 
 def row(skip: int, error: float, seed: int = 0, **more: object) -> StudyRow:

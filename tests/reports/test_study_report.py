@@ -14,13 +14,13 @@ import pytest
 from matplotlib.image import imread
 from reported_study import SHARE, SKIP, row, study_rows
 
-from lslam.config.study import ExpectedFinding
+from lslam.core.config.study import ExpectedFinding
+from lslam.core.types.study import StudyResult, StudyRow
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.picture import COLOURS
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_html import timing_notes, write_study_files
 from lslam.reports.study_table import means_grid, study_tables
-from lslam.types.study import StudyResult, StudyRow
 
 
 @pytest.fixture(scope="module")

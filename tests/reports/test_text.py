@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.config.outputs import EvalConfig
+from lslam.core.config.outputs import EvalConfig
+from lslam.core.types.run_record import RunRecord
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.reports.facts import describe, run_facts, stage_matrix
 from lslam.reports.html import render_report
 from lslam.reports.text import summary
-from lslam.types.run_record import RunRecord
-from lslam.types.trajectory import Trajectory
 
 MakeRecord = Callable[..., RunRecord]
 
@@ -142,8 +142,8 @@ def test_degenerate_directions_are_named() -> None:
 
 
 def test_crispness_is_stated_with_and_without_truth(make_record: MakeRecord) -> None:
+    from lslam.core.types.run_record import Crispness
     from lslam.reports.evaluations import run_document
-    from lslam.types.run_record import Crispness
 
     record = make_record(5)
     assert run_document(record, None) is None

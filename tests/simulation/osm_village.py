@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.osm_data import ATTRIBUTION, OsmData, Way
-from lslam.formats.osm_files import write_osm
-from lslam.geometry.geodesy import from_local
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.building import Building, Footprint
+from lslam.io.formats.osm_data import ATTRIBUTION, OsmData, Way
+from lslam.io.formats.osm_files import write_osm
 from lslam.simulation.osm_extract import osm_from_buildings
-from lslam.types.building import Building, Footprint
 
 ORIGIN = np.array([49.0112, 8.4229, 0.0])
 MAIN = [(-130.0, 0.0), (-40.0, 0.0), (60.0, 0.0), (60.0, 110.0)]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import se3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import Surface

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 from lslam.simulation.curve import RouteCurve, smooth_curve, stretched
 from lslam.simulation.flight import GRAVITY, FreePath, buffeting, climb_spline, fly, gait
 from lslam.simulation.path import SpeedProfile

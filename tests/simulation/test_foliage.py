@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
+from lslam.core.types.scan import Scan
 from lslam.simulation import furniture
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.returns import Returns
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface, box
-from lslam.types.scan import Scan
 
 BEAMS = LidarModel("beams", (0.0,), 36000, 0.1, 500.0, 0.0, 1e-6, 0.0, 1e6, 0.0)
 AHEAD = 5.0  # deg to either side

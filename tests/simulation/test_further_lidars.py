@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.errors import ConfigError, UsageError
-from lslam.formats.sequence_toml import read_sequence_toml
-from lslam.geometry import se3, so3
-from lslam.readers import open_sequence
+from lslam.core.errors import ConfigError, UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.scan import Scan
+from lslam.io.formats.sequence_toml import read_sequence_toml
+from lslam.io.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.record import MANIFEST, record
 from lslam.simulation.scenario_files import parse_scenario, scenario_named, scenario_text
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.scan import Scan
 
 SHARES_TOWNS = True
 COUNT = 3

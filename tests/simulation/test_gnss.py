@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import geodesy, se3, so3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import geodesy, se3, so3
 from lslam.simulation.kinematics import Motion, smooth_motion
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import ORIGIN, T_CAR_ANTENNA, GnssModel, SimulatedGnss, simulate_gnss

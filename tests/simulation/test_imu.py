@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import ImuStream
 from lslam.simulation.imu import (
     GRAVITY,
     IMUS,
@@ -24,7 +25,6 @@ from lslam.simulation.imu import (
 )
 from lslam.simulation.kinematics import Motion, smooth_motion, standing_start
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.imu import ImuStream
 
 SHARES_TOWNS = True
 

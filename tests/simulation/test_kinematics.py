@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 from lslam.simulation.kinematics import Kinematics, Motion, smooth_motion, standing_start
 from lslam.simulation.scenarios import simulate
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import se3, so3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3, so3
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel, lidar_named
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.readers import open_sequence
+from lslam.core.types.scan import Scan
+from lslam.io.readers import open_sequence
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
-from lslam.types.scan import Scan
 
 Floats = NDArray[np.float64]
 Scans = list[Scan]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lslam
-from lslam.geometry import se3
+from lslam.core.geometry import se3
 from lslam.simulation.indoors import SIZE
 from lslam.simulation.scenarios import simulate
 

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.errors import OutputError
+from lslam.core.errors import OutputError
+from lslam.core.version import __version__
 from lslam.simulation import record as recording
 from lslam.simulation.record import MANIFEST, record
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.sensors import GnssModel
-from lslam.version import __version__
 
 
 @pytest.fixture(scope="module")

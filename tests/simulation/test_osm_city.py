@@ -13,13 +13,13 @@ import pytest
 from numpy.typing import NDArray
 from shapely import MultiPolygon, contains_xy, points
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
+from lslam.core.types.building import Building, Footprint, footprint_polygon
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.osm_city import OsmCity, build_osm_city, extrude
 from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.simulation.terrain import flat, rolling
-from lslam.types.building import Building, Footprint, footprint_polygon
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
 

@@ -13,10 +13,11 @@ import pytest
 from numpy.typing import NDArray
 from shapely import LineString, MultiPolygon, STRtree, affinity, get_num_coordinates, union_all
 
-from lslam.errors import InputError, OutputError
-from lslam.formats.osm_buildings import buildings_of
-from lslam.formats.osm_data import ATTRIBUTION
-from lslam.formats.osm_files import read_osm, write_osm
+from lslam.core.errors import InputError, OutputError
+from lslam.core.types.building import Building, Footprint, footprint_polygon
+from lslam.io.formats.osm_buildings import buildings_of
+from lslam.io.formats.osm_data import ATTRIBUTION
+from lslam.io.formats.osm_files import read_osm, write_osm
 from lslam.simulation.city import City
 from lslam.simulation.osm_city import build_osm_city
 from lslam.simulation.osm_extract import Extracts, city_buildings, osm_from_buildings, write_extracts
@@ -33,7 +34,6 @@ from lslam.simulation.osm_place import read_extract
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.terrain import flat, rolling
-from lslam.types.building import Building, Footprint, footprint_polygon
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
 CM = 0.01

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from formats.osm_builders import ExtractMaker
+from osm_builders import ExtractMaker
 from osm_village import MAIN, ORIGIN, SIDE, houses, village, write_village
 from shapely import LineString, MultiPolygon, Point, contains_xy, distance, points
 
-from lslam.errors import InputError, UsageError
-from lslam.formats.osm_buildings import buildings_of
-from lslam.formats.osm_data import ATTRIBUTION
-from lslam.formats.osm_files import read_osm, write_osm
-from lslam.geometry.geodesy import from_local, to_local
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry.geodesy import from_local, to_local
+from lslam.core.types.building import footprint_polygon
+from lslam.io.formats.osm_buildings import buildings_of
+from lslam.io.formats.osm_data import ATTRIBUTION
+from lslam.io.formats.osm_files import read_osm, write_osm
 from lslam.osm.overpass import from_overpass
 from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
@@ -27,7 +28,6 @@ from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import Surface
 from lslam.simulation.waypoints import WayPoints
-from lslam.types.building import footprint_polygon
 
 WALLS = MultiPolygon([footprint_polygon(f) for b in houses() for f in b.footprints])
 

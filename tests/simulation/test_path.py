@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.geometry import se3, so3
+from lslam.core.geometry import se3, so3
 from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve, winding_line
 from lslam.simulation.path import SpeedProfile, Suspension, VehiclePath, drive, suspension
 from lslam.simulation.terrain import flat, rolling

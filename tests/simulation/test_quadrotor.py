@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lslam.errors import ConfigError, UsageError
+from lslam.core.errors import ConfigError, UsageError
 from lslam.simulation.flight import HOVER, VIOLENT
 from lslam.simulation.imu import GRAVITY, specific_force
 from lslam.simulation.kinematics import Kinematics

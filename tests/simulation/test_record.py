@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.errors import OutputError, OutputExistsError
-from lslam.formats.calibration_files import read_odometry_calib
-from lslam.formats.sequence_toml import read_sequence_toml
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.core.errors import OutputError, OutputExistsError
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan
+from lslam.io.formats.calibration_files import read_odometry_calib
+from lslam.io.formats.sequence_toml import read_sequence_toml
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.types.scan import Scan
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 
@@ -64,7 +64,7 @@ def test_ground_truth_comes_back_through_the_camera(drive: SimulatedDrive, tmp_p
 
 
 def test_a_reader_opens_it(drive: SimulatedDrive, tmp_path: Path) -> None:
-    from lslam.readers import open_sequence
+    from lslam.io.readers import open_sequence
 
     record(drive, tmp_path / "out")
     sequence = open_sequence(tmp_path / "out")

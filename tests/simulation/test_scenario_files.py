@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.errors import ConfigError, UsageError
+from lslam.core.errors import ConfigError, UsageError
 from lslam.simulation.built_scenario import BuiltScenario, build_scenario
 from lslam.simulation.scenario_files import Scenario, parse_scenario, scenario_named, scenario_names
 from lslam.simulation.scenarios import simulate

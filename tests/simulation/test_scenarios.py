@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.errors import UsageError
-from lslam.geometry import se3
+from lslam.core.errors import UsageError
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import Surface
-from lslam.types.scan import Scan
-from lslam.types.sequence import Sequence
 
 
 @pytest.fixture(scope="module")

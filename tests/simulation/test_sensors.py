@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.errors import UsageError
-from lslam.formats.stamped_csv import read_stamped_csv
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import geodesy, se3, so3
-from lslam.readers import open_sequence
+from lslam.core.errors import UsageError
+from lslam.core.geometry import geodesy, se3, so3
+from lslam.io.formats.stamped_csv import read_stamped_csv
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.simulation.imu import GRAVITY
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.geometry import se3
+from lslam.core.geometry import se3
 from lslam.simulation import indoors as st
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 

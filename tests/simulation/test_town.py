@@ -8,7 +8,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
+from lslam.core.types.scan import Scan
 from lslam.simulation.built_scenario import check_bends, check_path
 from lslam.simulation.city import KERB, City
 from lslam.simulation.scenario_files import scenario_names
@@ -16,7 +17,6 @@ from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, Surface
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import Network
-from lslam.types.scan import Scan
 
 GROUND = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN)
 

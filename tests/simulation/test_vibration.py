@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.errors import ConfigError
-from lslam.geometry import se3
+from lslam.core.errors import ConfigError
+from lslam.core.geometry import se3
 from lslam.simulation.kinematics import Vibration, shaking
 from lslam.simulation.lidar import trace
 from lslam.simulation.lidar_models import LidarModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.errors import UsageError
+from lslam.core.errors import UsageError
 from lslam.simulation.routes import FIRST_VISIT, Visit
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 

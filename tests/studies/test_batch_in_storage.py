@@ -10,8 +10,9 @@ from distributed import LocalCluster
 from storages import Counted, counted, stored
 from stub_sequences import SAMPLE
 
-from lslam.config.study import BatchConfig, parse_batch
-from lslam.core.remote import RemotePath
+from lslam.core.config.study import BatchConfig, parse_batch
+from lslam.core.types.study import StudyRow
+from lslam.io.remote import RemotePath
 from lslam.pipeline.storage import spool_of
 from lslam.studies.batch import expand_batch, expand_lines, listed_line
 from lslam.studies.cluster import connected
@@ -19,7 +20,6 @@ from lslam.studies.expanded_study import make_runs
 from lslam.studies.jobs import finished, said_file
 from lslam.studies.output import OutputOptions
 from lslam.studies.results_csv import read_state, read_study_csv
-from lslam.types.study import StudyRow
 
 
 @pytest.fixture

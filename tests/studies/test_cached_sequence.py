@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.config.load import load_config
+from lslam.core.config.load import load_config
+from lslam.core.types.scan import Scan
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.studies.grid import Job
 from lslam.studies.jobs import run_jobs
 from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress, Task, WorkerPool
 from lslam.studies.worker import ScanStore, SequenceCache, memory_bound, size_of
-from lslam.types.scan import Scan
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 SHARES_TOWNS = False  # what is asked is who traces a scan

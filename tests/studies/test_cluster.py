@@ -15,8 +15,9 @@ import pytest
 from distributed import LocalCluster
 
 from lslam.cli.options import engine_of
-from lslam.config.study import parse_study
-from lslam.errors import InputError, RunFailedError, UsageError
+from lslam.core.config.study import parse_study
+from lslam.core.errors import InputError, RunFailedError, UsageError
+from lslam.core.types.study import StudyRow
 from lslam.studies import cluster
 from lslam.studies.cluster import Cluster, connected, pack, unpack
 from lslam.studies.grid import Job
@@ -25,7 +26,6 @@ from lslam.studies.results_csv import State, read_state, read_study_csv, write_s
 from lslam.studies.runner import StudyProgress
 from lslam.studies.sweep import Sweep, expand_study, run_sweep
 from lslam.studies.worker import WorkerContext
-from lslam.types.study import StudyRow
 
 TREE = {
     "sequences": [{"scenario": "block", "lidar": "sample", "columns": 256, "scans": 12}],

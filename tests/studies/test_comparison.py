@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 
 import lslam
-from lslam.errors import InputError, InterruptedRunError, OutputExistsError, UsageError
+from lslam.core.errors import InputError, InterruptedRunError, OutputExistsError, UsageError
+from lslam.core.geometry import se3
+from lslam.core.types.comparison import Comparison, RunScore
+from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.formats.trajectory_files import read_trajectory
-from lslam.geometry import se3
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
 from lslam.pipeline.watch import Watch
-from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
 from lslam.studies.compare import _in_world_of_truth, compare
@@ -33,8 +35,6 @@ from lslam.studies.runner import StudyProgress, WorkerPool
 from lslam.studies.subjects import Subject
 from lslam.studies.variants import find_variants
 from lslam.studies.worker import WorkerContext
-from lslam.types.comparison import Comparison, RunScore
-from lslam.types.trajectory import Trajectory
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 SCANS = 14

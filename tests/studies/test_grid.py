@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.config import Config, load_config
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, UsageError
 from lslam.core.printable import file_safe
-from lslam.errors import InputError, UsageError
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.readers import open_sequence
 from lslam.pipeline.resume import input_digest, job_digest
-from lslam.readers import open_sequence
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
 from lslam.studies.grid import Cell, Job, expand
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state
 from lslam.studies.subjects import Scene, find_subjects, scans_needed, simulate_once
 from lslam.studies.variants import Variant, find_variants
-from lslam.types.trajectory import Trajectory
 
 
 def variants(*names: str, settings: tuple[str, ...] = ()) -> list[Variant]:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lslam.core.types.comparison import RunScore
 from lslam.studies.paired import compare_pairs, summarise
-from lslam.types.comparison import RunScore
 
 
 def run(sequence: str, method: str, seed: int, ate: float | None, status: str = "done", **more: float) -> RunScore:

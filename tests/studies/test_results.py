@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.config import Config
+from lslam.core.config import Config
 from lslam.studies import results
 from lslam.studies.grid import Job
 from lslam.studies.results import Results

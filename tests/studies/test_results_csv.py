@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from lslam.errors import InputError
+from lslam.core.errors import InputError
+from lslam.core.types.study import StudyRow, Value
 from lslam.studies.results_csv import read_study_csv, write_study_csv
-from lslam.types.study import StudyRow, Value
 
 DONE = StudyRow(
     "open-0/thesis-icp/1", "skip frames", "open", 0, "thesis-icp", True, {"input.skip_frames": 3, "map.voxel": 0.1 + 0.2},

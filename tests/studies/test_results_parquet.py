@@ -6,8 +6,8 @@ from pathlib import Path
 
 from pyarrow import parquet
 
+from lslam.core.types.study import StudyRow
 from lslam.studies.results_csv import write_study_parquet
-from lslam.types.study import StudyRow
 
 
 def test_columns_have_types_and_what_is_not_there_is_null(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from typing import get_args
 
 import pytest
 
-from lslam.config.study import Kind
-from lslam.errors import UsageError
+from lslam.core.config.study import Kind
+from lslam.core.errors import UsageError
 from lslam.studies.expanded_study import ExpandedStudy
 from lslam.studies.output import OutputOptions
 from lslam.studies.study_files import find_study, study_names

@@ -13,8 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.config.study import StudyConfig, parse_study
-from lslam.errors import ConfigError, InputError, InterruptedRunError, OutputExistsError, RunFailedError, UsageError
+from lslam.core.config.study import StudyConfig, parse_study
+from lslam.core.errors import (
+    ConfigError,
+    InputError,
+    InterruptedRunError,
+    OutputExistsError,
+    RunFailedError,
+    UsageError,
+)
+from lslam.core.types.study import StudyRow
 from lslam.studies.estimate import estimate, from_finished
 from lslam.studies.expanded_study import ExpandedStudy
 from lslam.studies.jobs import Local
@@ -25,7 +33,6 @@ from lslam.studies.runner import StudyProgress
 from lslam.studies.study_files import find_study
 from lslam.studies.subjects import used
 from lslam.studies.sweep import Sweep, expand_study, run_sweep, write_study_report
-from lslam.types.study import StudyRow
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from lslam.config import load_config
+from lslam.core.config import load_config
 from lslam.odometry.icp import Icp
 from lslam.pipeline import job as prepared
 from lslam.studies import worker

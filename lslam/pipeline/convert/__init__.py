@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lslam.errors import OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import OutputError, OutputExistsError, UsageError, cause
 
 SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 

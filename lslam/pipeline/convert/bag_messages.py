@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.formats.pointcloud2 import TYPES
-from lslam.geometry import so3
-from lslam.types.arrays import Floats, Longs
-from lslam.types.scan import Scan
+from lslam.core.geometry import so3
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.scan import Scan
+from lslam.io.formats.pointcloud2 import TYPES
 
 _CODES = {np.dtype(name): code for code, name in TYPES.items()}  # of sensor_msgs/PointField
 _UNKNOWN = np.r_[-1.0, np.zeros(8)]  # sensor_msgs/Imu: a first covariance of -1 means that there is no such reading

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from lslam.errors import OutputError, UsageError, cause
-from lslam.formats.bag_files import INFO_TOPIC, typestore
+from lslam.core.errors import OutputError, UsageError, cause
+from lslam.io.formats.bag_files import INFO_TOPIC, typestore
 
 # What belongs to the whole of a run.
 MAP_TOPIC, PATH_TOPIC = "/map", "/path"

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError, UsageError
-from lslam.formats.point_files import read_cloud
-from lslam.frontend.register_scans import read_ahead
-from lslam.kernels.voxel import first_points
+from lslam.core.errors import InputError, UsageError
+from lslam.core.kernels.voxel import first_points
+from lslam.core.types.arrays import Floats
+from lslam.core.types.sequence import Sequence
+from lslam.io.formats.point_files import read_cloud
 from lslam.maps.clean import PosedScan
+from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
 from lslam.pipeline.convert.bag_writer import MAP_TOPIC, PATH_TOPIC, BagWriter
 from lslam.pipeline.map_files import in_own_world
 from lslam.pipeline.map_pass import scan_poser
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, map_of, results_of
-from lslam.types.arrays import Floats
-from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 

@@ -13,23 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from lslam.errors import InputError, UsageError
-from lslam.formats.bag_files import INFO_TOPIC
-from lslam.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
-from lslam.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
-from lslam.formats.stamped_csv import write_gnss_csv, write_imu_csv
-from lslam.formats.trajectory_files import write_kitti, write_tum
-from lslam.frontend.register_scans import sweep_of
-from lslam.geometry import se3
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry import se3
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Calibration, Sequence
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.bag_files import INFO_TOPIC
+from lslam.io.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_calib, write_scan, write_times
+from lslam.io.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
+from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv
+from lslam.io.formats.trajectory_files import write_kitti, write_tum
+from lslam.odometry.frontend.register_scans import sweep_of
 from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.convert.convert_trajectory import change_frame
 from lslam.pipeline.map_pass import motion_within
-from lslam.preprocessing.deskew import deskew_points
-from lslam.preprocessing.merged_lidars import MergedLidars
-from lslam.types.scan import Scan
-from lslam.types.sequence import Calibration, Sequence
-from lslam.types.trajectory import Trajectory
+from lslam.registration.preprocessing.deskew import deskew_points
+from lslam.registration.preprocessing.merged_lidars import MergedLidars
 
 log = logging.getLogger("lslam")
 

@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core.errors import InputError, OutputExistsError, UsageError
 from lslam.core.extras import importing, install_hint
-from lslam.errors import InputError, OutputExistsError, UsageError
-from lslam.formats.atomic import write_text
-from lslam.formats.sequence_toml import FRAMES
-from lslam.formats.stamp_texts import utc_of
-from lslam.formats.trajectory_formats import FORMATS, WRITTEN
-from lslam.geometry import se3
+from lslam.core.geometry import se3
+from lslam.core.types.gnss import Georeference
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Trajectory
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.sequence_toml import FRAMES
+from lslam.io.formats.stamp_texts import utc_of
+from lslam.io.formats.trajectory_formats import FORMATS, WRITTEN
 from lslam.maps.georeference import to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json
-from lslam.types.gnss import Georeference
-from lslam.types.sequence import Calibration
-from lslam.types.trajectory import Trajectory
-from lslam.version import __version__
 
 log = logging.getLogger("lslam")
 

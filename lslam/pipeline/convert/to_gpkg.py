@@ -11,19 +11,19 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lslam.core.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.core.extras import importing, install_hint
-from lslam.errors import InputError, OutputError, OutputExistsError, UsageError, cause
-from lslam.formats.stamp_texts import utc_of
-from lslam.geometry.geodesy import from_local
+from lslam.core.geometry.geodesy import from_local
+from lslam.core.types.arrays import Floats
+from lslam.core.types.building import CorrectedMap
+from lslam.core.types.gnss import Georeference
+from lslam.io.formats.stamp_texts import utc_of
 from lslam.maps.georeference import to_lat_lon
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.convert import staged
 from lslam.pipeline.convert.convert_trajectory import georeference_beside
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
 from lslam.pipeline.run_folder import require_run
-from lslam.types.arrays import Floats
-from lslam.types.building import CorrectedMap
-from lslam.types.gnss import Georeference
 
 Shape = Literal["points", "lines", "polygons"]
 Value = int | float | str | datetime | None

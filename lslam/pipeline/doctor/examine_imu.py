@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
-from lslam.inertial.initialise import STILL_FORCE, STILL_RATE
+from lslam.core.types.arrays import Floats
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.sequence import Sequence, no_shared_time
+from lslam.odometry.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
+from lslam.odometry.inertial.initialise import STILL_FORCE, STILL_RATE
 from lslam.pipeline.doctor import Facts, Finding, plural
-from lslam.types.arrays import Floats
-from lslam.types.imu import ImuStream
-from lslam.types.sequence import Sequence, no_shared_time
 
 # s of standing: white noise is read off the Allan deviation from the first on, where that has its least from the second.
 _WHITE_S, _STABLE_S = 10.0, 120.0

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.geometry.geodesy import to_local
+from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.sequence import Sequence, no_shared_time
+from lslam.core.types.trajectory import Trajectory
 from lslam.pipeline.doctor import Facts, Finding, plural
-from lslam.types.arrays import Floats, Longs
-from lslam.types.sequence import Sequence, no_shared_time
-from lslam.types.trajectory import Trajectory
 
 # m/s2 that nothing which carries a LiDAR is accelerated by: of fixes and truths.
 _ACCELERATION = 15.0

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.errors import InputError
-from lslam.integrity.directions import MOST_EMPTIED, emptied, filled_directions
+from lslam.core.errors import InputError
+from lslam.core.types.arrays import Longs
+from lslam.core.types.scan import FARTHEST_M, NO_RING, Scan
+from lslam.core.types.sequence import Sequence
+from lslam.odometry.integrity.directions import MOST_EMPTIED, emptied, filled_directions
 from lslam.pipeline.doctor import Facts, Finding, plural
-from lslam.preprocessing.rings import RingRule
-from lslam.preprocessing.views import with_rings
-from lslam.types.arrays import Longs
-from lslam.types.scan import FARTHEST_M, NO_RING, Scan
-from lslam.types.sequence import Sequence
+from lslam.registration.preprocessing.rings import RingRule
+from lslam.registration.preprocessing.views import with_rings
 
 # A sweep lasts one period; drivers that cut it elsewhere stay well within these.
 _SWEEP = (0.2, 1.6)

@@ -8,17 +8,17 @@ from itertools import permutations, product
 
 import numpy as np
 
-from lslam.config import Config
-from lslam.frontend.inertial_start import first_poses
-from lslam.geometry import so3
-from lslam.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
-from lslam.inertial.fusion import InertialMotion
-from lslam.inertial.imu_cleaning import Cleaned, ImuFault, ImuRefusedError, clean
-from lslam.inertial.initialise import FirstPoses, start, told_poses
+from lslam.core.config import Config
+from lslam.core.geometry import so3
+from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.sequence import Sequence
+from lslam.odometry.frontend.inertial_start import first_poses
+from lslam.odometry.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
+from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.odometry.inertial.imu_cleaning import Cleaned, ImuFault, ImuRefusedError, clean
+from lslam.odometry.inertial.initialise import FirstPoses, start, told_poses
 from lslam.pipeline.doctor import Facts, Finding
-from lslam.types.arrays import Bools, Floats, Longs
-from lslam.types.imu import ImuStream
-from lslam.types.sequence import Sequence
 
 log = logging.getLogger("lslam")
 

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from lslam.core.types.arrays import Stamps
+from lslam.core.types.scan import Span
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
 from lslam.pipeline.doctor import Finding
-from lslam.types.arrays import Stamps
-from lslam.types.scan import Span
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 # So many times too long is what was taken for s, and too short what was taken for ns.
 UNITS = {1e3: ("ms", "us"), 1e6: ("us", "ms"), 1e9: ("ns", "s")}

@@ -8,23 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.config.input import PreprocessConfig
-from lslam.errors import LslamError
-from lslam.formats.bag_files import Bag, BagTopic, open_bag
-from lslam.formats.stamp_texts import utc_of
-from lslam.frontend.point_times import with_point_times
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.errors import LslamError
+from lslam.core.types.arrays import Longs
+from lslam.core.types.scan import Span
+from lslam.core.types.sequence import Sequence
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.bag_files import Bag, BagTopic, open_bag
+from lslam.io.formats.stamp_texts import utc_of
+from lslam.io.readers import bag as bag_reader
+from lslam.io.readers.lookup import find_folder
+from lslam.odometry.frontend.point_times import with_point_times
 from lslam.pipeline.doctor import Facts, Finding
 from lslam.pipeline.doctor.examine_imu import examine_imu
 from lslam.pipeline.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps
 from lslam.pipeline.doctor.examine_scans import examine_points, examine_stamps, examine_times, rings_rule
 from lslam.pipeline.doctor.examine_turns import examine_turns
 from lslam.pipeline.doctor.examine_units import examine_units
-from lslam.readers import bag as bag_reader
-from lslam.readers.lookup import find_folder
-from lslam.types.arrays import Longs
-from lslam.types.scan import Span
-from lslam.types.sequence import Sequence
-from lslam.types.trajectory import Trajectory
 
 
 def examine_bag(bag: Bag, uses: Mapping[str, str]) -> Facts:

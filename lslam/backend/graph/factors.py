@@ -1,0 +1,265 @@
+"""From plain values to factors of gtsam.
+
+Of K keyframes k has the key k, the floor the key K, the map the key K + 1; correlated noise of fixes has keys from `FIX_NOISE`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lslam.backend.graph.fix_noise import GaussMarkovNoise
+from lslam.backend.graph.inertial_factors import inertial_factors, insert_inertial
+from lslam.backend.graph.problem import FloorPlane, PlanarPrior, PoseGraph, PositionFix
+from lslam.core.geometry import noise, se2, se3, so3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import Constraint, Turn
+
+# Sigmas of the prior on the first pose, m and rad, when anchored and when the fixes anchor it, where its tilt has one of its
+# own (`PoseGraph.tilt_sigma`); of its tilt before up is known.
+HELD, FREE, TILTING = (1e-4, 1e-4), (1e3, 3.0), 0.2
+# m, sigma of the positions that a gyroscope does not observe.
+ANYWHERE = 1e4
+# x, y and yaw among the six of a pose, translation first.
+PLANAR = [0, 1, 5]
+# Roll and pitch, likewise.
+TILT = [3, 4]
+# First key of the correlated noise of fixes, beyond all others.
+FIX_NOISE = 1 << 40
+# Correlation times after which an error is independent.
+LONG = 20.0
+# Least sigmas of a constraint, m and rad, for the optimiser's arithmetic.
+SMALLEST = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
+
+
+def well_conditioned(covariance: Floats) -> Floats:
+    """Symmetric, positive definite (..., 6, 6): no sigma is below `SMALLEST`."""
+    scaled = covariance / np.outer(SMALLEST, SMALLEST)
+    values, vectors = np.linalg.eigh(0.5 * (scaled + np.swapaxes(scaled, -1, -2)))
+    kept = (vectors * np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(kept * np.outer(SMALLEST, SMALLEST))
+
+
+def between(constraint: Constraint, scale: float = 1.0, kernel: Any = None) -> Any:
+    """A relation between two keyframes; `scale` multiplies its covariance, `kernel` is an M-estimator of gtsam."""
+    return between_makers([constraint])[0](scale, kernel)
+
+
+def between_all(constraints: Sequence[Constraint]) -> list[Any]:
+    """As `between` of each."""
+    return [make(1.0, None) for make in between_makers(constraints)]
+
+
+def between_makers(constraints: Sequence[Constraint]) -> list[Callable[[float, Any], Any]]:
+    """What makes each, by scale and kernel as `between` does: linear algebra of thousands takes longer one by one."""
+    import gtsam
+
+    if not constraints:
+        return []
+    poses = np.stack([c.T_a_b for c in constraints])
+    bodies = noise.to_body(well_conditioned(np.stack([c.covariance for c in constraints])), poses)
+
+    def make(c: Constraint, pose: Any, body: Floats, scale: float, kernel: Any) -> Any:
+        model = gtsam.noiseModel.Gaussian.Covariance(scale * body)
+        return gtsam.BetweenFactorPose3(c.a, c.b, pose, _robust(model, kernel))
+
+    return [partial(make, c, gtsam.Pose3(c.T_a_b), body) for c, body in zip(constraints, bodies, strict=True)]
+
+
+def position(fix: PositionFix, scale: float = 1.0, kernel: Any = None) -> Any:
+    """A measured position of the antenna."""
+    import gtsam
+
+    model = _robust(gtsam.noiseModel.Diagonal.Sigmas(np.sqrt(scale) * fix.sigma), kernel)
+    if fix.share:
+        return _between_keyframes(fix, model)
+    if fix.instant is None:
+        return gtsam.GPSFactorArm(fix.keyframe, fix.position, fix.arm, model)
+    key, arm = FIX_NOISE + fix.instant, fix.arm
+    across = so3.hat(arm)
+
+    def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
+        pose = values.atPose3(fix.keyframe)
+        R = pose.rotation().matrix()
+        if jacobians is not None:
+            jacobians[0] = np.hstack([-R @ across, R])
+            jacobians[1] = np.eye(3)
+        return np.asarray(pose.translation() + R @ arm + values.atPoint3(key) - fix.position)
+
+    return gtsam.CustomFactor(model, [fix.keyframe, key], error)
+
+
+def _between_keyframes(fix: PositionFix, model: Any) -> Any:
+    """A measured position on the way from one keyframe to the next: scans there follow both."""
+    import gtsam
+
+    ends = ((fix.keyframe, fix.arm, 1.0 - fix.share), (fix.keyframe + 1, fix.next_arm, fix.share))
+
+    def error(_: Any, values: Any, jacobians: list[Floats] | None) -> Floats:
+        off = -fix.position
+        for i, (key, arm, weight) in enumerate(ends):
+            pose = values.atPose3(key)
+            R = pose.rotation().matrix()
+            off = off + weight * (pose.translation() + R @ arm)
+            if jacobians is not None:
+                jacobians[i] = weight * np.hstack([-R @ so3.hat(arm), R])
+        return np.asarray(off)
+
+    return gtsam.CustomFactor(model, [key for key, _, _ in ends], error)
+
+
+def planar(prior: PlanarPrior, pose: Floats, key: int, scale: float = 1.0, kernel: Any = None) -> Any:
+    """A planar prior on a keyframe in the map `key`: height, roll, pitch and directions that walls do not observe stay free.
+
+    pose : (4, 4) of the keyframe now, at whose height and tilt the error is linearised
+    """
+    import gtsam
+
+    T = _seen_from_above(prior.pose, pose)
+    information = np.zeros((6, 6))
+    information[np.ix_(PLANAR, PLANAR)] = prior.information * (prior.share / scale)
+    values, axes = np.linalg.eigh(noise.to_body(information, T))
+    # Rows of the square root, one per observed direction: an unobserved one has no information at all.
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * axes.T
+    model = gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
+    return gtsam.BetweenFactorPose3(key, prior.keyframe, gtsam.Pose3(T), _robust(model, kernel))
+
+
+def _seen_from_above(planar: Floats, pose: Floats) -> Floats:
+    """(4, 4) at x, y and yaw of `planar` (3,), with the height and the tilt of `pose` (4, 4)."""
+    turn = se2.to_se3(np.array([0.0, 0.0, planar[2] - se2.of_se3(pose)[2]]))[:3, :3]
+    return se3.make(turn @ pose[:3, :3], np.array([*planar[:2], pose[2, 3]]))
+
+
+def map_key(graph: PoseGraph) -> int:
+    """The key of the map's frame."""
+    return len(graph) + 1
+
+
+def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
+    """The factors that are no outlier candidates, held ones too; with `may_tilt` the first pose may tilt."""
+    import gtsam
+
+    factors = gtsam.NonlinearFactorGraph()
+    factors.add(_start(graph, may_tilt))
+    for factor in _relative(graph):
+        factors.add(factor)
+    for fix in graph.fixes:
+        if fix.is_held:
+            factors.add(position(fix))
+    for up in graph.free_ups:
+        model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
+        factors.add(gtsam.AttitudeFactorPose3(up.keyframe, gtsam.Unit3(graph.world_up), model, gtsam.Unit3(up.up)))
+    for turn in graph.turns:
+        factors.add(_turn(turn))
+    for floor in graph.floors:
+        factors.add(_floor(floor, len(graph)))
+    if graph.fix_noise is not None:
+        _add_fix_noise(factors, graph.fix_noise)
+    if graph.map_priors:
+        shift = gtsam.noiseModel.Diagonal.Sigmas(
+            np.array([HELD[1]] * 3 + [max(graph.shift_sigma, HELD[0])] * 2 + [HELD[0]])
+        )
+        factors.add(gtsam.PriorFactorPose3(map_key(graph), gtsam.Pose3(), shift))
+    return factors
+
+
+def _relative(graph: PoseGraph) -> list[Any]:
+    """Odometry, held loop closures and the IMU between keyframes."""
+    held = [loop for loop in graph.loops if loop.is_held]
+    imu = [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up)
+    return [*between_all([*graph.odometry, *held]), *imu]
+
+
+def _start(graph: PoseGraph, may_tilt: bool) -> Any:
+    """The prior on the first pose."""
+    import gtsam
+
+    sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
+    held = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    if not graph.is_anchored:
+        held[TILT, TILT] = graph.tilt_sigma**2
+    if graph.start_sigma is not None:
+        held[PLANAR, PLANAR] = graph.start_sigma**2
+    if may_tilt:
+        held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
+    first = graph.poses[0] if graph.start is None else _seen_from_above(graph.start, graph.poses[0])
+    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, first))
+    return gtsam.PriorFactorPose3(0, gtsam.Pose3(first), start)
+
+
+def start_values(graph: PoseGraph, poses: Floats) -> Any:
+    """Initial values of all variables, poses (K, 4, 4) of the keyframes."""
+    import gtsam
+
+    values = gtsam.Values()
+    for k, pose in enumerate(poses):
+        values.insert(k, gtsam.Pose3(pose))
+    if graph.floors:
+        values.insert(len(poses), gtsam.OrientedPlane3(_floor_in_world(graph.floors, poses)))
+    if graph.map_priors:
+        values.insert(map_key(graph), gtsam.Pose3())
+    if graph.inertial is not None:
+        insert_inertial(values, graph.inertial, poses)
+    if graph.fix_noise is not None:
+        for i in range(len(graph.fix_noise.seconds)):
+            values.insert(FIX_NOISE + i, np.zeros(3))
+    return values
+
+
+def poses_of(values: Any, count: int) -> Floats:
+    """(K, 4, 4) poses of a solution."""
+    return np.stack([values.atPose3(k).matrix() for k in range(count)])
+
+
+def _turn(turn: Turn) -> Any:
+    import gtsam
+
+    model = gtsam.noiseModel.Diagonal.Sigmas(np.array([turn.sigma] * 3 + [ANYWHERE] * 3))
+    pose = gtsam.Pose3(gtsam.Rot3(turn.R_a_b), np.zeros(3))
+    return gtsam.BetweenFactorPose3(turn.a, turn.b, pose, model)
+
+
+def _floor(floor: FloorPlane, key: int) -> Any:
+    import gtsam
+
+    # gtsam's planes are n . p + d = 0 with errors of direction (2) first, then of distance.
+    model = gtsam.noiseModel.Diagonal.Sigmas(np.array([floor.sigma_rad, floor.sigma_rad, floor.sigma_m]))
+    return gtsam.OrientedPlane3Factor(np.append(floor.normal, floor.offset), model, floor.keyframe, key)
+
+
+def _add_fix_noise(factors: Any, fix_noise: GaussMarkovNoise) -> None:
+    """A first-order Gauss-Markov process in its steady state.
+
+    (b - p a)^2 = p (b - a)^2 + (1 - p) b^2 - p (1 - p) a^2: between factors of instants a and b, and a prior on each.
+    """
+    import gtsam
+
+    steps = np.minimum(np.diff(fix_noise.seconds) / fix_noise.memory, LONG)
+    kept, driven = np.exp(-steps), -np.expm1(-2 * steps)
+    own = np.append(1.0, 1 / (1 + kept))
+    own[:-1] -= kept / (1 + kept)
+    for i, weight in enumerate(own.tolist()):
+        model = gtsam.noiseModel.Diagonal.Sigmas(fix_noise.sigma / np.sqrt(weight))
+        factors.add(gtsam.PriorFactorPoint3(FIX_NOISE + i, np.zeros(3), model))
+    for i, ratio in enumerate((driven / kept).tolist()):
+        model = gtsam.noiseModel.Diagonal.Sigmas(fix_noise.sigma * np.sqrt(ratio))
+        factors.add(gtsam.BetweenFactorPoint3(FIX_NOISE + i, FIX_NOISE + i + 1, np.zeros(3), model))
+
+
+def _floor_in_world(floors: Any, poses: Floats) -> Floats:
+    """(4,) the median of the floor planes."""
+    normals = np.stack([poses[f.keyframe][:3, :3] @ f.normal for f in floors])
+    normal = np.median(normals, axis=0)
+    normal /= np.linalg.norm(normal)
+    offsets = [f.offset - n @ poses[f.keyframe][:3, 3] for f, n in zip(floors, normals, strict=True)]
+    return np.append(normal, np.median(offsets))
+
+
+def _robust(model: Any, kernel: Any) -> Any:
+    import gtsam
+
+    return model if kernel is None else gtsam.noiseModel.Robust.Create(kernel, model)

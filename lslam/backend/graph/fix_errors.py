@@ -1,0 +1,247 @@
+"""Errors of GNSS fixes that their sigmas do not state: a wrong clock, more noise than stated, heights of another datum.
+
+Over a second odometry is far better than a receiver, whatever it drifts over a kilometre. Displacements over that time tell
+the offset between both clocks, and differences of successive residuals the white noise of each axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry.noise import quantile
+from lslam.core.types.arrays import Bools, Floats
+
+# s; offsets that are tried, their step, and the time over which displacements are compared.
+LARGEST_S, STEP_S, LAG_S = 2.5, 0.05, 1.0
+# Gain of the squared residuals that an offset must bring, in units of their noise, and its size in its own sigmas.
+LEAST_GAIN, LEAST_SIGMAS = 30.0, 5.0
+# s; a smaller offset is one of the stamps' resolution. Displacements below are too few.
+LEAST_OFFSET_S, FEWEST = 0.03, 8
+# Of a normal distribution, to its median absolute deviation. Shares of outliers that are tried.
+MAD, OUTLIERS = 1.4826, (1e-3, 0.03, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+# s; in a window the scatter of fixes is theirs, and odometry's drift little.
+WINDOW_S = 30.0
+# m; sigma of a height that is left out. Sigmas of heights within which they agree.
+NO_HEIGHT, WITHIN = 1e4, 3.3
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """`seconds` to be added to the stamps of fixes, one sigma of it, and the gain of squared residuals in units of noise."""
+
+    seconds: float
+    sigma: float
+    gain: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the stamps of fixes are off."""
+        return (
+            self.gain > LEAST_GAIN
+            and abs(self.seconds) > max(LEAST_SIGMAS * self.sigma, LEAST_OFFSET_S)
+            and abs(self.seconds) < LARGEST_S - STEP_S
+        )
+
+
+def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Floats], Floats]) -> ClockOffset | None:
+    """The offset at which displacements of fixes fit those of odometry best; None where too few of them move.
+
+    seconds : (F,) ascending; positions : (F, 3) m, east, north, up
+    antenna_at : (N, 3) m of odometry, level, at (N,) s, NaN outside of the run
+    """
+    gaps = np.diff(seconds)
+    if len(seconds) < FEWEST or gaps.min() <= 0:
+        return None
+    first, last = _pairs(seconds)
+    moved = (positions[last] - positions[first])[:, :2]
+    moved[~np.isfinite(moved).all(1)] = 1e9
+
+    def off(offset: float) -> Floats:
+        """(P, 2) residuals after the best turn."""
+        there = antenna_at(seconds + offset)[:, :2]
+        return moved - _turned(there[last] - there[first], moved)
+
+    tried = np.arange(-LARGEST_S, LARGEST_S + 0.5 * STEP_S, STEP_S)
+    sizes = np.stack([np.linalg.norm(off(float(offset)), axis=1) for offset in tried])
+    inside = np.isfinite(sizes)
+    costs = np.array([
+        np.median(row[ok]) if ok.sum() >= max(FEWEST, 0.6 * len(first)) else np.inf
+        for row, ok in zip(sizes, inside, strict=True)
+    ])  # fmt: skip
+    best = int(np.argmin(costs))
+    both = inside[best] & np.isfinite(unmoved := np.linalg.norm(off(0.0), axis=1))
+    if not np.isfinite(costs[best]) or not both.any():
+        return None
+    # Displacements that share a second share their errors.
+    shared = max(float(np.median(last - first)), 1.0)
+    noise = _spread(off(float(tried[best]))[both])
+    at, sigma, is_curved = float(tried[best]), 2.0 * STEP_S, False
+    for _ in range(4):
+        around = at + 4.0 * max(sigma, 1e-3) * np.linspace(-1.0, 1.0, 17)
+        there = [off(float(offset)) for offset in around]
+        sums = np.array([_squared(np.linalg.norm(one, axis=1)[both] / noise) / shared for one in there])
+        curve, slope, _ = np.polyfit(around, sums, 2)
+        is_curved = curve > 0
+        if not is_curved:
+            sigma *= 2.0
+            continue
+        at = float(np.clip(-slope / (2 * curve), around[0], around[-1]))
+        sigma = float(1.0 / np.sqrt(curve))
+        noise = _spread(there[int(np.argmin(sums))][both])
+    if not is_curved:
+        return None
+    reached = _squared(np.linalg.norm(off(at), axis=1)[both] / noise) / shared
+    return ClockOffset(at, sigma, _squared(unmoved[both] / noise) / shared - reached)
+
+
+def _pairs(seconds: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last fixes of pairs about a second apart."""
+    lag = max(LAG_S, 0.999 * float(np.median(np.diff(seconds))))
+    last = np.searchsorted(seconds, seconds + lag)
+    first = np.flatnonzero(last < len(seconds))
+    near = seconds[last[first]] - seconds[first] < 3.0 * lag
+    return first[near], last[first][near]
+
+
+def _turned(own: Floats, moved: Floats) -> Floats:
+    """`own` (P, 2) turned to fit `moved` (P, 2); pairs without one of odometry, or that are far too long, have no say."""
+    return np.asarray((_rotation(_turn(own, moved)) @ own.T).T)
+
+
+def _turn(own: Floats, moved: Floats) -> float:
+    """rad, by which `own` (P, 2) is turned to fit `moved` (P, 2)."""
+    ok = np.isfinite(own).all(1)
+    turn, weights = 0.0, ok.astype(float)
+    for _ in range(4):
+        a, b, w = own[ok], moved[ok], weights[ok]
+        turn = float(np.arctan2(w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), w @ (a * b).sum(1)))
+        rotated = _rotation(turn) @ np.nan_to_num(own).T
+        off = np.linalg.norm(moved - rotated.T, axis=1)
+        scale = max(float(np.median(off[ok])) if ok.any() else 1.0, 1e-4)
+        weights = ok / (1.0 + (off / (2.0 * scale)) ** 2)
+    return turn
+
+
+def _rotation(turn: float) -> Floats:
+    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+
+def _spread(residuals: Floats) -> float:
+    """m; sigma of residuals (N, 2), outliers aside."""
+    ok = np.isfinite(residuals).all(1)
+    return max(float(MAD * np.median(np.abs(residuals[ok]))), 1e-4) if ok.any() else 1.0
+
+
+def _squared(sizes: Floats) -> float:
+    """Sum of squares of sizes in sigmas, an outlier counted as five; those without one as all others."""
+    ok = np.isfinite(sizes)
+    return float((np.minimum(sizes[ok], 5.0) ** 2).sum() * len(sizes) / max(ok.sum(), 1))
+
+
+def actual_sigmas(seconds: Floats, residuals: Floats, sigmas: Floats, probability: float) -> Floats | None:
+    """(3,) factors by which fixes err more than they state, 1 where they do not; None where none does.
+
+    seconds : (F,) ascending; residuals : (F, 3) m, fixes minus trajectory, roughly aligned; sigmas : (F, 3) m, stated
+
+    Differences of successive fixes contain no drift of odometry: where they scatter by more than is stated, the statement is
+    wrong, and the sigma is that of the scatter within half a minute.
+    """
+    gaps = np.diff(seconds)
+    near = (gaps > 0) & (gaps <= 1.5 * np.median(gaps)) if len(gaps) else np.zeros(0, bool)
+    if near.sum() < FEWEST:
+        return None
+    scaled = residuals / sigmas
+    steps = np.diff(scaled, axis=0)[near]
+    white = np.array([_noise_beside_outliers(axis, probability) for axis in steps.T])
+    wrong = white > 1.0
+    if not wrong.any():
+        return None
+    number = ((seconds - seconds[0]) // WINDOW_S).astype(np.intp)
+    parts = [scaled[number == n] for n in np.unique(number)]
+    scatter = [MAD * np.median(np.abs(p - np.median(p, axis=0)), axis=0) for p in parts if len(p) >= FEWEST]
+    total = np.maximum(np.median(scatter, axis=0) if scatter else 0.0, white)
+    return np.asarray(np.where(wrong, np.maximum(total, 1.0), 1.0))
+
+
+def _noise_beside_outliers(steps: Floats, probability: float) -> float:
+    """The sigma of the fixes that makes their differences likeliest, in that which they state; 1 unless that is too small.
+
+    steps : (N,) differences of two of them. Some are of outliers, whose size has an even distribution over all magnitudes: fixes
+    of which a third is wrong do not scatter.
+    """
+    sizes = np.abs(steps - np.median(steps))
+    wide = 1.0 / (np.maximum(sizes, 1.0) * 2.0 * (1.0 + np.log(max(float(sizes.max()), 2.0))))
+    tried = np.concatenate([[1.0], np.geomspace(1.05, max(float(sizes.max()), 1.1), 80)])
+    fits = []
+    for factor in tried:
+        narrow = np.exp(-0.25 * (sizes / factor) ** 2) / (factor * np.sqrt(4.0 * np.pi))
+        fits.append(max(float(np.log((1 - share) * narrow + share * wide).sum()) for share in OUTLIERS))
+    best = int(np.argmax(fits))
+    # Adjacent differences share an error.
+    gain = 2.0 * (fits[best] - fits[0]) / 1.5
+    return float(tried[best]) if gain > quantile(probability, 1) else 1.0
+
+
+def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floats:
+    """(F, 3) m, of `positions` (F, 3) minus level `antenna` (F, 3) after a robust fit of heading and place.
+
+    seconds : (F,). The heading begins with that of displacements, which a jump of all fixes does not change.
+    """
+    far = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    first, last = _pairs(seconds)
+    R = np.eye(3)
+    R[:2, :2] = _rotation(_turn((antenna[last] - antenna[first])[:, :2], (positions[last] - positions[first])[:, :2]))
+    off = positions - antenna @ R.T
+    for _ in range(20):
+        off = off - np.median(off, axis=0)
+        size = np.linalg.norm(off[:, :2], axis=1)
+        scale = max(float(np.median(size)), 1e-3)
+        weights = (far < 1e5) / (1.0 + (size / (2.0 * scale)) ** 2)
+        w = weights / weights.sum()
+        a, b = antenna - w @ antenna, positions - w @ positions
+        across = w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        R[:2, :2] = _rotation(float(np.arctan2(across, w @ (a[:, :2] * b[:, :2]).sum(1))))
+        off = b - a @ R.T
+    return off - np.median(off, axis=0)
+
+
+def agreeing_heights(off: Floats, sigmas: Floats) -> Bools:
+    """(F,) whether a height belongs to the level at which most of them lie.
+
+    off : (F,) m, of fixes minus trajectory; sigmas : (F,) m
+    """
+    order = np.argsort(off, kind="stable")
+    values, reach = off[order], WITHIN * sigmas[order]
+    counts = np.searchsorted(values, values + reach, side="right") - np.searchsorted(values, values - reach)
+    level = values[int(np.argmax(counts))]
+    near = np.abs(off - level) <= WITHIN * sigmas
+    return np.asarray(np.abs(off - np.median(off[near])) <= WITHIN * sigmas)
+
+
+def height_levels(off: Floats, sigmas: Floats) -> Floats:
+    """(F,) m, by which a height lies above the first ones, as far as heights jump from one fix to the next.
+
+    off : (F,) m, of fixes minus trajectory, in order of time; sigmas : (F,) m
+
+    Medians before and after a fix differ by a jump, while a tilt and odometry's drift change them little. A jump exceeds
+    the sigma of a height, and what such differences are elsewhere.
+    """
+    levels = np.zeros(len(off))
+    if len(off) < 2 * FEWEST:
+        return levels
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(off, FEWEST), axis=1)
+    steps = medians[FEWEST:] - medians[:-FEWEST]
+    usual = MAD * float(np.median(np.abs(steps - np.median(steps))))
+    least = WITHIN * np.maximum(sigmas[FEWEST : FEWEST + len(steps)], 1.5 * usual)
+    sizes = np.abs(steps) * (np.abs(steps) > least)
+    while sizes.any():
+        at = int(np.argmax(sizes))
+        near, before, after = off[at : at + 2 * FEWEST], medians[at], medians[at + FEWEST]
+        first = at + int(np.argmax(np.cumsum((near - after) ** 2 - (near - before) ** 2))) + 1
+        levels[first:] += steps[at]
+        sizes[max(at - FEWEST + 1, 0) : at + FEWEST] = 0.0
+    return levels

@@ -1,0 +1,300 @@
+"""gtsam's optimisers, with their exceptions as sentences, and marginal covariances."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lslam.backend.graph.factors import FIX_NOISE
+from lslam.backend.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
+from lslam.backend.graph.selected_inverse import selected_inverse
+from lslam.core.config.backend import GraphConfig
+from lslam.core.errors import GraphError
+from lslam.core.geometry import noise
+from lslam.core.geometry.noise import quantile
+from lslam.core.stopping import check_stop, checking
+from lslam.core.types.arrays import Floats
+
+# Keyframes that iSAM2 takes in per update.
+BATCH = 10
+# The control parameter's growth per round, and rounds at most (Yang et al. take 1.4 and 100, from far worse starts).
+GROWTH, ROUNDS = 2.0, 30
+# A weight beyond is decided, as one of 0 is; other small weights are not: with the control parameter all of them are small.
+IN = 0.999
+
+
+def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
+    """The values at which `factors` fit best, from `values` on.
+
+    Raises GraphError when the graph is singular or the solution is not finite, InterruptedRunError as `check_stop`.
+    """
+    import gtsam
+
+    check_stop()
+    try:
+        is_dogleg = config.optimizer == "dogleg"
+        params: Any = gtsam.DoglegParams() if is_dogleg else gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(config.max_iterations)
+        params.iterationHook = lambda iteration, before, after: check_stop()
+        optimizer: Any = gtsam.DoglegOptimizer if is_dogleg else gtsam.LevenbergMarquardtOptimizer
+        found = optimizer(factors, values, params).optimize()
+        error = float(factors.error(found))
+    except RuntimeError as failure:
+        raise GraphError(f"the pose graph cannot be optimised: {_first_line(failure)}") from None
+    if not np.isfinite(error):
+        raise GraphError("the pose graph cannot be optimised: its error is not finite")
+    return found
+
+
+def refine(factors: Any, values: Any, config: GraphConfig) -> Any:
+    """As `solve`, from values near the solution, by Gauss-Newton.
+
+    A step's linear cost foretells the cost behind it. Where that holds to the optimiser's own tolerance, the next step would
+    lower it by no more than that, and is not made. Where a step does not lower the cost, `solve` goes on.
+    """
+    import gtsam
+
+    params = gtsam.NonlinearOptimizerParams()
+    for _ in range(config.max_iterations):
+        check_stop()
+        try:
+            linear = factors.linearize(values)
+            step = linear.eliminateSequential(gtsam.Ordering.OrderingType.COLAMD).optimize()
+            moved = values.retract(step)
+            reached = factors.error(moved)
+            if abs(reached - linear.error(step)) <= max(
+                params.getAbsoluteErrorTol(), params.getRelativeErrorTol() * reached
+            ):
+                return moved
+            if not reached < factors.error(values):
+                break
+        except RuntimeError:
+            break
+        values = moved
+    return solve(factors, values, config)
+
+
+def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
+    """The same by iSAM2, keyframes 0, 1, ... in turn: each factor enters with the last of its keyframes.
+
+    Raises GraphError as `solve` does.
+    """
+    import gtsam
+
+    due: list[list[Any]] = [[] for _ in range(count)]
+    for i in range(factors.size()):
+        factor = factors.at(i)
+        due[max((k for k in map(keyframe_of, factor.keys()) if k < count), default=0)].append(factor)
+    params = gtsam.ISAM2Params()
+    params.relinearizeSkip = 1
+    together = [key for key in map(int, values.keys()) if FIX_NOISE <= key < SPEED_KEY]
+    if together:
+        # Beside odometry of a centimetre the information of correlated noise of a metre is lost in the normal equations.
+        params.setFactorization("QR")
+    solver = gtsam.ISAM2(params)
+    try:
+        for begin in range(0, count, BATCH):
+            check_stop()
+            part, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            for k in range(begin, min(begin + BATCH, count)):
+                start.insert(k, values.atPose3(k))
+                if values.exists(SPEED_KEY + k):
+                    start.insert(SPEED_KEY + k, values.atPoint3(SPEED_KEY + k))
+                    start.insert(BIAS_KEY + k, values.atConstantBias(BIAS_KEY + k))
+                for factor in due[k]:
+                    part.add(factor)
+            if begin == 0 and values.exists(count + 1):
+                start.insert(count + 1, values.atPose3(count + 1))
+            if begin == 0:
+                for key in together:
+                    start.insert(key, values.atPoint3(key))
+            if begin == 0 and values.exists(count):
+                floor = values.atOrientedPlane3(count)
+                start.insert(count, floor)
+                loose = gtsam.noiseModel.Isotropic.Sigma(2, 3.0)
+                part.add(gtsam.OrientedPlane3DirectionPrior(count, floor.planeCoefficients(), loose))
+            solver.update(part, start)
+        return solver.calculateBestEstimate()
+    except RuntimeError as failure:
+        raise GraphError(f"the pose graph cannot be optimised: {_first_line(failure)}") from None
+
+
+def marginals(factors: Any, values: Any, poses: Floats) -> Floats:
+    """(K, 6, 6) covariances of the poses with the keys 0..K-1, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
+
+    Raises GraphError when the graph is singular.
+    """
+    bodies = marginal_blocks(factors, values, range(len(poses)))
+    world = noise.from_body(bodies, poses)
+    # d of this house is in the parent's axes: the world's.
+    return 0.5 * (world + np.swapaxes(world, -1, -2))
+
+
+def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
+    """(K, 6, 6) covariances of the poses with these keys, in gtsam's order and axes.
+
+    Raises GraphError when the graph is singular.
+    """
+    import gtsam
+
+    wanted = list(keys)
+    try:
+        net = factors.linearize(values).eliminateSequential(gtsam.Ordering.OrderingType.COLAMD)
+        found = dict(checking(selected_inverse(net, wanted)))
+        return np.stack([found[key] for key in wanted])
+    except RuntimeError:
+        # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
+        return scaled_blocks(factors, values, wanted)
+
+
+def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:
+    """What `marginal_blocks` gives, by normal equations scaled so that each unknown counts alike."""
+    from scipy.sparse import csc_array, diags_array
+    from scipy.sparse.linalg import splu
+
+    # The columns of the Jacobian are in the order of the keys; a floor has less than six.
+    sizes = dict(sorted(values.dims().items()))
+    begins = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
+    columns = values.dim()
+    rows, cols, entries = factors.linearize(values).sparseJacobian_()
+    A = csc_array((entries, (rows.astype(np.intp) - 1, cols.astype(np.intp) - 1)))[:, :columns]
+    H = (A.T @ A).tocsc()
+    scale = 1.0 / np.sqrt(H.diagonal())
+    try:
+        factor = splu((diags_array(scale) @ H @ diags_array(scale)).tocsc())
+    except RuntimeError as failure:
+        raise GraphError(f"the pose graph has no covariances: {_first_line(failure)}") from None
+    blocks = []
+    for key in checking(keys):
+        begin = begins[key]
+        units = np.zeros((columns, 6))
+        units[begin : begin + 6] = np.diag(scale[begin : begin + 6])
+        blocks.append(scale[begin : begin + 6, None] * factor.solve(units)[begin : begin + 6])
+    return np.stack(blocks)
+
+
+def _first_line(failure: RuntimeError) -> str:
+    text = str(failure).strip()
+    return text.splitlines()[0] if text else type(failure).__name__
+
+
+@dataclass(frozen=True)
+class OutlierCandidate:
+    """A factor that may be an outlier: `make(scale, kernel)` gives it with its covariance times `scale`; dim of its residual."""
+
+    make: Callable[[float, Any], Any]
+    dim: int
+
+
+@dataclass(frozen=True)
+class GncResult:
+    """The solution of a graph.
+
+    factors : gtsam's graph of all inliers; values : the solution; weights : (D,) 0..1 per candidate
+    squared : (D,) whitened squared residuals at the solution; limits : (D,) their chi-square quantiles, inliers are below
+    rounds : solutions it took
+    """
+
+    factors: Any
+    values: Any
+    weights: Floats
+    squared: Floats
+    limits: Floats
+    rounds: int
+
+
+def gnc_solve(fixed: Any, candidates: Sequence[OutlierCandidate], values: Any, config: GraphConfig) -> GncResult:
+    """Solve, classifying the outlier candidates by the method `config.robust`."""
+    limits = np.array([quantile(config.probability, d.dim) for d in candidates])
+    plain = [d.make(1.0, None) for d in candidates]
+    if config.robust == "gnc":
+        return _graduated(fixed, candidates, plain, limits, values, config)
+    factors = joined(fixed, [d.make(1.0, _kernel(config.robust, d.dim)) for d in candidates])
+    values = solve(factors, values, config)
+    squared = _squared(plain, values)
+    is_inlier = (squared <= limits) | (config.robust == "none")
+    return GncResult(factors, values, is_inlier.astype(float), squared, limits, 1)
+
+
+def _graduated(
+    fixed: Any,
+    candidates: Sequence[OutlierCandidate],
+    plain: list[Any],
+    limits: Floats,
+    values: Any,
+    config: GraphConfig,
+) -> GncResult:
+    weights = np.ones(len(plain))
+    factors = joined(fixed, plain)
+    values = solve(factors, values, config)
+    squared = _squared(plain, values)
+    rounds = 1
+    ratio = float((squared / limits).max()) if len(plain) else 0.0
+    if ratio <= 1:
+        return GncResult(factors, values, weights, squared, limits, rounds)
+    mu = 1.0 / (2.0 * ratio - 1.0)
+    while rounds < ROUNDS:
+        weights = truncated_weights(squared / limits, mu)
+        factors = joined(fixed, _weighted(candidates, plain, weights))
+        values = refine(factors, values, config)
+        squared = _squared(plain, values)
+        rounds += 1
+        if are_decided(weights):
+            break
+        mu *= GROWTH
+    # Finally inliers have their own covariance, outliers are left out.
+    is_inlier = squared <= limits
+    if are_decided(weights) and np.array_equal(is_inlier, weights > IN):
+        return GncResult(factors, values, is_inlier.astype(float), squared, limits, rounds)
+    weights = is_inlier.astype(float)
+    factors = joined(fixed, [f for f, b in zip(plain, is_inlier, strict=True) if b])
+    values = solve(factors, values, config)
+    return GncResult(factors, values, weights, _squared(plain, values), limits, rounds + 1)
+
+
+def truncated_weights(ratio: Floats, mu: float) -> Floats:
+    """Weights of truncated least squares at `mu` (Yang et al. 2020, equation 14), of squared residuals per limit."""
+    low, high = mu / (mu + 1), (mu + 1) / mu
+    middle = np.sqrt(mu * (mu + 1) / np.maximum(ratio, 1e-12)) - mu
+    return np.where(ratio <= low, 1.0, np.where(ratio >= high, 0.0, np.clip(middle, 0.0, 1.0)))
+
+
+def are_decided(weights: Floats) -> bool:
+    """Whether every candidate counts in full or not at all."""
+    return bool(np.all((weights == 0) | (weights > IN)))
+
+
+def _weighted(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: Floats) -> list[Any]:
+    chosen = []
+    for item, factor, weight in zip(candidates, plain, weights, strict=True):
+        if weight > 0:
+            chosen.append(factor if weight > IN else item.make(1.0 / weight, None))
+    return chosen
+
+
+def joined(fixed: Any, more: list[Any]) -> Any:
+    """The factor graph `fixed` and more factors; `fixed` stays as it is."""
+    import gtsam
+
+    factors = gtsam.NonlinearFactorGraph(fixed)
+    for factor in more:
+        factors.add(factor)
+    return factors
+
+
+def _squared(factors: list[Any], values: Any) -> Floats:
+    """(D,) squared whitened residuals. gtsam's `error` is half of that."""
+    return np.array([2.0 * factor.error(values) for factor in factors])
+
+
+def _kernel(name: str, dim: int) -> Any:
+    """An M-estimator with its parameter at the 95 % quantile of inlier residuals."""
+    import gtsam
+
+    bend = float(np.sqrt(quantile(0.95, dim)))
+    estimators = gtsam.noiseModel.mEstimator
+    kernels: dict[str, Any] = {"huber": estimators.Huber, "cauchy": estimators.Cauchy}
+    return kernels[name].Create(bend) if name in kernels else None

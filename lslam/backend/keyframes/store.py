@@ -1,0 +1,192 @@
+"""The clouds of keyframes, compressed on disk, so that memory does not grow with the length of the run."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, OutputError, cause
+from lslam.core.types.arrays import Points
+from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.state_files import pack_npz, read_npz, write_npz
+
+INDEX = "index.npz"
+CACHED = 32
+
+
+class KeyframeStore:
+    """Keyframes in order; their clouds in a folder, the last used ones in memory.
+
+    The folder holds `index.npz`, everything but the clouds, once `save` was called, and `000000.npz`, `000001.npz`, ...
+    for the clouds. A folder that has an index is opened with what it holds. Several threads may ask for points.
+
+    folder : created when the first cloud is added; None keeps the packed clouds in memory
+    deflate : how much clouds are packed, from 0, not at all, to 9
+
+    Raises InputError for an index or a cloud that is damaged or missing, OutputError for what cannot be written.
+
+    >>> store = KeyframeStore()
+    >>> store.add(Keyframe(0, 0, 0, np.eye(4)), np.ones((2, 3), np.float32))
+    >>> len(store), store.points(0).tolist()
+    (1, [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    """
+
+    def __init__(self, folder: Path | None = None, cached: int = CACHED, deflate: int = 1) -> None:
+        self.folder = folder
+        self.keyframes: list[Keyframe] = []
+        # The number by which the cloud of each was added.
+        self._files: list[int] = []
+        self._memory: dict[int, bytes] = {}
+        self._cached, self._deflate = cached, deflate
+        self._recent: OrderedDict[int, Points] = OrderedDict()
+        self._lock = threading.Lock()
+        if folder is not None and (folder / INDEX).exists():
+            self.restore(read_npz(folder / INDEX))
+
+    def __len__(self) -> int:
+        """How many keyframes there are."""
+        return len(self.keyframes)
+
+    def add(self, keyframe: Keyframe, points: Points) -> None:
+        """Take the next keyframe with its cloud (N, 3), m, in the LiDAR frame at its scan's stamp; written at once."""
+        if keyframe.number != len(self):
+            raise ValueError(f"keyframe {keyframe.number} cannot follow {len(self) - 1}")
+        cloud = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
+        # Byte by byte and axis by axis: what is alike lies side by side, and deflate takes it down to half.
+        planes = np.ascontiguousarray(cloud.T).view(np.uint8).reshape(3, len(cloud), 4).transpose(2, 0, 1)
+        if self.folder is None:
+            stream = io.BytesIO()
+            pack_npz(stream, {"planes": planes}, self._deflate)
+            self._memory[keyframe.number] = stream.getvalue()
+        else:
+            _make(self.folder)
+            write_npz(self._path(keyframe.number), {"planes": planes}, self._deflate)
+        self.keyframes.append(keyframe)
+        self._files.append(keyframe.number)
+        self._keep(keyframe.number, cloud)
+
+    def points(self, number: int) -> Points:
+        """Cloud (N, 3), m, of keyframe `number`, as it was added; not to be written to."""
+        file = self._files[number]
+        with self._lock:
+            if file in self._recent:
+                self._recent.move_to_end(file)
+                return self._recent[file]
+        source = io.BytesIO(self._memory[file]) if self.folder is None else self._path(file)
+        planes = read_npz(source).get("planes", np.zeros(0, np.uint8))
+        if planes.ndim != 3 or planes.shape[:2] != (4, 3) or planes.dtype != np.uint8:
+            raise InputError(f"{source if isinstance(source, Path) else 'a keyframe'} holds no cloud of a keyframe")
+        values = np.ascontiguousarray(planes.transpose(1, 2, 0)).view(np.float32)[..., 0]
+        return self._keep(file, np.ascontiguousarray(values.T))
+
+    def keep(self, keyframes: Sequence[Keyframe]) -> None:
+        """Hold these of the keyframes only, by their numbers, which begin at 0 again; their clouds stay where they are."""
+        self._files = [self._files[k.number] for k in keyframes]
+        self.keyframes = [replace(k, number=number) for number, k in enumerate(keyframes)]
+
+    def clear(self) -> None:
+        """Forget all keyframes, and remove those that the folder holds, of an earlier run too."""
+        self.keyframes, self._files, self._memory = [], [], {}
+        with self._lock:
+            self._recent.clear()
+        for file in [] if self.folder is None else self.folder.glob("*.npz"):
+            file.unlink(missing_ok=True)
+
+    def save(self) -> None:
+        """Write the index, so that the folder can be opened again; no keyframes leave no folder."""
+        if self.folder is not None and self.keyframes:
+            write_npz(self.folder / INDEX, self.state())
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Everything but the clouds, as arrays."""
+        return {**keyframe_arrays(self.keyframes), "files": np.array(self._files, np.int64)}
+
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Hold the keyframes of `state`; raises InputError when a cloud of theirs is not there."""
+        keyframes = keyframes_of(state)
+        files = [int(file) for file in state.get("files", np.arange(len(keyframes)))]
+        if len(files) != len(keyframes):
+            raise InputError("an index of keyframes is damaged: it does not list a file for each")
+        for number, file in enumerate(files):
+            if self.folder is None or not self._path(file).is_file():
+                raise InputError(f"{self.folder}: the cloud of keyframe {number} is missing")
+        with self._lock:
+            self._recent.clear()
+        self.keyframes, self._files = keyframes, files
+
+    @property
+    def size(self) -> int:
+        """Bytes of all clouds, compressed."""
+        if self.folder is None:
+            return sum(len(data) for data in self._memory.values())
+        return sum(self._path(file).stat().st_size for file in self._files)
+
+    def _path(self, file: int) -> Path:
+        assert self.folder is not None
+        return self.folder / f"{file:06d}.npz"
+
+    def _keep(self, file: int, cloud: Points) -> Points:
+        cloud.flags.writeable = False
+        with self._lock:
+            self._recent[file] = cloud
+            self._recent.move_to_end(file)
+            while len(self._recent) > self._cached:
+                self._recent.popitem(last=False)
+        return cloud
+
+
+class PartOfStore(KeyframeStore):
+    """Some of another store's keyframes, by their numbers there; their own begin at 0.
+
+    whole : they as the other store has them
+    """
+
+    def __init__(self, store: KeyframeStore, numbers: Sequence[int]) -> None:
+        super().__init__()
+        self._store, self.whole = store, [store.keyframes[n] for n in numbers]
+        self.keyframes = [replace(k, number=number) for number, k in enumerate(self.whole)]
+
+    def points(self, number: int) -> Points:
+        """Cloud of a keyframe."""
+        return self._store.points(self.whole[number].number)
+
+
+def keyframe_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[Any]]:
+    """Keyframes as arrays; a covariance that is not known is NaN."""
+    none = np.full((6, 6), np.nan)
+    return {
+        "scans": np.array([k.scan for k in keyframes], np.int64),
+        "stamps_ns": np.array([k.stamp_ns for k in keyframes], np.int64),
+        "poses": np.array([k.T_world_lidar for k in keyframes], np.float64).reshape(-1, 4, 4),
+        "covariances": np.array(
+            [none if k.covariance is None else k.covariance for k in keyframes], np.float64
+        ).reshape(-1, 6, 6),
+        "distances": np.array([k.distance for k in keyframes], np.float64),
+    }
+
+
+def keyframes_of(state: Mapping[str, NDArray[Any]]) -> list[Keyframe]:
+    """The keyframes of `keyframe_arrays`; raises InputError when they are not."""
+    try:
+        columns = [state[name] for name in ("scans", "stamps_ns", "poses", "covariances", "distances")]
+        return [
+            Keyframe(number, int(scan), int(stamp), pose, None if np.isnan(C).any() else C, float(distance))
+            for number, (scan, stamp, pose, C, distance) in enumerate(zip(*columns, strict=True))
+        ]
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"an index of keyframes is damaged: {error}") from None
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None

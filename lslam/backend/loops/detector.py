@@ -1,0 +1,331 @@
+"""Loop closure detection: candidates by odometry's gate and Scan Context, verified by registration."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from copy import copy
+from dataclasses import replace
+from itertools import islice
+
+import numpy as np
+
+from lslam.backend.loops import create_descriptor
+from lslam.backend.loops.descriptor import PlaceMatch
+from lslam.backend.loops.gating import (
+    LoopThrottle,
+    OdometryUncertainty,
+    RelativeUncertainty,
+    SharedResults,
+    resolve_ambiguity,
+)
+from lslam.backend.loops.level_submap import LevelSubmap, find_up, levelled, make_level_submap
+from lslam.backend.loops.verify import Verification, Verifier
+from lslam.backend.loops.working_memory import WorkingMemory
+from lslam.core.config.backend import LoopsConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import InterruptedRunError
+from lslam.core.geometry import se3, so3
+from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats, Longs, Points
+from lslam.core.types.constraint import Constraint, KnownPair, LoopCandidate, LoopStage, Verdict
+from lslam.core.types.stage_clock import KeyframeClocks, StageClock
+from lslam.core.types.trajectory import Keyframe
+from lslam.registration.preprocessing.ground import Z
+
+# m; two passes of a street lie so far apart at most.
+NEAR = 8.0
+# m and rad, least gate of odometry: what two registrations of the same place differ by.
+LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
+# rad between the headings that are searched; beyond the widest gate they lie about the descriptor's own.
+TURN_STEP, WIDEST_TURN = np.deg2rad(2.0), np.deg2rad(20.0)
+# Factor on the best descriptor distance within which others are candidates too, and how many; different places of a town
+# differ by twice as much.
+RIVAL, RIVALS = 1.5, 3
+# Level submaps, clouds and gates cached, and how many submaps serve to estimate the vertical.
+KEPT, CLOUDS, HELD, LOOKS = 4, 4, 256, 8
+
+
+class Detector:
+    """Detects loop closures among keyframes.
+
+    keyframes : all of the run, in order
+    cloud : gives the submap about a keyframe, (M, 3) m, in its LiDAR frame
+    forbidden : pairs of keyframes, the older first, that are no candidates, nor are those around them
+    up : (3,) unit vector, up in the world of the keyframes by the mounting of the sensor
+    """
+
+    def __init__(
+        self,
+        keyframes: Sequence[Keyframe],
+        cloud: Callable[[int], Points],
+        config: LoopsConfig,
+        registration: RegistrationConfig,
+        forbidden: Sequence[tuple[int, int]] = (),
+        up: Floats = Z,
+    ) -> None:
+        self.keyframes, self.cloud, self.config, self.registration = keyframes, cloud, config, registration
+        self.forbidden, self._mounted = forbidden, up
+        self._is_level = False
+        self.uncertainty = OdometryUncertainty(keyframes, config.drift_percent, config.drift_deg)
+        self.index = create_descriptor(config)
+        self.verifier = Verifier(config, registration)
+        self._index_lock = threading.Lock()
+        self._described = SharedResults(self._describe)
+        self._clouds = SharedResults(self._make_level, CLOUDS)
+        self._submaps = SharedResults(self._make_submap, KEPT)
+        # Submaps overlap: the first keyframe of every few metres represents those after it.
+        steps = np.floor(self.uncertainty.distances / (NEAR / 2))
+        self._is_described = np.diff(steps, prepend=-1.0) > 0
+        bound = config.memory_places if config.memory == "bounded" else None
+        places = np.cumsum(self._is_described) - 1
+        self.memory = WorkingMemory(places, self.uncertainty.distances, bound, config.min_travel)
+
+    def find(
+        self, clocks: KeyframeClocks | None = None, should_stop: Callable[[], bool] = lambda: False, threads: int = 1
+    ) -> list[LoopCandidate]:
+        """All candidates in the order of the newer keyframe, with verdicts; arguments and errors of `find_loops`."""
+        clocks = KeyframeClocks() if clocks is None else clocks
+        candidates: list[LoopCandidate] = []
+        throttle = LoopThrottle(self.config.spacing)
+        count = len(self.keyframes)
+        if any(len(self._gated(b)) for b in range(count)):
+            self._level_world()
+        # Of thousands of keyframes, each has thousands: those of the next few are held.
+        gated = SharedResults(self._gated, HELD)
+        ahead: dict[int, tuple[Longs, Future[list[LoopCandidate]]]] = {}
+        with ThreadPoolExecutor(threads, "lslam-loops") as pool:
+            try:
+                for b, keyframe in enumerate(self.keyframes):
+                    if should_stop():
+                        raise InterruptedRunError(
+                            f"interrupted during loop closure detection, at keyframe {b} of {count}"
+                        )
+                    if self.memory.reach(b):
+                        gated = SharedResults(self._gated, HELD)
+                    older = gated.get(b)
+                    if len(older) == 0:
+                        throttle.reset()
+                        continue
+                    if not throttle.is_due(keyframe.distance):
+                        candidates.append(self._thinned(older, b, throttle.wait))
+                        continue
+                    for n in (b, *islice(self._due_after(b, gated, throttle), threads - 1)):
+                        # What was begun with another memory is begun again.
+                        if n not in ahead or (n == b and not np.array_equal(ahead[n][0], older)):
+                            compared = gated.get(n)
+                            task = pool.submit(copy_context().run, self._examined, n, compared, clocks[n])
+                            ahead[n] = compared, task
+                    examined = ahead.pop(b)[1].result()
+                    candidates += examined
+                    for closed in examined:
+                        if closed.is_accepted:
+                            self.memory.close(closed.a, b)
+                    throttle.observe(
+                        keyframe.distance,
+                        Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED,
+                    )
+            finally:
+                pool.shutdown(cancel_futures=True)
+        return candidates
+
+    def verify_known(self, pair: KnownPair) -> LoopCandidate:
+        """The pair registered, whatever odometry says of its place; of its heading odometry is believed where it is sure."""
+        self._level_world()
+        a, b = pair.a, pair.b
+        turn = self._turn(self.uncertainty.between(b, np.array([a])))
+        spread = WIDEST_TURN if turn <= WIDEST_TURN else np.pi
+        yaws = np.arange(-spread, spread, TURN_STEP)
+        expected = self.keyframes[a].T_world_lidar[:3, :3] @ pair.place
+        within = self.config.known_within if pair.within is None else pair.within
+        found = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
+        closed = self._constraint(a, b, found)
+        return LoopCandidate(
+            a, b, self._away(a, b), float("nan"), Verdict.REJECTED if found.reason else Verdict.ACCEPTED,
+            found.stage if found.reason else LoopStage.MANUAL, found.reason, found.rmse, found.overlap,
+            None if closed is None else replace(closed, is_held=not found.reason),
+        )  # fmt: skip
+
+    def _due_after(self, b: int, gated: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
+        """The next keyframes after `b` that are due if all verdicts are as the last one."""
+        throttle = copy(throttle)
+        throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
+        for n in range(b + 1, min(b + HELD, len(self.keyframes))):
+            if len(gated.get(n)) == 0:
+                throttle.reset()
+            elif throttle.is_due(self.keyframes[n].distance):
+                yield n
+                throttle.observe(self.keyframes[n].distance, throttle.last or Verdict.ACCEPTED)
+
+    def _examined(self, b: int, older: Longs, clock: StageClock) -> list[LoopCandidate]:
+        """Keyframe `b` verified against the similar ones of the `older`, with verdicts."""
+        with clock.stage("loops"):
+            alike, fallback = self._choose(b, older)
+            verified = [self._examine(match, b) for match in alike]
+            examined = resolve_ambiguity(verified, self.keyframes, self._reach_between)
+            if not any(c.is_accepted or c.stage == LoopStage.AMBIGUITY for c in examined):
+                examined += [self._examine(match, b) for match in fallback()]
+            return examined
+
+    def _level_world(self) -> None:
+        """Rotate the world so that z is up, as BEV correlation needs. Relative poses stay."""
+        if self._is_level:
+            return
+        self._is_level = True
+        shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
+        maps = [make_level_submap(self._make_level(int(number)), self.registration).fine for number in shown]
+        up = find_up(maps, self._mounted)
+        self.keyframes = levelled(self.keyframes, up)
+        self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
+
+    def _gated(self, b: int) -> Longs:
+        """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
+        among = self._allowed(b, self.memory.before(b))
+        if self.config.radius is None:
+            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR, self.config.sigmas)
+        return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
+
+    def _allowed(self, b: int, among: Longs) -> Longs:
+        """Those that no forbidden pair lies at: so near along the way the same surfaces are taken for the same place."""
+        distances = self.uncertainty.distances
+        for older, newer in self.forbidden:
+            if abs(distances[b] - distances[newer]) <= NEAR:
+                among = among[np.abs(distances[among] - distances[older]) > NEAR]
+        return among
+
+    def _thinned(self, older: Longs, b: int, wait: float) -> LoopCandidate:
+        a = self._nearest(older, b)
+        said = f"the last one tried was less than {wait:g} m ago"
+        return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, said)
+
+    def _nearest(self, older: Longs, b: int) -> int:
+        away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
+        return int(older[away.argmin()])
+
+    def _away(self, a: int, b: int) -> float:
+        return float(np.linalg.norm(self.uncertainty.positions[b] - self.uncertainty.positions[a]))
+
+    def _choose(self, b: int, older: Longs) -> tuple[list[PlaceMatch], Callable[[], list[PlaceMatch]]]:
+        """The candidates to verify, and what gives a fallback, if there is one.
+
+        Where odometry is nearly certain, its nearest is the candidate and the most similar the fallback. Elsewhere it is the
+        other way round, and all that are nearly as similar are verified, since an ambiguous one must be rejected.
+        """
+        near = self._nearest(older, b)
+        reach = self._reach_between(near, b)
+        nearest = np.array([near])
+        if reach < NEAR:
+            away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
+            about = older[away <= away.min() + reach]
+            chosen = self._matches(b, nearest)
+            return chosen, lambda: self._elsewhere(self._alike(b, about)[:1], chosen)
+        alike = self._alike(b, older)
+        if not alike:
+            return self._matches(b, nearest), list
+        return alike, lambda: self._elsewhere(self._matches(b, nearest), alike)
+
+    def _elsewhere(self, matches: list[PlaceMatch], chosen: list[PlaceMatch]) -> list[PlaceMatch]:
+        """Those of the matches that are not at the place of a chosen one."""
+        return [m for m in matches if all(self._away(m.number, c.number) > NEAR / 2 for c in chosen)]
+
+    def _alike(self, b: int, older: Longs) -> list[PlaceMatch]:
+        """Those of the `older` that look like keyframe `b`: the most similar and its rivals."""
+        near = self._nearest(older, b)
+        matches = self._matches(b, older[self._is_described[older] | (older == near)])
+        limit = min(self.config.max_descriptor_distance, RIVAL * matches[0].distance)
+        return self._apart([m for m in matches if m.distance <= limit])
+
+    def _matches(self, b: int, older: Longs) -> list[PlaceMatch]:
+        """The `older` by their similarity to keyframe `b`, the best first."""
+        for number in (b, *older):
+            self._described.get(int(number))
+        with self._index_lock:
+            return self.index.nearest(b, older, self._turn(self.uncertainty.between(b, older[:1])))
+
+    def _apart(self, matches: list[PlaceMatch]) -> list[PlaceMatch]:
+        """The first few matches, none near another."""
+        kept: list[PlaceMatch] = []
+        for match in matches:
+            if len(kept) < RIVALS and all(self._away(match.number, k.number) > NEAR for k in kept):
+                kept.append(match)
+        return kept
+
+    def _examine(self, match: PlaceMatch, b: int) -> LoopCandidate:
+        """Verify the loop of keyframe `b` with the match."""
+        a = match.number
+        uncertainty = self.uncertainty.between(b, np.array([a]))
+        expected = self.uncertainty.positions[b] - self.uncertainty.positions[a]
+        yaws = self._yaws(match, self._turn(uncertainty))
+        found = self.verifier.verify(
+            self._submaps.get(a), self._submaps.get(b), expected, self._reach(uncertainty), yaws
+        )
+        stage, reason = found.stage, found.reason
+        if not reason:
+            reason = self._beyond(found, expected, uncertainty)
+            stage = LoopStage.GATE if reason else stage
+        return LoopCandidate(
+            a, b, self._away(a, b), match.distance, Verdict.REJECTED if reason else Verdict.ACCEPTED, stage, reason, found.rmse,
+            found.overlap, self._constraint(a, b, found),
+        )  # fmt: skip
+
+    def _reach_between(self, older: int, newer: int) -> float:
+        """m, gate of odometry between two keyframes."""
+        return self._reach(self.uncertainty.between(newer, np.array([older])))
+
+    def _reach(self, uncertainty: RelativeUncertainty) -> float:
+        """m, gate on the position."""
+        if self.config.radius is not None:
+            return self.config.radius
+        return max(self.config.sigmas * float(uncertainty.reach[0]), LEAST_REACH)
+
+    def _turn(self, uncertainty: RelativeUncertainty) -> float:
+        """rad, gate on the heading."""
+        return max(self.config.sigmas * float(uncertainty.turn[0]), float(LEAST_TURN))
+
+    def _yaws(self, match: PlaceMatch, turn: float) -> Floats:
+        """rad, headings of the newer submap in the older to search."""
+        centre, spread = (0.0, turn) if turn <= WIDEST_TURN else (match.yaw, self.index.yaw_error + TURN_STEP)
+        count = int(np.ceil(spread / TURN_STEP))
+        return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
+
+    def _beyond(self, found: Verification, expected: Floats, uncertainty: RelativeUncertainty) -> str:
+        """Why the pose found lies outside the gate of odometry; empty inside."""
+        assert found.T_a_b is not None
+        shift = found.T_a_b[:3, 3] - expected
+        turn = float(so3.angle(found.T_a_b[:3, :3]))
+        if turn > self._turn(uncertainty):
+            return f"odometry would be wrong by {np.rad2deg(turn):.1f} deg"
+        if self.config.radius is not None:
+            sigmas = self.config.sigmas * float(np.linalg.norm(shift)) / self.config.radius
+        else:
+            least = (LEAST_REACH / self.config.sigmas) ** 2 * np.eye(3)
+            sigmas = float(np.sqrt(shift @ np.linalg.solve(uncertainty.position[0] + least, shift)))
+        if sigmas > self.config.sigmas:
+            return f"odometry would be wrong by {np.linalg.norm(shift):.1f} m"
+        return ""
+
+    def _constraint(self, a: int, b: int, found: Verification) -> Constraint | None:
+        """Pose and covariance of the loop closure, from level axes to those of the keyframes."""
+        if found.T_a_b is None or found.covariance is None:
+            return None
+        R_a, R_b = (self.keyframes[k].T_world_lidar[:3, :3] for k in (a, b))
+        T = se3.make(R_a.T @ found.T_a_b[:3, :3] @ R_b, R_a.T @ found.T_a_b[:3, 3])
+        turn = np.kron(np.eye(2), R_a.T)
+        return Constraint(a, b, T, turn @ found.covariance @ turn.T)
+
+    def _make_submap(self, number: int) -> LevelSubmap:
+        return make_level_submap(self._clouds.get(number), self.registration)
+
+    def _make_level(self, number: int) -> Points:
+        """The submap about a keyframe in the axes of the world."""
+        points = self.cloud(number)
+        level = np.empty_like(points)
+        transform(points, se3.make(self.keyframes[number].T_world_lidar[:3, :3], np.zeros(3)), level)
+        return level
+
+    def _describe(self, number: int) -> None:
+        points = self._clouds.get(number)
+        with self._index_lock:
+            self.index.add(number, points)

@@ -1,0 +1,107 @@
+"""Loop closures of a run: candidates that are searched, pairs that a person knows."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.submaps import submap
+from lslam.backend.loops import create_descriptor
+from lslam.backend.loops.detector import LEAST_REACH, Detector
+from lslam.backend.loops.gating import OdometryUncertainty
+from lslam.backend.loops.level_submap import make_level_submap
+from lslam.backend.loops.verify import Verifier
+from lslam.core.config.backend import LoopsConfig
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.errors import InterruptedRunError
+from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats, Points
+from lslam.core.types.constraint import KnownPair, LoopCandidate, LoopStage
+from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.trajectory import Keyframe
+from lslam.registration.preprocessing.ground import Z
+
+log = logging.getLogger("lslam")
+
+
+def find_loops(
+    store: KeyframeStore,
+    config: LoopsConfig,
+    registration: RegistrationConfig,
+    submap_size: int = 5,
+    clocks: KeyframeClocks | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
+    threads: int = 1,
+    keyframes: Sequence[Keyframe] | None = None,
+    forbidden: Sequence[tuple[int, int]] = (),
+    up: Floats = Z,
+) -> list[LoopCandidate]:
+    """Loop candidates of a run in the order of the newer keyframe, with verdicts.
+
+    store : the run's keyframes with odometry's poses, their covariances and the distance travelled
+    submap_size : keyframes whose clouds make one submap (`keyframes.submap_size`)
+    clocks : take the time of each keyframe, stage `loops`
+    threads : so many keyframes are verified at once; the candidates do not depend on it
+    keyframes : those of the store at other poses than odometry's; forbidden : pairs of them that are no candidates, nor are
+        those around them
+    up : (3,) unit vector, up in their world by the mounting of the sensor
+
+    An accepted candidate carries its constraint, T_a_b between LiDAR frames. Raises InterruptedRunError when `should_stop`
+    said so between two keyframes.
+    """
+    at = store.keyframes if keyframes is None else keyframes
+    detector = _detector(store, at, config, registration, submap_size, forbidden, up)
+    candidates = detector.find(clocks, should_stop, threads)
+    accepted = sum(c.is_accepted for c in candidates)
+    tried = sum(c.stage != LoopStage.THINNED for c in candidates)
+    log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, tried, len(store))
+    return candidates
+
+
+def verify_known(
+    store: KeyframeStore, pairs: Sequence[KnownPair], config: LoopsConfig, registration: RegistrationConfig,
+    submap_size: int = 5, should_stop: Callable[[], bool] = lambda: False, up: Floats = Z,
+) -> list[LoopCandidate]:  # fmt: skip
+    """The known pairs as candidates, verified wherever their scans may lie; an accepted one is held by the graph.
+
+    Raises InterruptedRunError when `should_stop` said so between two.
+    """
+    detector = _detector(store, store.keyframes, config, registration, submap_size, up=up)
+    found = []
+    for pair in pairs:
+        if should_stop():
+            raise InterruptedRunError("interrupted while known pairs were verified")
+        found.append(detector.verify_known(pair))
+    return found
+
+
+def _detector(
+    store: KeyframeStore, keyframes: Sequence[Keyframe], config: LoopsConfig, registration: RegistrationConfig,
+    submap_size: int, forbidden: Sequence[tuple[int, int]] = (), up: Floats = Z,
+) -> Detector:  # fmt: skip
+    poses = np.array([keyframe.T_world_lidar for keyframe in keyframes]).reshape(-1, 4, 4)
+    return Detector(
+        keyframes, lambda number: submap(store, poses, number, submap_size), config, registration, forbidden, up
+    )
+
+
+def warm_up(config: LoopsConfig) -> None:
+    """Compile or load every kernel that loop closure detection needs, with a small room."""
+    room = warm_up_candidates(config)
+    submap_of_room = make_level_submap(room, RegistrationConfig())
+    Verifier(LoopsConfig(), RegistrationConfig()).verify(
+        submap_of_room, submap_of_room, np.zeros(3), LEAST_REACH, [0.0]
+    )
+
+
+def warm_up_candidates(config: LoopsConfig) -> Points:
+    """Compile or load the kernels by which candidates are found; the room (3000, 3), m, that serves for it."""
+    room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
+    room[np.arange(3000), np.arange(3000) % 3] = 8.0
+    transform(room, np.eye(4), np.empty_like(room))
+    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, np.arange(0), 1.0, 1.0, 1.0)
+    create_descriptor(config).add(0, room)
+    return room

@@ -1,0 +1,203 @@
+"""Gating of loop candidates: by the uncertainty of odometry, by how often they are tried, and by what else a keyframe matches."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from lslam.backend.kernels import gating
+from lslam.core.geometry import so3
+from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
+from lslam.core.types.trajectory import Keyframe
+
+
+@dataclass(frozen=True)
+class RelativeUncertainty:
+    """Uncertainty of one keyframe's pose relative to others.
+
+    position : (C, 3, 3) m2, world axes; turn : (C,) rad, standard deviation of the rotation
+    """
+
+    position: Floats
+    turn: Floats
+
+    @property
+    def reach(self) -> Floats:
+        """(C,) m, standard deviation of the position where it is worst."""
+        return np.asarray(np.sqrt(np.linalg.eigvalsh(self.position)[:, 2]))
+
+
+class OdometryUncertainty:
+    """Relative uncertainty of keyframe poses: odometry's covariances, and systematic drift that they do not model.
+
+    Odometry's covariances accumulate independent errors, transported by the lever arm: with A = [[I, -hat(p_b - p_a)],
+    [0, I]], the relative covariance of a and b is S_b - A S_a A^T. Errors of scale and bending are added as
+    `drift_percent` of the distance travelled and `drift_deg` per 100 m of it, the latter by the rms distance from b to
+    the keyframes since a.
+    """
+
+    def __init__(self, keyframes: Sequence[Keyframe], drift_percent: float, drift_deg: float) -> None:
+        self.positions = np.array([k.T_world_lidar[:3, 3] for k in keyframes]).reshape(-1, 3)
+        self.distances = np.array([k.distance for k in keyframes])
+        known = all(k.covariance is not None for k in keyframes)
+        self.covariances = np.array([k.covariance for k in keyframes]) if known and keyframes else None
+        self._per_m = drift_percent / 100
+        self._turn_per_m = np.deg2rad(drift_deg) / 100
+        zero = np.zeros((1, 3))
+        self._sum = np.concatenate([zero, np.cumsum(self.positions, axis=0)])
+        self._squares = np.concatenate([[0.0], np.cumsum((self.positions**2).sum(axis=1))])
+
+    def between(self, b: int, older: Longs) -> RelativeUncertainty:
+        """Uncertainty of keyframe `b` relative to each of the keyframes `older`."""
+        travelled = self.distances[b] - self.distances[older]
+        turn = self._turn_per_m * travelled
+        spread = (self._per_m * travelled) ** 2 + (turn * self._lever(b, older)) ** 2
+        position = spread[:, None, None] * np.eye(3)
+        square = turn**2
+        if self.covariances is not None:
+            A = np.tile(np.eye(6), (len(older), 1, 1))
+            A[:, :3, 3:] = -so3.hat(self.positions[b] - self.positions[older])
+            own = self.covariances[b] - A @ self.covariances[older] @ A.transpose(0, 2, 1)
+            position = position + _positive(own[:, :3, :3])
+            square = square + np.maximum(np.linalg.eigvalsh(own[:, 3:, 3:])[:, 2], 0.0)
+        return RelativeUncertainty(position, np.sqrt(square))
+
+    def gated(self, b: int, among: Longs, least: float, near: float, sigmas: float) -> Longs:
+        """Those `among` the older keyframes (C,) at least `least` m of way ago and no farther from keyframe `b` than `near` m and
+        so many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
+        """
+        covariances = np.zeros((0, 6, 6)) if self.covariances is None else self.covariances
+        return np.asarray(gating.gated(
+            b, among, self.positions, self.distances, covariances, self._sum, self._squares,
+            (self._per_m, float(self._turn_per_m)), (float(least), float(near), float(sigmas)),
+        ))  # fmt: skip
+
+    def _lever(self, b: int, older: Longs) -> Floats:
+        """(C,) m, rms distance of keyframe `b` from the keyframes since each of `older`."""
+        count = b + 1 - older
+        mean = (self._sum[b + 1] - self._sum[older]) / count[:, None]
+        squares = (self._squares[b + 1] - self._squares[older]) / count
+        p = self.positions[b]
+        return np.asarray(np.sqrt(np.maximum(p @ p - 2 * mean @ p + squares, 0.0)))
+
+
+def _positive(matrices: Floats) -> Floats:
+    """Symmetric (C, 3, 3) without negative eigenvalues: the difference of two estimates may have some."""
+    values, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+class LoopThrottle:
+    """Distance between two attempts: `spacing` after a change of verdict, up to three times it while verdicts repeat.
+
+    One more loop closure in a row of accepted ones adds little information, and so does one more rejection.
+    """
+
+    LONGEST = 3
+
+    def __init__(self, spacing: float) -> None:
+        self.spacing = spacing
+        self.reset()
+
+    def reset(self) -> None:
+        """Attempt at the next candidate: there were none."""
+        self._tried_at, self._row = -np.inf, 0
+        self.last: Verdict | None = None
+
+    @property
+    def wait(self) -> float:
+        """m between the last attempt and the next."""
+        return self.spacing * min(self._row, self.LONGEST)
+
+    def is_due(self, distance: float) -> bool:
+        """Whether an attempt is due at `distance` m since the start."""
+        return distance - self._tried_at >= self.wait
+
+    def observe(self, distance: float, verdict: Verdict) -> None:
+        """Take the verdict of an attempt at `distance` m."""
+        self._row = self._row + 1 if verdict == self.last else 1
+        self._tried_at, self.last = distance, verdict
+
+
+def resolve_ambiguity(
+    examined: list[LoopCandidate], keyframes: Sequence[Keyframe], reach: Callable[[int, int], float]
+) -> list[LoopCandidate]:
+    """Candidates of one newer keyframe, the most similar first, with at most one loop closure accepted.
+
+    reach : m, gate of odometry between an older and a newer keyframe
+
+    All are rejected when two imply different poses of the keyframe, or when one of them was ambiguous by itself.
+    """
+    accepted = [c for c in examined if c.is_accepted]
+    ambiguous = next((c for c in examined if c.stage == LoopStage.AMBIGUITY), None)
+    if accepted and ambiguous is not None:
+        return [_ambiguous(c, f"keyframe {ambiguous.a} looks as much alike, and is ambiguous") for c in examined]
+    if len(accepted) < 2:
+        return examined
+    first = accepted[0]
+    for other in accepted[1:]:
+        gap = float(np.linalg.norm(_put(other, keyframes) - _put(first, keyframes)))
+        if gap > reach(min(first.a, other.a), max(first.a, other.a)):
+            said = f"keyframes {first.a} and {other.a} fit, at places {gap:.1f} m apart"
+            return [_ambiguous(c, said) for c in examined]
+    said = f"closed with keyframe {first.a} already"
+    extra = {c.a for c in accepted[1:]}
+    return [
+        replace(c, verdict=Verdict.REJECTED, stage=LoopStage.THINNED, reason=said) if c.a in extra else c
+        for c in examined
+    ]
+
+
+def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> Floats:
+    """(3,) m in the world, position of the newer keyframe by the loop closure and odometry's pose of the older one."""
+    assert candidate.constraint is not None
+    return np.asarray((keyframes[candidate.a].T_world_lidar @ candidate.constraint.T_a_b)[:3, 3])
+
+
+def _ambiguous(candidate: LoopCandidate, reason: str) -> LoopCandidate:
+    """The candidate, rejected as ambiguous unless it was rejected before."""
+    if not candidate.is_accepted:
+        return candidate
+    return replace(candidate, verdict=Verdict.REJECTED, stage=LoopStage.AMBIGUITY, reason=reason)
+
+
+T = TypeVar("T")
+
+
+class SharedResults(Generic[T]):
+    """Results of a function of a number, the last used ones kept; who asks for one that another thread makes waits for it.
+
+    make : the function; kept : how many results, None for all
+
+    >>> squares = SharedResults(lambda number: number**2, kept=1)
+    >>> squares.get(3), squares.get(3), squares.get(4)
+    (9, 9, 16)
+    """
+
+    def __init__(self, make: Callable[[int], T], kept: int | None = None) -> None:
+        self._make, self._kept = make, kept
+        self._made: OrderedDict[int, Future[T]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, number: int) -> T:
+        """The result for `number`; raises what making it raised."""
+        with self._lock:
+            known = self._made.get(number)
+            result = Future() if known is None else known
+            self._made[number] = result
+            self._made.move_to_end(number)
+            if self._kept is not None and len(self._made) > self._kept:
+                self._made.popitem(last=False)
+        if known is None:
+            try:
+                result.set_result(self._make(number))
+            except BaseException as error:
+                result.set_exception(error)
+        return result.result()

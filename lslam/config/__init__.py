@@ -1,6 +1,0 @@
-"""Configuration: one frozen model per section, TOML in, resolved TOML out, unknown keys answered with the nearest name."""
-
-from lslam.config.config import Config
-from lslam.config.load import load_config, to_described_toml, to_toml
-
-__all__ = ["Config", "load_config", "to_described_toml", "to_toml"]

@@ -1,0 +1,305 @@
+"""Sections of the back end: keyframes, loops, the pose graph, satellite fixes, buildings, existing maps, drift for tests."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from lslam.core.config.section import Section
+
+
+class KeyframesConfig(Section):
+    """When a scan becomes a keyframe, and what is kept of it."""
+
+    distance: float = Field(2.0, gt=0, description="m; way since the last keyframe")
+    angle_deg: float = Field(15.0, gt=0, description="deg; turn since the last keyframe")
+    voxel: float = Field(0.3, ge=0.05, description="m; one averaged point per voxel is kept of a keyframe's scan")
+    deflate: int = Field(
+        1,
+        ge=0,
+        le=9,
+        description="how much the clouds on disk are packed: 0 not at all, quickest, twice the size; 9 most",
+    )
+    submap_size: int = Field(5, ge=1, description="keyframes whose clouds make one submap, about the one in the middle")
+
+
+class LoopsConfig(Section):
+    """Candidates by a place descriptor and odometry, verified by registration of submap to submap."""
+
+    use: bool = Field(True, description="look for places seen before and close loops there")
+    file: str = Field(
+        "", description="CSV of pairs that are known to be loop closures, or forbidden to be any; empty: none"
+    )
+    known_within: float = Field(10.0, gt=0, description="m; so far apart the scans of a known pair may have been taken")
+    radius: float | None = Field(
+        None,
+        gt=0,
+        description="m; keyframes within this distance by odometry are candidates; absent: within 8 m and what odometry "
+        "may be wrong by",
+    )
+    sigmas: float = Field(
+        3.0, gt=0, description="odometry is trusted to be wrong by at most so many standard deviations"
+    )
+    drift_percent: float = Field(
+        0.5,
+        ge=0,
+        description="%; of the distance travelled, that odometry may be wrong by, one standard deviation, beside its own "
+        "covariance, which knows of no systematic errors",
+    )
+    drift_deg: float = Field(0.25, ge=0, description="deg/100 m; likewise for rotation")
+    min_travel: float = Field(30.0, gt=0, description="m; way before a keyframe can be seen again")
+    spacing: float = Field(
+        4.0,
+        ge=0,
+        description="m; way between one candidate that is registered and the next; up to three times as far after "
+        "several that came out alike",
+    )
+    descriptor: str = Field(
+        "scan-context", description="by which places are told alike: scan-context, or a plug-in's name"
+    )
+    memory: Literal["all", "bounded"] = Field(
+        "all",
+        description="which older places are compared: all, or a working memory of bounded size (Labbé and Michaud 2013), so "
+        "that the time per keyframe does not grow with the run",
+    )
+    memory_places: int = Field(
+        500, ge=20, description="places, 4 m of way each, in the working memory of `loops.memory = bounded`"
+    )
+    rings: int = Field(20, ge=4, le=400, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
+    sectors: int = Field(60, ge=8, le=360, description="Scan Context: sectors of the polar image")
+    reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")
+    max_descriptor_distance: float = Field(
+        0.4, gt=0, le=1, description="distance of the descriptors, 0 alike to 1, above which two places are different"
+    )
+    max_iterations: int = Field(30, ge=1, description="Gauss-Newton steps of a verification")
+    max_rmse: float = Field(0.3, gt=0, description="m; distance of the points to the other submap's surfaces, at most")
+    min_overlap: float = Field(
+        0.3, ge=0, le=1, description="share of each submap's points that must lie on surfaces of the other"
+    )
+    max_ambiguity: float = Field(
+        0.75,
+        gt=0,
+        le=1,
+        description="a place elsewhere that odometry allows and that fits this much as well makes a closure ambiguous",
+    )
+    max_disagreement_m: float = Field(
+        0.2, gt=0, description="m; registration of old to new may differ from that of new to old by so much"
+    )
+    max_disagreement_deg: float = Field(0.5, gt=0, description="deg; likewise for rotation")
+    sigma_m: float = Field(0.01, gt=0, description="m; a loop closure is never more certain than this")
+    sigma_deg: float = Field(0.02, gt=0, description="deg; likewise for rotation")
+
+
+class GraphConfig(Section):
+    """The optimisation of keyframe poses."""
+
+    control: str = Field("", description="CSV of control points, surveyed positions that hold the poses; empty: none")
+    optimizer: Literal["lm", "dogleg"] = Field(
+        "lm", description="Levenberg-Marquardt, or Powell's dog leg (trust region)"
+    )
+    incremental: bool = Field(False, description="solve keyframe by keyframe with iSAM2 before the final optimisation")
+    robust: Literal["gnc", "huber", "cauchy", "none"] = Field(
+        "gnc", description="how wrong loops and fixes are told: graduated non-convexity, an M-estimator, not at all"
+    )
+    is_pairwise: bool = Field(True, description="drop loops that contradict the loops around them before optimising")
+    probability: float = Field(
+        0.999,
+        gt=0.5,
+        lt=1,
+        description="a loop or fix within this quantile of its own chi-square distribution is right",
+    )
+    drift_percent: float = Field(
+        1.0, gt=0, description="%; one sigma of what odometry may be wrong by over a distance, when loops are judged"
+    )
+    drift_deg_per_100m: float = Field(0.5, gt=0, description="deg/100 m; likewise of its heading, roll and pitch")
+    steady_drift: bool = Field(
+        True,
+        description="set odometry straight where loops tell that it runs away at one rate, before they are closed, or walls of "
+        "buildings that it drifts",
+    )
+    max_iterations: int = Field(100, ge=1, description="of the optimiser, per solution")
+    gravity: bool = Field(True, description="with an IMU: hold each keyframe's up direction to what it measured")
+    gravity_deg: float = Field(0.3, gt=0, description="deg; one sigma of that direction: 0.05 m/s2 of bias are 0.3 deg")
+    imu_orientation: bool = Field(False, description="with an IMU: hold turns between keyframes to the gyroscope's")
+    imu_orientation_deg: float = Field(0.2, gt=0, description="deg; one sigma of such a turn")
+    floor: bool = Field(False, description="hold keyframes to one floor plane, for flat ground only (hdl_graph_slam)")
+    floor_is_flat: bool = Field(
+        True, description="only where nearly all of it is one plane; false: whatever it is, as hdl_graph_slam does"
+    )
+    floor_m: float = Field(0.1, gt=0, description="m; one sigma of the floor's distance")
+    floor_deg: float = Field(1.0, gt=0, description="deg; one sigma of the floor's direction")
+    planar: bool = Field(
+        False, description="a graph of two dimensions: odometry's height, roll and pitch stay as they are"
+    )
+    information: Literal["registration", "fitness"] = Field(
+        "registration",
+        description="covariances of constraints: of the registrations, or from how far the points of one keyframe lie from the "
+        "nearest ones of the other (hdl_graph_slam)",
+    )
+    fitness_sigma_m: tuple[float, float] = Field((0.1, 5.0), description="m; sigma of a perfect fit and of a bad one")
+    fitness_sigma_rad: tuple[float, float] = Field((0.05, 0.2), description="rad; likewise of rotation")
+    fitness_gain: float = Field(20.0, gt=0, description="how soon sigma grows with the fitness score")
+    fitness_limit: float = Field(0.5, gt=0, description="m2; a fitness score as bad as can be")
+
+
+class GnssConfig(Section):
+    """Satellite fixes: as factors of the pose graph, or for one rigid transform at the end."""
+
+    mode: Literal["off", "fit", "graph"] = Field(
+        "off", description="off; fit: georeference the finished trajectory (--georeference); graph: factors (--gnss)"
+    )
+    crs: int | None = Field(
+        None, ge=1024, le=32767, description="EPSG code of georeferenced outputs; default: UTM zone"
+    )
+    height_crs: int | None = Field(
+        None,
+        ge=1024,
+        le=32767,
+        description="EPSG code of a vertical coordinate reference system: --crs EPSG:25832+7837",
+    )
+    geoid: str = Field(
+        "", description="grid (GTX, GeoTIFF) of the geoid that heights of outputs and control points count from"
+    )
+    sigma: float | None = Field(None, gt=0, description="m; one sigma of a fix; default: what the recording states")
+    min_sigma: float = Field(0.02, gt=0, description="m; least sigma of a fix")
+    vertical: float = Field(1.8, ge=1, description="heights are worse than positions by this factor")
+    max_sigma: float = Field(20.0, gt=0, description="m; fixes that state more are left out")
+    min_fixes: int = Field(5, ge=3, description="with fewer fixes that agree there is no georeference")
+
+
+class OsmConfig(Section):
+    """Fetching buildings from an Overpass server, the circles of the buffer, and walls (Del Tufo, 3.1 and 3.2)."""
+
+    extract: str = Field(
+        "",
+        description="buildings that hold the trajectory: a file (.osm, .json, .geojson), auto to fetch them, empty: none",
+    )
+    origin: tuple[float, float, float] | None = Field(
+        None, description="lat, lon (deg), height (m) of the first pose, where no satellite fix says it"
+    )
+    heading_deg: float | None = Field(
+        None,
+        ge=-360,
+        le=360,
+        description="deg; clockwise from north, of the LiDAR's x axis at the first pose; none: sought",
+    )
+    start_radius: float = Field(10.0, gt=0, le=100, description="m; so far off the origin may be")
+    start_heading_deg: float = Field(20.0, gt=0, le=180, description="deg; so far off the heading may be")
+    hold_start: bool = Field(
+        False,
+        description="hold the first pose where the origin has it, as well as start_radius says, against a map that is off as a "
+        "whole; else it only says where to look. rigid always does",
+    )
+    mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
+        "two-level",
+        description="prior: the map is true; rigid: it is off as a whole, as far as the start tells; non-rigid: each building is "
+        "off by itself, in one graph with the trajectory; two-level: first the trajectory, then each building",
+    )
+    matcher: str = Field(
+        "walls",
+        description="walls: walls laid on walls; baseline: NDT and VGICP of flattened scans, buildings and trajectory in one "
+        "graph, as in Del Tufo, section 2.5 (the mode is not asked)",
+    )
+    trust_poses: bool = Field(
+        True, description="with --poses: they are laid on the map as a whole and not bent; false: held like odometry"
+    )
+    shift_sigma: float = Field(2.0, ge=0, description="m; one sigma by which a map may be off as a whole; 0 holds it")
+    map_sigma: float = Field(0.5, gt=0, description="m; one sigma by which a neighbourhood of the map is off by itself")
+    map_sigma_deg: float = Field(1.0, gt=0, description="deg; likewise of its heading")
+    building_sigma: float = Field(1.0, gt=0, description="m; one sigma by which a building of the map is off")
+    building_sigma_deg: float = Field(2.0, gt=0, description="deg; likewise of its heading")
+    server: str = Field(
+        "https://overpass-api.de/api/interpreter",
+        pattern=r"^https?://\S+$",
+        description="address of an Overpass server",
+    )
+    timeout: float = Field(180.0, gt=0, le=900, description="s; longest wait for one reply")
+    connect_timeout: float = Field(10.0, gt=0, description="s; longest wait for a connection")
+    attempts: int = Field(4, ge=1, le=10, description="how often one request is tried while the server is busy")
+    backoff: float = Field(5.0, gt=0, description="s; wait after the first refusal, doubled after each further one")
+    cache: Literal["use", "refresh", "only"] = Field(
+        "use", description="use: what was fetched before is not asked for again; refresh: ask again; only: no network"
+    )
+    fetch_radius: float = Field(120.0, gt=0, description="m; buildings so far round a place are fetched")
+    renew_radius: float = Field(60.0, gt=0, description="m; so far from the last request's place a new one is made")
+    use_radius: float = Field(35.0, gt=0, description="m; buildings so far from the estimate are matched")
+    wall_height: float = Field(
+        1.6, ge=0, description="m; above the ground: what is lower is clutter: cars, fences, hedges, people"
+    )
+    wall_range: float = Field(60.0, gt=0, le=150, description="m; walls are looked for so far from the sensor")
+    wall_tilt_deg: float = Field(15.0, gt=0, lt=45, description="deg; largest tilt of a wall's surface")
+    wall_tolerance: float = Field(0.15, gt=0, description="m; points so far from a line are of its wall")
+    wall_gap: float = Field(1.0, gt=0, description="m; a wider gap parts two walls on one line")
+    min_cluster: int = Field(20, ge=3, description="points a wall has at least")
+    min_length: float = Field(2.0, gt=0, description="m; shorter walls are left out")
+    wall_sigma: float = Field(0.3, gt=0, description="m; one sigma of a wall of the map, drawn by hand from the air")
+    max_distance: float = Field(2.0, gt=0, description="m; mean distance of walls that counts as no match (eq. 3.1)")
+    distance_weight: float = Field(1.0, ge=0, description="A of equation 3.1")
+    coverage_weight: float = Field(1.0, ge=0, description="B of equation 3.2")
+    translation_weight: float = Field(0.1, ge=0, description="C of equation 3.3, of the way to the edge of the window")
+    line_weight: float = Field(
+        0.25, gt=0, le=1, description="information of a match of parallel walls only, against one with corners"
+    )
+    min_coverage: float = Field(0.4, ge=0, le=1, description="share of the walls seen that must lie on the map")
+    min_start_coverage: float = Field(0.6, ge=0, le=1, description="the same where any heading is possible")
+    min_building_coverage: float = Field(0.1, ge=0, le=1, description="share of a building's walls that must be seen")
+    rival_margin: float = Field(
+        15.0, ge=0, description="another pose with so little less fitness makes a match a guess"
+    )
+
+    @model_validator(mode="after")
+    def _check(self) -> OsmConfig:
+        self.require_order("renew_radius", "fetch_radius")
+        if not self.use_radius < self.fetch_radius:
+            raise ValueError(f"use_radius = {self.use_radius} must be less than fetch_radius = {self.fetch_radius}")
+        return self
+
+
+class LocalizeConfig(Section):
+    """A map takes the place of loops and of the pose graph: the drive gets its poses in the map's frame."""
+
+    map: str = Field("", description="run folder, cloud (PLY, PCD, LAS, LAZ) or folder of tiles; empty: none")
+    start: tuple[float, float, float] | None = Field(
+        None,
+        description="x and y of the first scan in the map, m, and its heading, deg counter-clockwise from the map's x axis; "
+        "absent: searched in the whole map, or about the satellite fixes",
+    )
+    start_radius: float = Field(10.0, gt=0, description="m; `start` may be wrong by so much")
+    start_turn_deg: float = Field(30.0, gt=0, le=180, description="deg; likewise its heading")
+
+
+class DebugConfig(Section):
+    """Drift that is added to odometry before loops are looked for; the manifest says so loudly."""
+
+    drift: bool = Field(False, description="let odometry run away as the next keys say: for experiments only")
+    drift_kind: Literal["rate", "random-walk", "recorded"] = Field(
+        "rate",
+        description="at rates that last, or for `drift_memory` only; at rates drawn anew at every step, of the same size after "
+        "100 m; or as the odometry of a real run did",
+    )
+    drift_percent: float = Field(1.0, ge=0, description="%; of the way travelled, in one direction of the world")
+    drift_deg_per_100m: float = Field(0.5, ge=0, description="deg/100 m; of heading, over the way travelled")
+    drift_tilt_deg_per_100m: float = Field(0.0, ge=0, description="deg/100 m; of roll and pitch, likewise")
+    drift_seed: int = Field(0, ge=0, description="draws that direction and the side the heading turns to")
+    drift_memory: float | None = Field(
+        None, gt=0, description="m; way over which both are forgotten and drawn anew; absent: they never change"
+    )
+    drift_estimate: str = Field(
+        "",
+        description="`recorded`: trajectory of that run, in any format that `eval` reads; where it ends its errors begin anew",
+    )
+    drift_truth: str = Field("", description="`recorded`: its ground truth")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        are_given = bool(self.drift_estimate), bool(self.drift_truth)
+        if self.drift_kind == "recorded" and not all(are_given):
+            raise ValueError(
+                "drift_kind = recorded takes drift_estimate and drift_truth, the two trajectories of a real run"
+            )
+        if self.drift_kind != "recorded" and any(are_given):
+            raise ValueError(f"drift_estimate and drift_truth are of drift_kind = recorded, not of {self.drift_kind}")
+        if self.drift_kind != "rate" and self.drift_memory is not None:
+            raise ValueError(f"drift_memory is of drift_kind = rate, not of {self.drift_kind}")
+        return self

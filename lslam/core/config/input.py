@@ -1,0 +1,138 @@
+"""Sections `input` and `preprocess`: which scans are read, and what is done to one by itself."""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from lslam.core.config.section import Section
+from lslam.core.machine import available_cores
+
+RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
+
+
+class ScanRange(Section):
+    """Which scans of one sequence are used; what is absent stays as the configuration says."""
+
+    start: int | None = Field(None, ge=0, description="first scan used of this sequence, absent: input.start")
+    count: int | None = Field(None, ge=1, description="number of scans used of it, absent: input.count")
+    skip_frames: int | None = Field(None, ge=1, description="use every n-th scan of it, absent: input.skip_frames")
+
+    @property
+    def own(self) -> dict[str, int]:
+        """What is given, by key of the section `input`.
+
+        >>> ScanRange(count=5).own
+        {'count': 5}
+        """
+        values = {key: getattr(self, key) for key in ScanRange.model_fields}
+        return {key: value for key, value in values.items() if value is not None}
+
+    @property
+    def last(self) -> int:
+        """Index of the last scan that it asks for."""
+        return (self.start or 0) + ((self.count or 1) - 1) * (self.skip_frames or 1)
+
+
+AS_CONFIGURED = ScanRange()
+# More have nothing to do: scans are read one after the other.
+MOST_WORKERS = 8
+
+
+class InputConfig(Section):
+    """Which scans of the sequence are used, and how strict the run is about them."""
+
+    start: int = Field(0, ge=0, description="first scan used")
+    count: int | None = Field(None, ge=1, description="number of scans used; all when absent")
+    skip_frames: int = Field(1, ge=1, description="use every n-th scan")
+    threads: int = Field(
+        0, ge=0, description="0: as many as there are cores; 1: everything in turn; results do not depend on it"
+    )
+    strict: bool = Field(False, description="every degradation is a failed gate: exit 4")
+    vertical_correction_deg: float | None = Field(
+        None, description="deg; rotation of KITTI HDL-64E points about p x z; absent: the reader knows"
+    )
+    level: Literal["auto", "gravity", "ground", "none"] = Field(
+        "auto",
+        description="what makes z of the world up: gravity as an IMU measures it, the ground under the first scan, or "
+        "nothing; auto: gravity with the IMU, else nothing",
+    )
+    rings: str = Field(
+        "auto", description="how rings are found: auto, field, order (of the file), rows[:N] or elevation[:N]"
+    )
+
+    @property
+    def workers(self) -> int:
+        """Threads of `threads`, 1 or more."""
+        return self.threads or min(available_cores(), MOST_WORKERS)
+
+    @field_validator("rings")
+    @classmethod
+    def _check_rings(cls, value: str) -> str:
+        if RINGS.fullmatch(value) is None:
+            raise ValueError("auto, field, order, rows[:N] or elevation[:N] is needed")
+        return value
+
+
+class PreprocessConfig(Section):
+    """Range gate, what is taken out, and down-sampling."""
+
+    range_min: float = Field(1.0, ge=0, description="m; nearer points hit the vehicle")
+    range_max: float = Field(100.0, gt=0, description="m; far points hold the yaw")
+    range_shape: Literal["sphere", "cylinder"] = Field("sphere", description="distance in space, or horizontal")
+    ego_box: tuple[float, float, float, float, float, float] | None = Field(
+        None,
+        description="m; x_min, x_max, y_min, y_max, z_min, z_max in the LiDAR frame: points inside are dropped",
+    )
+    up: tuple[float, float, float] | None = Field(
+        None,
+        description="up in the LiDAR frame, of any length; absent: z, unless the IMU, or the ground under the first scans, is "
+        "more than 45 deg off",
+    )
+    remove_ground: bool = Field(False, description="take out the points that lie on the ground")
+    ground_slope: float = Field(0.2, gt=0, lt=1, description="m/m; steepest ground against the plane under the sensor")
+    ground_tolerance: float = Field(0.25, gt=0, description="m; what is lower above the ground counts as ground")
+    denoise: bool = Field(
+        False, description="take out points far from their neighbours (statistical outlier removal): distant ones first"
+    )
+    denoise_neighbours: int = Field(10, ge=2, description="`denoise`: nearest points asked, the point itself included")
+    denoise_deviations: float = Field(
+        2.0, ge=0, description="`denoise`: standard deviations above the mean distance that are still allowed"
+    )
+    skip_standing: bool = Field(
+        False, description="while the sensor stands, repeat the pose instead of registering and mapping the scan"
+    )
+    standing_m: float = Field(0.02, gt=0, description="m; what has moved less since it was registered stands")
+    standing_deg: float = Field(0.1, gt=0, description="deg; likewise for rotation")
+    deskew: bool = Field(True, description="take the motion within a scan out of it, where points have times")
+    map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
+    least_line: float = Field(
+        0.5,
+        ge=0,
+        description="share of the line of pulses that a surface leaves in a cell of `map_leaf` below which its points are "
+        "of the air; where these fill a quarter of the cells (rain, snow, dust), they are left out of the map, and of `target` "
+        "and `grid` source points; 0 keeps all",
+    )
+    downsample: Literal["target", "grid", "first", "random", "none"] = Field(
+        "target",
+        description="source points: centroids of a grid adapted to a target count, of a fixed grid, first point per "
+        "voxel, random share, or all",
+    )
+    source_voxel: float = Field(1.0, gt=0, description="m; grid of the source points, where `target` starts")
+    source_points_min: int = Field(4000, ge=50, description="`target`: fewer points make the grid finer")
+    source_points_max: int = Field(6000, ge=100, description="`target`: more points make the grid coarser")
+    random_share: float = Field(0.3, gt=0, le=1, description="`random`: share of points kept")
+    seed: int = Field(0, ge=0, description="`random`: seed")
+
+    @model_validator(mode="after")
+    def _check(self) -> PreprocessConfig:
+        self.require_order("range_min", "range_max")
+        self.require_order("source_points_min", "source_points_max")
+        box = self.ego_box
+        if box is not None and not (box[0] < box[1] and box[2] < box[3] and box[4] < box[5]):
+            raise ValueError(f"ego_box = {list(box)} must be x_min, x_max, y_min, y_max, z_min, z_max")
+        if self.up is not None and not 0.0 < sum(v * v for v in self.up) < float("inf"):
+            raise ValueError(f"up = {list(self.up)} must be a direction: three finite numbers, not all 0")
+        return self

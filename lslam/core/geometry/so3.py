@@ -1,0 +1,175 @@
+"""Rotations: exponential and logarithm on SO(3), quaternions (xyzw), angles. Arrays may be stacked: (..., 3, 3)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import portable
+
+Floats = NDArray[np.float64]
+# Length of x as seen from above, below which it is vertical: 15 deg.
+_STEEP = 0.25
+
+
+def hat(v: NDArray[Any]) -> Floats:
+    """(..., 3) vectors to (..., 3, 3) skew matrices, so that `hat(a) @ b == cross(a, b)`."""
+    v = np.asarray(v, np.float64)
+    m = np.zeros((*v.shape[:-1], 3, 3))
+    m[..., 0, 1], m[..., 0, 2], m[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    m[..., 1, 0], m[..., 2, 0], m[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return m
+
+
+def exp(phi: NDArray[Any]) -> Floats:
+    """(..., 3) rotation vectors, rad, to (..., 3, 3) matrices (Rodrigues)."""
+    phi = np.asarray(phi, np.float64)
+    theta2 = np.sum(phi * phi, axis=-1)[..., None, None]
+    theta = np.sqrt(theta2)
+    small = theta2 < 1e-10
+    safe = np.where(small, 1.0, theta)
+    sine, cosine = portable.sine_cosine(safe)
+    a = np.where(small, 1 - theta2 / 6, sine / safe)
+    b = np.where(small, 0.5 - theta2 / 24, (1 - cosine) / safe**2)
+    return np.asarray(np.eye(3) + a * hat(phi) + b * square(phi))
+
+
+def square(phi: Floats) -> Floats:
+    """hat(phi) @ hat(phi) of vectors (..., 3)."""
+    return np.asarray(phi[..., :, None] * phi[..., None, :] - np.eye(3) * portable.dot(phi, phi)[..., None, None])
+
+
+def log(R: NDArray[Any]) -> Floats:
+    """(..., 3, 3) rotations to (..., 3) rotation vectors, rad, of angle 0..pi; stable near 0 and near pi."""
+    q = to_quaternion(R)
+    v, w = q[..., :3], q[..., 3]
+    n = np.linalg.norm(v, axis=-1)
+    small = n < 1e-9
+    scale = np.where(small, 2.0, 2 * portable.arctan2(n, w) / np.where(small, 1.0, n))
+    return np.asarray(v * scale[..., None])
+
+
+def angle(R: NDArray[Any]) -> Floats:
+    """Rotation angle |log R| in rad, shape (...)."""
+    return np.asarray(np.linalg.norm(log(R), axis=-1))
+
+
+def least_rotation(a: Floats, b: Floats) -> Floats:
+    """(3, 3) smallest rotation that takes the unit vector `a` (3,) to `b` (3,), half a turn square to them where opposite."""
+    axis, cosine = np.cross(a, b), float(portable.dot(a, b))
+    sine = float(portable.norm(axis))
+    if sine < 1e-12:
+        if cosine > 0:
+            return np.eye(3)
+        least = int(np.argmin(np.abs(a)))
+        axis = np.eye(3)[least] - a[least] * a
+        return exp(np.pi * axis / portable.norm(axis))
+    return exp(axis / sine * portable.arctan2(sine, cosine))
+
+
+def level_frame(up: Floats) -> Floats:
+    """(3, 3) rotation that makes the unit vector `up` (3,) the z axis and keeps x ahead as seen from above.
+
+    Where x is nearly vertical, the least rotation. The identity for up = z.
+    """
+    if np.array_equal(up, (0.0, 0.0, 1.0)):
+        return np.eye(3)
+    ahead = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    length = float(portable.norm(ahead))
+    if length < _STEEP:
+        return least_rotation(up, np.array([0.0, 0.0, 1.0]))
+    return np.stack([ahead / length, np.cross(up, ahead / length), up])
+
+
+def to_quaternion(R: NDArray[Any]) -> Floats:
+    """(..., 3, 3) rotations to (..., 4) unit quaternions xyzw with w >= 0 (Shepperd's method: the largest term leads)."""
+    R = np.asarray(R, np.float64)
+    r00, r11, r22 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    # 4 q q^T
+    rows = np.empty((*R.shape[:-2], 4, 4))
+    rows[..., 0, 0], rows[..., 1, 1] = 1 + r00 - r11 - r22, 1 - r00 + r11 - r22
+    rows[..., 2, 2], rows[..., 3, 3] = 1 - r00 - r11 + r22, 1 + r00 + r11 + r22
+    rows[..., 0, 1] = rows[..., 1, 0] = R[..., 1, 0] + R[..., 0, 1]
+    rows[..., 0, 2] = rows[..., 2, 0] = R[..., 0, 2] + R[..., 2, 0]
+    rows[..., 1, 2] = rows[..., 2, 1] = R[..., 2, 1] + R[..., 1, 2]
+    rows[..., 0, 3] = rows[..., 3, 0] = R[..., 2, 1] - R[..., 1, 2]
+    rows[..., 1, 3] = rows[..., 3, 1] = R[..., 0, 2] - R[..., 2, 0]
+    rows[..., 2, 3] = rows[..., 3, 2] = R[..., 1, 0] - R[..., 0, 1]
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0, -q, q))
+
+
+def from_quaternion(q: NDArray[Any]) -> Floats:
+    """(..., 4) quaternions xyzw, any non-zero length, to (..., 3, 3) rotations."""
+    q = np.asarray(q, np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    m = np.empty((*q.shape[:-1], 3, 3))
+    m[..., 0, 0], m[..., 0, 1], m[..., 0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+    )
+    m[..., 1, 0], m[..., 1, 1], m[..., 1, 2] = (
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+    )
+    m[..., 2, 0], m[..., 2, 1], m[..., 2, 2] = (
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
+    )
+    return m
+
+
+def is_rotation(R: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+    """(...,) whether each (..., 3, 3) matrix is a rotation up to `tolerance` in R^T R; False where numbers are not finite."""
+    R = np.asarray(R, np.float64)
+    is_small = np.abs(R).max(axis=(-2, -1)) < 2  # NaN is not, and nothing below overflows
+    R = np.where(is_small[..., None, None], R, 0.0)
+    off = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-2, -1))
+    return np.asarray(is_small & (off <= tolerance) & (np.linalg.det(R) > 0))
+
+
+def normalise(R: NDArray[Any]) -> Floats:
+    """Nearest rotation to (..., 3, 3) matrices that rounding moved off SO(3)."""
+    R = np.asarray(R, np.float64)
+    for _ in range(6):
+        # Newton and Schulz's iteration for the polar factor squares the distance; far off the singular vectors tell.
+        off = portable.product(np.swapaxes(R, -1, -2), R) - np.eye(3)
+        largest = np.abs(off).max(initial=0.0)
+        if not largest < 0.1:
+            return _nearest(R)
+        R = R - 0.5 * portable.product(R, off)
+        if largest < 1e-9:
+            break
+    return R if bool(np.all(np.linalg.det(R) > 0)) else _nearest(R)
+
+
+def _nearest(R: Floats) -> Floats:
+    u, _, vt = np.linalg.svd(R)
+    d = np.sign(np.linalg.det(u @ vt))
+    u[..., :, 2] *= d[..., None]
+    return np.asarray(u @ vt)
+
+
+def euler_rpy(R: NDArray[Any]) -> Floats:
+    """(..., 3) roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    R = np.asarray(R, np.float64)
+    roll = portable.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = portable.arctan2(-R[..., 2, 0], portable.hypot(R[..., 0, 0], R[..., 1, 0]))
+    yaw = portable.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+def from_euler_rpy(rpy: NDArray[Any]) -> Floats:
+    """(..., 3) roll, pitch, yaw in rad to Rz(yaw) Ry(pitch) Rx(roll)."""
+    rpy = np.asarray(rpy, np.float64)
+    axes = np.eye(3)
+    level = portable.product(exp(rpy[..., 2:3] * axes[2]), exp(rpy[..., 1:2] * axes[1]))
+    return portable.product(level, exp(rpy[..., 0:1] * axes[0]))

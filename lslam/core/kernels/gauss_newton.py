@@ -1,0 +1,193 @@
+"""One Gauss-Newton step from normal equations, with a guard on unobserved directions; and the bound that trims matches."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.facts import INFORMATION, LEVER, MATCHED, POPULATION
+from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
+from lslam.core.kernels.linalg import eigen, extent, rotate_left
+from lslam.core.kernels.linearisation import Pose, Sums
+from lslam.core.kernels.surface_information import solve_on_surfaces
+
+Floats = NDArray[np.float64]
+Limits = tuple[float, float, float]
+
+# A degenerate direction is still estimated until its information is below this part of the threshold: errors of a degree in the
+# normals alone give a direction that nothing observes 3e-4 of the information.
+UNSEEN = 0.3
+# Part of the largest eigenvalue below which an eigenvalue is an error of rounding.
+ROUNDING = 1e-12
+
+
+@inline_with_arrays
+def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats,
+                   weak: Floats) -> int:  # fmt: skip
+    """Step d = -inv(H) g, (6,) m and rad, in the observed directions; returns the number of degenerate ones, rows of `weak`.
+
+    Rotations are scaled by the rms lever arm, m, which makes the six eigenvalues comparable. A direction is degenerate when
+    its eigenvalue is less than `weak_share` of the total information or less than `least`, 1/m2. It is left out of the step
+    below `unseen` times that threshold: solution remapping (Zhang, Kaess and Singh 2016).
+    """
+    lever = math.sqrt(max(facts[LEVER] / max(facts[INFORMATION], 1e-300), 1e-6))
+    A = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            A[i, j] = H[i, j] * (1.0 if i < 3 else 1.0 / lever) * (1.0 if j < 3 else 1.0 / lever)
+    values, vectors = eigen(A)
+    d[:] = 0.0
+    count = 0
+    needed = max(weak_share * facts[INFORMATION], least)
+    none = ROUNDING * extent(values)[1]
+    for k in range(6):
+        if values[k] <= needed or values[k] <= none:
+            for i in range(6):
+                weak[count, i] = vectors[i, k]
+            count += 1
+            if values[k] <= unseen * needed or values[k] <= none:
+                continue
+        dot = 0.0
+        for i in range(6):
+            dot += vectors[i, k] * g[i] * (1.0 if i < 3 else 1.0 / lever)
+        for i in range(6):
+            d[i] -= vectors[i, k] * dot / values[k] * (1.0 if i < 3 else 1.0 / lever)
+    return count
+
+
+@inline
+def mirror(H: Floats) -> None:
+    """The lower triangle from the upper."""
+    for i in range(6):
+        for j in range(i):
+            H[i, j] = H[j, i]
+
+
+@inline
+def step_norms(d: Floats) -> tuple[float, float]:
+    """Translation, m, and rotation, rad, of an update (6,)."""
+    return (
+        math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]),
+        math.sqrt(d[3] * d[3] + d[4] * d[4] + d[5] * d[5]),
+    )
+
+
+@inline
+def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Floats) -> bool:
+    """Move R and t by the step d (6,), bounded by the kernel's width `scale`, m; False when the step is not finite.
+
+    move, turn : norms of the translation, m, and the rotation, rad, of d
+    """
+    if not (np.isfinite(move) and np.isfinite(turn)):
+        return False
+    # Correspondences are not valid beyond a step of the kernel's width.
+    limit = 2.0 * max(scale, 0.5)
+    if move > limit:
+        for i in range(6):
+            d[i] *= limit / move
+    t[0] += d[0]
+    t[1] += d[1]
+    t[2] += d[2]
+    rotate_left(R, d[3], d[4], d[5])
+    return True
+
+
+@inline
+def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
+    """Divide H, S, g and the information by the mean relative weight, so that H is the information of the points."""
+    w = facts[MATCHED] / max(facts[POPULATION], 1e-300)
+    for i in range(6):
+        g[i] *= w
+        for j in range(6):
+            H[i, j] *= w
+            S[i, j] *= w
+    facts[INFORMATION] *= w
+    facts[LEVER] *= w
+
+
+@inline_with_arrays
+def within(allowed: Floats, H: Floats) -> Floats:
+    """A H A, the information (6, 6) along the directions on which A = `allowed` (6, 6) projects; H where it has no rows."""
+    if len(allowed) == 0:
+        return H
+    A = np.zeros((6, 6))
+    for i in range(6):
+        for k in range(6):
+            for m in range(6):
+                for j in range(6):
+                    A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
+    return A
+
+
+@inline
+def make_whole(sums: Sums) -> None:
+    """Divide the sums of a linearisation by the mean relative weight of its points, and fill in H's lower triangle."""
+    H, S, g, facts = sums
+    if facts[POPULATION] > 0.0:
+        scale_by_population(H, S, g, facts)
+    mirror(H)
+
+
+@kernel
+def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
+         weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
+    """Move the pose by one step in the observed directions, and write the step to d (6,), m and rad.
+
+    sums : of a linearisation; H has its upper triangle alone, and is filled in
+    scale : width of the robust kernel, m
+    limits : `weak_share`, `least` and `unseen` of `solve_observed`
+    allowed : (6, 6) projector on the directions that may be estimated; (0, 6) allows all
+    weak : (6, 6), whose first rows become the degenerate directions
+
+    Returns whether the step is finite, the number of degenerate directions, and the step's translation, m, and rotation, rad.
+    """
+    R, t = pose
+    H, _, g, facts = sums
+    make_whole(sums)
+    # Directions that the projector excludes have eigenvalue 0, so that their part of g does not enter the step.
+    count = solve_observed(within(allowed, H), g, facts, limits[0], limits[1], limits[2], d, weak)
+    move, turn = step_norms(d)
+    return move_by(d, move, turn, scale, R, t), count, move, turn
+
+
+@kernel
+def step_on_surfaces(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
+                     weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
+    """As `step`, with degenerate directions by S; a kernel of its own, so that runs of other residuals need not compile it."""
+    R, t = pose
+    H, S, g, facts = sums
+    make_whole(sums)
+    mirror(S)
+    count = solve_on_surfaces(within(allowed, H), within(allowed, S), g, facts, limits[0], limits[1], d, weak)
+    move, turn = step_norms(d)
+    return move_by(d, move, turn, scale, R, t), count, move, turn
+
+
+@kernel
+def trimmed(away2: Floats, share: float, gate2: float) -> float:
+    """Squared distance, m2, within which `share` of the matched points within `gate2` lie: that quantile of `away2` (S,).
+
+    Unmatched points have a negative distance. Bisection needs no copy and no sort, and is the same for any order of points.
+    """
+    if share >= 1.0:
+        return gate2
+    high = 0.0
+    total = 0
+    for a in away2:
+        if 0.0 <= a <= gate2:
+            total += 1
+            high = max(high, a)
+    low = 0.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        count = 0
+        for a in away2:
+            if 0.0 <= a <= middle:
+                count += 1
+        if count >= share * total:
+            high = middle
+        else:
+            low = middle
+    return high

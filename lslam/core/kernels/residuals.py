@@ -1,0 +1,263 @@
+"""Normal equations of scan points against Gaussian voxels, point to plane, and the functions that other residuals share."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
+from lslam.core.kernels.gaussians import BLOB, find
+from lslam.core.kernels.jit import inline, kernel
+from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.voxel import index_of, pack
+
+Floats = NDArray[np.float64]
+# Rows of planes, keys and table, see `gaussians`.
+Voxels = tuple[Floats, NDArray[np.int64], NDArray[np.int32]]
+
+# Factor on the variance of the normal, two sigma: the errors of neighbouring points of one ring are correlated.
+TILT = 4.0
+
+
+@inline
+def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: NDArray[np.int64],
+                 slots: NDArray[np.int32], keys: NDArray[np.int64], table: NDArray[np.int32]) -> bool:  # fmt: skip
+    """Look up the slots (8,) of the voxels around point i at x, y, z, world, when it has left its octant cell; True then."""
+    ix, iy, iz = (
+        index_of(x - 0.5 / inverse, inverse),
+        index_of(y - 0.5 / inverse, inverse),
+        index_of(z - 0.5 / inverse, inverse),
+    )
+    cell = pack(ix, iy, iz)
+    if cells[i] == cell:
+        return False
+    cells[i] = cell
+    k = 0
+    for dx in range(2):
+        for dy in range(2):
+            for dz in range(2):
+                slots[i, k] = find(pack(ix + dx, iy + dy, iz + dz), keys, table)
+                k += 1
+    return True
+
+
+@inline
+def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32], chosen: NDArray[np.int32], asked: Floats,
+            planes: Floats) -> tuple[int, float, int, float]:  # fmt: skip
+    """Nearest plane and nearest blob among the slots of point i: for each the slot, or -1, and its mean's squared distance, m2.
+
+    The nearest one stays the same while the point moves by less than half of the difference between the distances to the
+    second nearest and to the nearest one. The blob is kept up to date only without a plane.
+    chosen : (S, 2) plane and blob found last; asked : (S, 4) where the point was then, m, and the squared distance, m2, within
+        which they stay the same
+    """
+    best, blob = int(chosen[i, 0]), int(chosen[i, 1])
+    best_d, blob_d = 1e300, 1e300
+    moved2 = (x - asked[i, 0]) ** 2 + (y - asked[i, 1]) ** 2 + (z - asked[i, 2]) ** 2
+    if moved2 < asked[i, 3]:
+        if best >= 0:
+            best_d = (x - planes[best, 0]) ** 2 + (y - planes[best, 1]) ** 2 + (z - planes[best, 2]) ** 2
+        elif blob >= 0:
+            blob_d = (x - planes[blob, 0]) ** 2 + (y - planes[blob, 1]) ** 2 + (z - planes[blob, 2]) ** 2
+        return best, best_d, blob, blob_d
+    best, blob = -1, -1
+    next_d, next_blob_d = 1e300, 1e300
+    for k in range(8):
+        s = slots[i, k]
+        if s < 0:
+            continue
+        kind = planes[s, 7]
+        if kind < BLOB:
+            continue
+        d = (x - planes[s, 0]) ** 2 + (y - planes[s, 1]) ** 2 + (z - planes[s, 2]) ** 2
+        if kind >= 0.0:
+            if d < best_d:
+                next_d, best_d, best = best_d, d, s
+            elif d < next_d:
+                next_d = d
+        elif d < blob_d:
+            next_blob_d, blob_d, blob = blob_d, d, s
+        elif d < next_blob_d:
+            next_blob_d = d
+    chosen[i, 0], chosen[i, 1] = best, blob
+    asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+    margin = math.sqrt(next_d) - math.sqrt(best_d) if best >= 0 else math.sqrt(next_blob_d) - math.sqrt(blob_d)
+    asked[i, 3] = 0.25 * margin * margin if best >= 0 or blob >= 0 else 1e300
+    return best, best_d, blob, blob_d
+
+
+@inline
+def variance_of(p: Floats, off: float, d2: float) -> float:
+    """Variance, m2, of the surface of a plane voxel at the foot of a point.
+
+    The sum of the variance along the normal and of the normal's uncertainty times the squared distance of the foot from the
+    mean.
+    p : (8,) row of `planes`; off : distance of the point from the plane, m; d2 : squared distance from the mean, m2
+    """
+    variance: float = p[6] + TILT * p[7] * (d2 - off * off)
+    return variance
+
+
+@kernel
+def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
+              width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3), LiDAR frame, with scatter (S, 6) around each, to H, g and facts, see `linearisation`.
+
+    Points that are matched already are skipped; points that are matched with a plane here are marked. A coarser map takes the
+    others.
+
+    Each point takes the nearest plane voxel of the eight around it: residual n . (R s + t - mean), variance = map
+    eigenvalue + source scatter along the normal + sigma2 + tilt at that distance from the mean, Geman-McClure weight of
+    width `scale`, times `plane_weight`. Without a plane the residual is point to point to the nearest blob, with its mean
+    variance, times `blob_weight`, and times `along` in the direction of the sensor's axis.
+    `away2` (S,), m2, takes the squared distance of each matched point to its plane or mean. Points beyond `gate2` are
+    rejected: they count as matched and have no weight.
+    """
+    source, scatter = points
+    planes, keys, table = voxels
+    size, sigma2, plane_weight, blob_weight, along, _ = settings
+    cells, slots, chosen, asked, is_done, away2 = search
+    R, t = pose
+    scale, _, gate2 = width
+    H, _, g, facts = sums
+    inverse = 1.0 / size
+    c2 = scale * scale
+    for i in range(len(source)):
+        if is_done[i]:
+            continue
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
+            asked[i, 3] = -1.0
+        best, best_d, blob, blob_d = nearest(x, y, z, i, slots, chosen, asked, planes)
+        if best >= 0:
+            is_done[i] = True
+            p = planes[best]
+            nx, ny, nz = p[3], p[4], p[5]
+            r = nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2])
+            away2[i] = r * r
+            facts[MATCHED] += 1.0
+            if abs(r) < scale:
+                facts[INLIERS] += 1.0
+            if r * r > gate2:
+                continue
+            # The normal in the LiDAR frame, for the source scatter along it.
+            lx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
+            ly = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
+            lz = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
+            q = scatter[i]
+            spread = (
+                q[0] * lx * lx + q[3] * ly * ly + q[5] * lz * lz
+                + 2.0 * (q[1] * lx * ly + q[2] * lx * lz + q[4] * ly * lz)
+            )  # fmt: skip
+            robust = c2 / (c2 + r * r)
+            robust *= robust
+            w = plane_weight * robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
+            j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
+            add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
+            facts[INFORMATION] += w
+            facts[SQUARED] += robust * r * r
+            facts[LEVER] += w * (rx * rx + ry * ry + rz * rz)
+            facts[ROBUST] += robust
+        elif blob >= 0 and blob_weight > 0.0:
+            is_done[i] = True
+            p = planes[blob]
+            ux, uy, uz = R[0, 2], R[1, 2], R[2, 2]
+            ex, ey, ez = x - p[0], y - p[1], z - p[2]
+            drop = 1.0 - along
+            across2 = blob_d - drop * (ux * ex + uy * ey + uz * ez) ** 2
+            away2[i] = across2
+            facts[MATCHED] += 1.0
+            if across2 < c2:
+                facts[INLIERS] += 1.0
+            if across2 > gate2:
+                continue
+            robust = c2 / (c2 + across2)
+            robust *= robust
+            q = scatter[i]
+            w = blob_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
+            add_information(
+                H, g, w, 1.0 - drop * ux * ux, -drop * ux * uy, -drop * ux * uz, 1.0 - drop * uy * uy, -drop * uy * uz,
+                1.0 - drop * uz * uz, ex, ey, ez, rx, ry, rz,
+            )  # fmt: skip
+            facts[INFORMATION] += (2.0 + along) * w
+            facts[LEVER] += (2.0 + along) * w * (rx * rx + ry * ry + rz * rz)
+
+
+@inline
+def add_row(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: float, j3: float, j4: float,
+         j5: float) -> None:  # fmt: skip
+    """Upper triangle of H += w j j^T and g += w r j."""
+    w0, w1, w2, w3, w4, w5 = w * j0, w * j1, w * j2, w * j3, w * j4, w * j5
+    H[0, 0] += w0 * j0
+    H[0, 1] += w0 * j1
+    H[0, 2] += w0 * j2
+    H[0, 3] += w0 * j3
+    H[0, 4] += w0 * j4
+    H[0, 5] += w0 * j5
+    H[1, 1] += w1 * j1
+    H[1, 2] += w1 * j2
+    H[1, 3] += w1 * j3
+    H[1, 4] += w1 * j4
+    H[1, 5] += w1 * j5
+    H[2, 2] += w2 * j2
+    H[2, 3] += w2 * j3
+    H[2, 4] += w2 * j4
+    H[2, 5] += w2 * j5
+    H[3, 3] += w3 * j3
+    H[3, 4] += w3 * j4
+    H[3, 5] += w3 * j5
+    H[4, 4] += w4 * j4
+    H[4, 5] += w4 * j5
+    H[5, 5] += w5 * j5
+    g[0] += w0 * r
+    g[1] += w1 * r
+    g[2] += w2 * r
+    g[3] += w3 * r
+    g[4] += w4 * r
+    g[5] += w5 * r
+
+
+@inline
+def add_information(H: Floats, g: Floats, w: float, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
+                    ex: float, ey: float, ez: float, rx: float, ry: float, rz: float) -> None:  # fmt: skip
+    """Upper triangle of H += w J^T M J and g += w J^T M e, with J = [I, -hat(r)] and M the symmetric matrix xx..zz."""
+    xx, xy, xz, yy, yz, zz = w * xx, w * xy, w * xz, w * yy, w * yz, w * zz
+    H[0, 0] += xx
+    H[0, 1] += xy
+    H[0, 2] += xz
+    H[1, 1] += yy
+    H[1, 2] += yz
+    H[2, 2] += zz
+    # B = -M hat(r), the block between translation and rotation.
+    b00, b01, b02 = xz * ry - xy * rz, xx * rz - xz * rx, xy * rx - xx * ry
+    b10, b11, b12 = yz * ry - yy * rz, xy * rz - yz * rx, yy * rx - xy * ry
+    b20, b21, b22 = zz * ry - yz * rz, xz * rz - zz * rx, yz * rx - xz * ry
+    H[0, 3] += b00
+    H[0, 4] += b01
+    H[0, 5] += b02
+    H[1, 3] += b10
+    H[1, 4] += b11
+    H[1, 5] += b12
+    H[2, 3] += b20
+    H[2, 4] += b21
+    H[2, 5] += b22
+    # hat(r) B
+    H[3, 3] += ry * b20 - rz * b10
+    H[3, 4] += ry * b21 - rz * b11
+    H[3, 5] += ry * b22 - rz * b12
+    H[4, 4] += rz * b01 - rx * b21
+    H[4, 5] += rz * b02 - rx * b22
+    H[5, 5] += rx * b12 - ry * b02
+    px, py, pz = xx * ex + xy * ey + xz * ez, xy * ex + yy * ey + yz * ez, xz * ex + yz * ey + zz * ez
+    g[0] += px
+    g[1] += py
+    g[2] += pz
+    g[3] += ry * pz - rz * py
+    g[4] += rz * px - rx * pz
+    g[5] += rx * py - ry * px

@@ -1,0 +1,113 @@
+"""Point clouds that are handed on block by block, because the whole may not fit into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.types.arrays import Floats
+
+BLOCK = 1 << 18
+
+
+@dataclass(frozen=True)
+class CloudBlock:
+    """Some points of a cloud: points (N, 3) float64, m; intensity (N,) float32 or None."""
+
+    points: Floats
+    intensity: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+class Cloud(Protocol):
+    """A cloud in one frame: its size is known, its points come in blocks, always the same ones in the same order."""
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether every block has intensities."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of points."""
+        ...
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """All points, in blocks of a size that fits into memory."""
+        ...
+
+
+@dataclass(frozen=True)
+class ArrayCloud:
+    """A cloud in memory: points (N, 3) float64, m; intensity (N,) float32 or None.
+
+    >>> ArrayCloud.of([[1, 2, 3]]).points.tolist()
+    [[1.0, 2.0, 3.0]]
+    """
+
+    points: Floats
+    intensity: NDArray[np.float32] | None = None
+
+    @classmethod
+    def of(cls, points: Any, intensity: Any = None) -> ArrayCloud:
+        """From anything array-like."""
+        values = None if intensity is None else np.asarray(intensity, np.float32).reshape(-1)
+        return cls(np.asarray(points, np.float64).reshape(-1, 3), values)
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether there are intensities."""
+        return self.intensity is not None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """Slices of the arrays."""
+        for start in range(0, len(self), BLOCK):
+            some = slice(start, start + BLOCK)
+            yield CloudBlock(self.points[some], None if self.intensity is None else self.intensity[some])
+
+
+def in_memory(cloud: Cloud) -> ArrayCloud:
+    """The whole cloud as arrays."""
+    if isinstance(cloud, ArrayCloud):
+        return cloud
+    parts = list(cloud.blocks())
+    points = np.concatenate([part.points for part in parts]) if parts else np.zeros((0, 3))
+    if not cloud.has_intensity:
+        return ArrayCloud(points)
+    values = [part.intensity for part in parts if part.intensity is not None]
+    return ArrayCloud(points, np.concatenate(values) if values else np.zeros(0, np.float32))
+
+
+def bounds(cloud: Cloud) -> tuple[Floats, Floats]:
+    """Smallest and largest x, y, z, m, of its finite points; NaN when there are none."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for block in cloud.blocks():
+        points = block.points[np.isfinite(block.points).all(1)]
+        if len(points):
+            low, high = np.minimum(low, points.min(0)), np.maximum(high, points.max(0))
+    return (low, high) if np.isfinite(low).all() else (np.full(3, np.nan), np.full(3, np.nan))
+
+
+def thinned(cloud: Cloud, most: int) -> ArrayCloud:
+    """At most `most` points of a cloud, evenly spaced in its order, so the same ones every time.
+
+    >>> thinned(ArrayCloud.of([[x, 0, 0] for x in range(5)]), 3).points[:, 0].tolist()
+    [0.0, 2.0, 4.0]
+    """
+    step, seen = max(1, -(-len(cloud) // most)), 0
+    points, values = [np.zeros((0, 3))], [np.zeros(0, np.float32)]
+    for block in cloud.blocks():
+        some = slice(-seen % step, None, step)
+        points.append(block.points[some].copy())  # a view would keep its whole block
+        if block.intensity is not None:
+            values.append(block.intensity[some].copy())
+        seen += len(block)
+    return ArrayCloud(np.concatenate(points), np.concatenate(values) if cloud.has_intensity else None)

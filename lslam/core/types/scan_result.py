@@ -1,0 +1,180 @@
+"""The outcome of one scan: its pose, what its points say of it, and the check by pairs of scans."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from lslam.core.geometry import noise, portable, se3, so3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.imu import ImuDiagnostics
+from lslam.core.types.scan import LEVER_M
+
+
+@dataclass(frozen=True)
+class ScanEquations:
+    """Normal equations of a scan on a map: the cost grows by g d + d H d / 2 as its pose moves by d.
+
+    T_world_lidar : (4, 4) at the scan's stamp, where H (6, 6) and g (6,) hold; t' = t + d[:3], R' = exp(d[3:]) R in world
+        axes, 1/m2 and 1/rad2
+    """
+
+    stamp_ns: int
+    T_world_lidar: Floats
+    H: Floats
+    g: Floats
+
+
+# What explains less than this part of what is usual, or less than a share of the points, is rejected.
+USUAL, FEWEST = 0.7, 0.15
+# m; a check with a larger sigma of the position confirms nothing.
+OPEN_M = 0.5
+# m, of a point at `LEVER_M`: two motions of a pair of scans that differ by less are one.
+SAME_M = 0.2
+
+
+@dataclass(frozen=True)
+class MotionCheck:
+    """One comparison of a claimed motion with the scans at its ends; m and rad, axes of the sensor at its begin.
+
+    first, last : positions of the scans in the run; seconds : between them
+    claimed, found : (4, 4) poses of the last scan seen from the first
+    sigma : (6,) standard deviation of what was found, about a metre along directions that the scans do not hold
+    agreement : share of the points that lie on surfaces of the first scan as found; claimed_agreement : as claimed
+    usual : what the agreement lately was; is_after_break : whether scans are missing or failed just before the last
+    rival : (4, 4) another motion that explains the last scan about as well as the one found
+    emptied : share of the directions that held points since the poses stand, and hold none now
+    """
+
+    first: int
+    last: int
+    seconds: float
+    claimed: Floats
+    found: Floats
+    sigma: Floats
+    agreement: float
+    claimed_agreement: float
+    usual: float
+    is_after_break: bool = False
+    rival: Floats | None = None
+    emptied: float = 0.0
+
+    @property
+    def is_conclusive(self) -> bool:
+        """Whether enough points are inliers, and the rotation is constrained well enough, to accept it."""
+        return self.agreement >= max(USUAL * self.usual, FEWEST) and LEVER_M * float(np.max(self.sigma[3:])) < SAME_M
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the scans do not tell the motion, or tell it only along some directions."""
+        return not self.is_conclusive or float(np.max(self.sigma[:3])) > OPEN_M
+
+    @property
+    def apart(self) -> Floats:
+        """(6,) by how much the scans say the motion was more than claimed."""
+        return motion_apart(self.claimed, self.found)
+
+
+def motion_apart(a: Floats, b: Floats) -> Floats:
+    """(6,) by how much a motion `b` (4, 4) is more than another, `a`: m, then rad, in the axes of where both begin."""
+    turn = so3.log(portable.product(b[:3, :3], a[:3, :3].T))
+    return np.concatenate([b[:3, 3] - a[:3, 3], turn])
+
+
+Status = Literal["ok", "bridged", "skipped"]
+
+MOTION_PRIOR, STATIONARY = "motion prior", "standing"
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """The result of odometry for one scan.
+
+    status : `ok` registered; `bridged` registration failed and the motion prior stands in; `skipped` the scan could
+        not be read or was empty, the motion prior stands in
+    T_world_lidar : (4, 4) pose at the scan's stamp
+    covariance : (6, 6) of the pose in the world, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; grows with
+        the distance travelled. None when the method has none
+    registration_covariance : likewise, but relative to the local map the scan was registered on
+    points_covariance : as `covariance`, of the local map by the points of all scans alone, where `covariance` knows of an IMU
+        that a pose graph may get beside; None elsewhere
+    map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
+    is_stationary : the sensor had not moved since the scan before
+    is_repeated : for that reason the scan was not registered and has the pose of the one before
+    posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
+        empty: the method itself
+    segment : number of the local map it was registered on; frame : of the coordinates that its pose is in, 0 for those of the
+        trajectory
+    is_lost : the scans round it say that it may be elsewhere, which a problem of the run says in words
+    degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
+    prior_error : (translation m, rotation rad) between motion prior and result
+    prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (Girolimetto, equation 5.1)
+    imu : its diagnostics
+    stamp_offset : (4, 4) pose at the stamp as the next scan tells it, seen from `T_world_lidar`; None where it tells none
+    fault : what was wrong with the scan though it was of use; empty: nothing
+    stages : seconds per stage, by name, in the order they ran
+    """
+
+    index: int
+    stamp_ns: int
+    T_world_lidar: Floats
+    status: Status = "ok"
+    reason: str = ""
+    covariance: Floats | None = None
+    registration_covariance: Floats | None = None
+    points_covariance: Floats | None = None
+    map_age: float = 1.0
+    converged: bool = True
+    iterations: int = 0
+    source_points: int = 0
+    inliers: int = 0
+    rmse: float = 0.0
+    overlap: float = 0.0
+    is_stationary: bool = False
+    is_repeated: bool = False
+    posed_by: str = ""
+    segment: int = 0
+    frame: int = 0
+    is_lost: bool = False
+    degenerate: Floats = field(default_factory=lambda: np.zeros((0, 6)))
+    prior_error: tuple[float, float] = (0.0, 0.0)
+    prior_norm: float = 0.0
+    imu: ImuDiagnostics = field(default_factory=ImuDiagnostics)
+    stamp_offset: Floats | None = None
+    fault: str = ""
+    stages: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def at_stamp(self) -> ScanResult:
+        """The result with the pose that the next scan tells; for what keeps no points as `T_world_lidar` saw them."""
+        if self.stamp_offset is None:
+            return self
+        return replace(self, T_world_lidar=self.T_world_lidar @ self.stamp_offset, stamp_offset=None)
+
+    def moved(self, T: Floats) -> ScanResult:
+        """The result in the world that `T` (4, 4) leads to: pose, covariances and degenerate directions."""
+        R = T[:3, :3]
+
+        def turned(covariance: Floats | None) -> Floats | None:
+            return None if covariance is None else noise.rotated(covariance, R)
+
+        return replace(
+            self, T_world_lidar=se3.normalise(T @ self.T_world_lidar), covariance=turned(self.covariance),
+            points_covariance=turned(self.points_covariance), registration_covariance=turned(self.registration_covariance),
+            degenerate=self.degenerate @ np.kron(np.eye(2), R).T,
+        )  # fmt: skip
+
+    @property
+    def by_points(self) -> ScanResult:
+        """The same pose, which varies as the local map does by the points alone; the result itself where that is all there is."""
+        if self.points_covariance is None:
+            return self
+        return replace(self, covariance=self.points_covariance, registration_covariance=None)
+
+    def poser(self, method: str) -> str:
+        """What posed the scan: the `method`, its fallback, the motion prior, or the scan before where it repeats that pose."""
+        if self.is_repeated:
+            return STATIONARY
+        return (self.posed_by or method) if self.status == "ok" else MOTION_PRIOR

@@ -1,0 +1,1 @@
+"""Bytes to values and back: codecs, data sets on disk, remote storage."""

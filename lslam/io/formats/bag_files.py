@@ -1,0 +1,285 @@
+"""Bags of ROS 1 and ROS 2, read without ROS.
+
+Reading goes through an index of our own: any message can be read at any time, the files are never loaded, and recordings that
+were cut off or never indexed are read as far as they are whole.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache, cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError
+from lslam.core.printable import shown
+from lslam.io.formats.bag_chunks import LARGEST, Topic, damage, unpack
+from lslam.io.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, suffix_of
+from lslam.io.formats.bag_records import ChunkedBag
+from lslam.io.formats.bag_sqlite import SqliteBag
+from lslam.io.formats.bag_unpacking import unpacked
+from lslam.io.formats.mcap_records import McapFile
+from lslam.io.formats.ros1_records import Ros1Bag
+from lslam.io.remote import RemotePath
+
+T = TypeVar("T")
+
+# Said once, at the beginning: where lslam's own bags keep what else is known of a sequence, as `sequence.toml`.
+INFO_TOPIC = "/lslam/sequence"
+_ENCODINGS = ("cdr", "ros1")
+_SAID = 3  # damaged messages that are named one by one
+_ZSTD = b"\x28\xb5\x2f\xfd"  # ROS 2 can compress every message by itself
+_ZSTD_BLOCK = 1 << 18  # more than the largest block of zstd
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+_OLD_NAMES = {"tf/msg/tfMessage": _TRANSFORMS}
+
+
+Recording = ChunkedBag | SqliteBag
+_Reader = Callable[[Path, Path], Recording]
+READERS: dict[str, _Reader] = {".bag": Ros1Bag, ".bag.active": Ros1Bag, ".mcap": McapFile, ".db3": SqliteBag}
+_MAGIC: dict[bytes, _Reader] = {b"#ROSBAG": Ros1Bag, b"\x89MCAP0": McapFile, b"SQLite format 3": SqliteBag}
+
+
+@dataclass
+class BagTopic:
+    """One topic over all files and connections of a bag; `encoding` is `cdr` or `ros1`.
+
+    Its messages are numbered by the time of recording, whichever part they lie in.
+    """
+
+    name: str
+    type: str
+    encoding: str
+    parts: list[tuple[Recording, Topic]] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return sum(len(topic) for _, topic in self.parts)
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """(N,) when each message was recorded."""
+        return np.asarray(self._rows[0], np.int64)
+
+    def place(self, k: int) -> tuple[Recording, Topic, int]:
+        """Where message `k` lies, and its number there. Raises IndexError beyond the last."""
+        _, part, row = self._rows[:, k].tolist()
+        return *self.parts[part], row
+
+    @cached_property
+    def _rows(self) -> NDArray[np.int64]:
+        """(3, N) when each message was recorded, its part and its number there."""
+        tables = [(t.stamps_ns, np.full(len(t), n), np.arange(len(t))) for n, (_, t) in enumerate(self.parts)]
+        rows = np.concatenate([np.stack(table) for table in tables], axis=1)
+        return rows[:, np.argsort(rows[0], kind="stable")]
+
+
+class Header(NamedTuple):
+    """Beginning of a stamped message: its stamp (ns), its frame, where the rest begins, and the byte order, `<` or `>`."""
+
+    stamp_ns: int
+    frame: str
+    end: int
+    order: str
+
+
+class Bag:
+    """The files of one recording, as one bag; messages are read when they are asked for, from any thread."""
+
+    def __init__(self, path: Path, files: list[Path]) -> None:
+        """Open the files of a recording.
+
+        Raises InputError where none can be read, and for files of ROS 1 and of ROS 2 that hold the same topics.
+        """
+        self.path = path
+        self.losses = left_out(path, files) + missing_parts(path, files)
+        self.notes: list[str] = []
+        every = _recordings(files, self.notes, self.losses)
+        copies = _copies([recording.topics for recording in every])
+        recordings = [recording for k, recording in enumerate(every) if k not in copies]
+        self.losses += [recording.loss for recording in recordings if recording.loss]
+        self.notes += [
+            f"{every[k].path.name} is left out: all of it is in {every[n].path.name} as well" for k, n in copies.items()
+        ]
+        self.files = [recording.path for recording in recordings]
+        # A file that was cut off may have lost the type, which the other parts tell.
+        types = {(t.name, t.encoding): t.type for recording in recordings for t in recording.topics if t.type}
+        topics: dict[tuple[str, str, str], BagTopic] = {}
+        for recording in recordings:
+            for topic in recording.topics:
+                kind = topic.type or types.get((topic.name, topic.encoding), "")
+                key = (topic.name, _OLD_NAMES.get(kind, kind), topic.encoding)
+                topics.setdefault(key, BagTopic(*key)).parts.append((recording, topic))
+        self.topics = sorted(topics.values(), key=lambda t: t.name)
+        _check_encodings(path, self.topics)
+
+    def of_type(self, *names: str) -> list[BagTopic]:
+        """Topics with messages that lslam can decode, of the types whose names (`Imu`, `PointCloud2`) are given."""
+        return [t for t in self.topics if len(t) and t.encoding in _ENCODINGS and t.type.rsplit("/", 1)[-1] in names]
+
+    def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
+        """Message `k` of `topic` as it was serialised, or its first `limit` bytes at the least.
+
+        Raises InputError when it is damaged.
+        """
+        recording, part, row = topic.place(k)
+        data = recording.read(part, row, limit)
+        return _unpacked(recording, part, row, limit) if data[:4] == _ZSTD else data
+
+    def each(
+        self, topic: BagTopic, read: Callable[[bytes], T], problems: list[str], limit: int | None = None
+    ) -> Iterator[tuple[int, T]]:
+        """The number of every message of `topic` and what `read` makes of it, or of its first `limit` bytes.
+
+        Of those that are damaged the first are named in `problems`, the others counted.
+        """
+        broken: list[str] = []
+        for recording, part in topic.parts:
+            recording.expect(part, limit is not None)
+        for k in range(len(topic)):
+            try:
+                value = read(self.message(topic, k, limit))
+            except InputError as error:
+                broken.append(str(error))
+            else:
+                yield k, value
+        problems.extend(broken[:_SAID])
+        if len(broken) > _SAID:
+            problems.append(f"{len(broken) - _SAID} more messages of {topic.name} are damaged")
+
+    def decode(self, topic: BagTopic, data: bytes) -> Any:
+        """A message as an object with the fields of its type. Raises InputError when it does not fit the type."""
+        from rosbags.serde import SerdeError
+
+        store = typestore(topic.encoding)
+        try:
+            if topic.encoding == "ros1":
+                return store.deserialize_ros1(data, topic.type)
+            return store.deserialize_cdr(memoryview(data), topic.type)
+        except (SerdeError, KeyError, AssertionError) as error:
+            raise InputError(f"{self.path}: a message of {topic.name} is no {topic.type}: {error}") from None
+
+
+def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[Recording]:
+    """The files opened; why others cannot be goes to `losses`. Raises InputError where none can."""
+    packed: list[str] = []
+    recordings: list[Recording] = []
+    failures: list[InputError] = []
+    for file in files:
+        try:
+            with unpacked(file) as (there, loss):
+                recordings.append(_reader(file, there)(file, there))
+            losses += [loss] if loss else []
+            packed += [file.name] if there != file else []
+        except InputError as error:
+            failures.append(error)
+    if not recordings:
+        raise failures[0]
+    losses += [f"a part of the recording is not read: {failure}" for failure in failures]
+    if packed:
+        are = "is" if len(packed) == 1 else "are"
+        notes.append(
+            f"{shown(packed)} {are} compressed as a whole: unpacked in the user's cache for as long as the recording is read"
+        )
+    return recordings
+
+
+def _copies(files: list[list[Topic]]) -> dict[int, int]:
+    """Which files, by their topics, hold nothing but what another one holds, and which that is; of equal ones the first stays.
+
+    A copy is made by converting, compressing, indexing or filtering: it keeps names of topics and times of recording.
+    """
+    counts = [sum(map(len, topics)) for topics in files]
+    copies: dict[int, int] = {}
+    fuller: list[int] = []
+    for k in sorted(range(len(files)), key=lambda k: -counts[k]):
+        whole = next((n for n in fuller if counts[k] and _is_within(files[k], files[n])), None)
+        if whole is None:
+            fuller.append(k)
+        else:
+            copies[k] = whole
+    return copies
+
+
+def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
+    """Whether every message is among the others, by topic and time; where one begins or ends outside, no more is compared."""
+
+    def has_all(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> bool:
+        is_around = len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1]
+        return is_around and bool(np.isin(wanted, stamps).all())
+
+    return all(any(o.name == t.name and has_all(o.stamps_ns, t.stamps_ns) for o in others) for t in topics if len(t))
+
+
+def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
+    """Raise InputError for a topic of ROS 1 that is one of ROS 2 as well."""
+    legible = [topic for topic in topics if len(topic) and topic.encoding in _ENCODINGS]
+    for topic, other in pairwise(legible):
+        if other.name == topic.name and other.encoding != topic.encoding:
+            files = ", ".join(t.parts[0][0].path.name for t in (topic, other))
+            raise InputError(
+                f"{path} holds bags of ROS 1 and of ROS 2 ({files}) that are no copies of each other, and {topic.name} is in "
+                "both: name one of them"
+            )
+
+
+def _reader(path: Path, there: Path) -> _Reader:
+    """By the file's first bytes, else by its name."""
+    by_name = READERS[suffix_of(path)]
+    if isinstance(there, RemotePath):
+        return by_name
+    with there.open("rb") as stream:
+        head = stream.read(16)
+    return next((reader for magic, reader in _MAGIC.items() if head.startswith(magic)), by_name)
+
+
+def open_bag(path: Path) -> Bag:
+    """Open a ROS 1 bag, an MCAP or SQLite file, or a folder of them. Raises InputError when there is none or it is unreadable."""
+    files = list_bag_files(path)
+    if not files:
+        raise InputError(f"{path} holds no bag: {', '.join('*' + s for s in SUFFIXES)} are read")
+    return Bag(path, files)
+
+
+def read_header(topic: BagTopic, data: bytes) -> Header:
+    """The header that begins messages of stamped types. Raises InputError when there is none."""
+    try:
+        if topic.encoding == "ros1":
+            _, seconds, nanoseconds, length = struct.unpack_from("<4I", data)
+            at, order = 16, "<"
+        else:
+            order = "<" if data[1] else ">"
+            seconds, nanoseconds, length = struct.unpack_from(order + "iII", data, 4)
+            at = 16
+        frame = data[at : at + length].split(b"\0", 1)[0].decode(errors="replace")
+    except (struct.error, IndexError):
+        raise InputError(f"a message of {topic.name} has no header: {len(data)} bytes") from None
+    return Header(seconds * 10**9 + nanoseconds, frame.lstrip("/"), at + length, order)
+
+
+@cache
+def typestore(encoding: str) -> Any:
+    """The standard message types: their layout never changed, so what a bag says about them is not needed."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    if _TRANSFORMS not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TRANSFORMS))
+    return store
+
+
+def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
+    """A message that was compressed by itself; what is wanted of its beginning lies in the first block."""
+    packed = recording.read(topic, k, None if limit is None else _ZSTD_BLOCK)
+    try:
+        data = unpack("zstd", iter([packed]), LARGEST + 1 if limit is None else limit)
+        if len(data) > LARGEST:
+            raise ValueError(f"it unpacks to more than {LARGEST} bytes")
+    except damage() as error:
+        raise InputError(f"{recording.path}: message {k} of {topic.name} is damaged: {error}") from None
+    return data

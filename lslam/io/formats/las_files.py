@@ -1,0 +1,215 @@
+"""LAS 1.4 and LAZ files, what every GIS reads: written block by block, read whole. The only file that knows laspy.
+
+What a file says of its own size is held against its size first: native code trusts it and aborts for want of memory. Offsets are
+those of the LAS 1.4 R15 specification, and for LAZ those of Isenburg's laszip (its VLR, its chunk table).
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, OutputError, cause
+from lslam.core.extras import importing
+from lslam.core.types.cloud import ArrayCloud, Cloud
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import atomic_write
+
+if TYPE_CHECKING:
+    import lazrs
+
+_VLR, _EVLR = 54, 60  # bytes of their headers
+_LASZIP = b"laszip encoded"
+_LAYERED = 3  # the compressor of point formats 6 and above: every field of a chunk lies by itself
+# Fields of the items of layered chunks; those of bytes are as many as the bytes.
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+_EXTRA_BYTES = 14
+_SIZES = {2: 227, 3: 235, 4: 375, 5: 393}  # bytes of the header by minor version
+SCALE = 0.001  # m
+_WAY_OUT = "install it with: pip install laspy lazrs"
+_REACH = 2**31 - 1
+_BLOCK = 1 << 26  # bytes of points decompressed at a time
+
+
+def check_las(stream: BinaryIO) -> tuple[int, int]:
+    """Bytes of a point and of the largest chunk, decompressed. Raises ValueError saying which sizes contradict each other."""
+    size = os.fstat(stream.fileno()).st_size
+    head = stream.read(393)
+    if head[:4] != b"LASF":
+        raise ValueError("it does not begin with LASF")
+    minor = head[25] if len(head) > 25 else 0
+    least = _SIZES.get(minor, 227)
+    if len(head) < least:
+        raise ValueError(f"its header ends after {len(head)} bytes")
+    own, offset, vlrs, kind, record = struct.unpack_from("<HIIBH", head, 94)
+    if not least <= own <= offset <= size or vlrs * _VLR > offset - own:
+        raise ValueError(
+            f"its header of {own} bytes and its {vlrs} records do not fit before its points at byte {offset}"
+        )
+    (count,) = struct.unpack_from("<Q", head, 247) if minor >= 4 else struct.unpack_from("<I", head, 107)
+    if minor >= 4:
+        first, evlrs = struct.unpack_from("<QI", head, 235)
+        if evlrs and first + evlrs * _EVLR > size:
+            raise ValueError(f"its {evlrs} records from byte {first} on reach beyond its {size} bytes")
+    if not record:
+        raise ValueError("its points have no bytes")
+    if not kind & 0x80:
+        if offset + count * record > size:
+            raise ValueError(f"{count} points of {record} bytes from byte {offset} on reach beyond its {size} bytes")
+    elif count:
+        return record, record * _check_chunks(stream, *_laszip(stream, own, vlrs, record), count, offset, record)
+    return record, 0
+
+
+def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs.LazVlr, int]:
+    """How points are compressed, and in how many layers a chunk lies, 0 where it has none."""
+    import lazrs
+
+    position = begin
+    for _ in range(vlrs):
+        stream.seek(position)
+        head = stream.read(_VLR)
+        if len(head) < _VLR:
+            break
+        user, number, length = struct.unpack_from("<16sHH", head, 2)
+        if user.rstrip(b"\0") == _LASZIP and number == 22204:
+            data = stream.read(length)
+            laszip = lazrs.LazVlr(data)
+            if laszip.item_size() != record or laszip.chunk_size() == 0:
+                raise ValueError(f"its compression is of points that have not {record} bytes")
+            compressor, items = struct.unpack_from("<H30xH", data)
+            kinds = list(struct.iter_unpack("<HHH", data[34 : 34 + 6 * items]))
+            layers = sum(size if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, size, _ in kinds)
+            return laszip, layers if compressor == _LAYERED else 0
+        position += _VLR + length
+    raise ValueError("nothing says how its points are compressed")
+
+
+def _check_chunks(stream: BinaryIO, laszip: lazrs.LazVlr, layers: int, count: int, offset: int, record: int) -> int:
+    """The most points a chunk has."""
+    import lazrs
+
+    size = os.fstat(stream.fileno()).st_size
+    stream.seek(offset)
+    begin = offset + 8
+    (table,) = struct.unpack("<q", stream.read(8).ljust(8, b"\0"))
+    if table == -1:  # written by what could not go back
+        stream.seek(size - 8)
+        (table,) = struct.unpack("<q", stream.read(8))
+    if not begin <= table <= size - 8:
+        raise ValueError(f"its table of chunks is said to lie at byte {table} of {size}")
+    stream.seek(table)
+    _, chunks = struct.unpack("<II", stream.read(8))
+    # A chunk begins with one point as it is.
+    if chunks * record > table - begin:
+        raise ValueError(f"{chunks} chunks do not fit into {table - begin} bytes")
+    if not laszip.uses_variable_size_chunks() and chunks != -(-count // laszip.chunk_size()):
+        raise ValueError(f"{count} points in chunks of {laszip.chunk_size()} are not {chunks} chunks")
+    # The table is compressed itself; how many entries it has is known by now.
+    stream.seek(offset)
+    entries = lazrs.read_chunk_table(stream, laszip)
+    for _, length in entries:
+        if length < record or begin + length > table:
+            raise ValueError(f"the chunk at byte {begin} is said to have {length} bytes")
+        if layers:
+            _check_layers(stream, layers, begin, length, record)
+        begin += length
+    return max((points for points, _ in entries), default=0)
+
+
+def _check_layers(stream: BinaryIO, layers: int, begin: int, length: int, record: int) -> None:
+    stream.seek(begin + record)
+    need = 4 + 4 * layers
+    said = stream.read(need) if record + need <= length else b""
+    if len(said) < need or record + need + sum(struct.unpack_from(f"<{layers}I", said, 4)) > length:
+        raise ValueError(f"the chunk at byte {begin} has less than its layers need")
+
+
+def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
+    """Write a cloud, m, as LAS 1.4 (point format 6); `.laz` compresses it.
+
+    Coordinates are millimetres about an offset, the floor of the smallest ones. Intensities are 16 bits: 0..1 and 0..255
+    are spread over them, larger values are kept. The file is dated 1970, so the same cloud gives the same bytes.
+
+    wkt : coordinate reference system of the points; empty: none
+
+    Raises OutputError when the file cannot be written, or the cloud is wider than the millimetres of LAS reach (2147 km).
+    """
+    with importing("laspy", _WAY_OUT):
+        import laspy
+        import lazrs  # noqa: F401
+    low, high, largest = _survey(cloud)
+    offset = np.floor(low)
+    if np.any(high - offset > SCALE * _REACH):
+        raise OutputError(f"{path}: the map is wider than LAS can hold in millimetres: crop it with --crop")
+    header = _header(laspy, offset, wkt)
+    factor = 65535.0 if largest <= 1.0 else 257.0 if largest <= 255.0 else 1.0
+    with atomic_write(path) as stream:
+        compressed = path.suffix.lower() == ".laz"
+        with laspy.open(stream, mode="w", header=header, do_compress=compressed, closefd=False) as writer:
+            for block in cloud.blocks():
+                record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
+                steps = np.rint((block.points - offset) / SCALE)
+                record["X"], record["Y"], record["Z"] = steps.astype(np.int32).T
+                if block.intensity is not None:
+                    record["intensity"] = np.clip(np.rint(block.intensity * factor), 0, 65535).astype(np.uint16)
+                record["return_number"] = record["number_of_returns"] = np.ones(len(block), np.uint8)
+                writer.write_points(record)
+
+
+def read_las(path: Path) -> tuple[ArrayCloud, str]:
+    """The points, m, 16-bit intensities and WKT, or "", of a LAS or LAZ file. Raises InputError naming one that is damaged."""
+    with importing("laspy", _WAY_OUT):
+        import laspy
+        import lazrs  # noqa: F401
+    try:
+        with path.open("rb") as stream:
+            record, largest = check_las(stream)
+            stream.seek(0)
+            # On all cores whole chunks are decompressed at once, however large they are.
+            backend = laspy.LazBackend.LazrsParallel if largest <= _BLOCK else laspy.LazBackend.Lazrs
+            with laspy.open(stream, closefd=False, laz_backend=backend) as reader:
+                blocks = [
+                    (np.column_stack([block.x, block.y, block.z]), np.asarray(block.intensity, np.float32))
+                    for block in reader.chunk_iterator(max(_BLOCK // record, 1))
+                ]
+                header = reader.header
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
+    except BaseException as error:  # laspy and lazrs raise whatever a damaged byte leads to, Rust its panics
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        raise InputError(f"{path} cannot be read as LAS: {error}") from None
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in blocks)])
+    intensity = np.concatenate([np.zeros(0, np.float32), *(values for _, values in blocks)])
+    texts = [vlr.string for vlr in header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"]
+    return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
+
+
+def _header(laspy: Any, offset: NDArray[np.float64], wkt: str) -> Any:
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.scales, header.offsets = np.full(3, SCALE), offset
+    header.creation_date = date(1970, 1, 1)  # laspy would put today's
+    header.system_identifier = "lslam"
+    header.generating_software = f"lslam {__version__}"
+    # Format 6 has to say WKT, also when there is none.
+    header.global_encoding.wkt = True
+    if wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    return header
+
+
+def _survey(cloud: Cloud) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Smallest and largest coordinates (3,), m, and the largest intensity; zeros for nothing."""
+    low, high, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+    for block in cloud.blocks():
+        low, high = np.minimum(low, block.points.min(0)), np.maximum(high, block.points.max(0))
+        if block.intensity is not None:
+            largest = max(largest, float(block.intensity.max()))
+    return (low, high, largest) if np.isfinite(low).all() else (np.zeros(3), np.zeros(3), 0.0)

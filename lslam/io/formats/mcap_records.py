@@ -1,0 +1,90 @@
+"""The records of MCAP files."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.io.formats.bag_chunks import Chunk, Topic
+from lslam.io.formats.bag_records import INDICES, ChunkedBag, Record
+
+_SCHEMA, _CHANNEL = 3, 4
+_FOOTER_SIZE = 29  # bytes of the record, its prefix included
+_PREFIX = 9  # bytes before the content of a record: op and length
+_STAMPS = 22  # bytes before the data of a message: channel, sequence, log time, publish time
+_CHUNK_HEAD = 64  # more than what stands before the records of a chunk
+
+
+class McapFile(ChunkedBag):
+    """One `.mcap` file. The head of a record is the first bytes of its content, of a message all that is not data."""
+
+    MAGIC = b"\x89MCAP0\r\n"
+    MESSAGE, INDEX, CHUNK, CHUNK_INFO, NAMES, FOOTER = 5, 7, 6, 8, (_SCHEMA, _CHANNEL), 2
+
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        """Open `path`, or what it holds, where it was unpacked."""
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[int, str, str]] = {}
+        super().__init__(path, unpacked)
+
+    def _misnomer(self, head: bytes) -> str:
+        return "no MCAP file"
+
+    def _record(self, chunk: Chunk | None, offset: int, is_head: bool = False) -> Record:
+        head = self._file.part(chunk, offset, _PREFIX + _STAMPS, is_head)
+        op, length = struct.unpack_from("<BQ", head)
+        before = _STAMPS if op == self.MESSAGE else 0
+        return Record(op, head[_PREFIX:], offset + _PREFIX + before, length - before)
+
+    def _summary(self) -> int:
+        footer = self._file.size - len(self.MAGIC) - _FOOTER_SIZE
+        return int(struct.unpack_from("<Q", self._file.read(footer, _FOOTER_SIZE), _PREFIX)[0])
+
+    def _near(self, info: Record) -> list[tuple[int, int]]:
+        start, size = struct.unpack_from("<2Q", self._file.read(info.data, info.size), 16)
+        return [(start, _CHUNK_HEAD), (start + size, INDICES)]
+
+    def _chunk(self, record: Record) -> Chunk:
+        head = self._file.part(None, record.data, _CHUNK_HEAD)
+        _, _, length, crc = struct.unpack_from("<QQQI", head)
+        compression, at = _text(head, 28)
+        (size,) = struct.unpack_from("<Q", head, at)
+        return Chunk(record.data + at + 8, size, length, compression, crc)
+
+    def _index(self, record: Record) -> tuple[int, NDArray[np.unsignedinteger[Any]]]:
+        data = self._file.read(record.data, record.size)
+        return int.from_bytes(data[:2], "little"), np.frombuffer(data, "<u8", offset=6).reshape(-1, 2)
+
+    def _message(self, record: Record) -> tuple[int, int]:
+        channel, _, stamp = struct.unpack_from("<HIQ", record.head)
+        return channel, stamp
+
+    def _note_name(self, record: Record, data: bytes) -> None:
+        (number,) = struct.unpack_from("<H", data)
+        if record.op == _SCHEMA:
+            self._schemas[number] = _text(data, 2)[0]
+            return
+        (schema,) = struct.unpack_from("<H", data, 2)
+        name, at = _text(data, 4)
+        self._channels[number] = (schema, name, _text(data, at)[0])
+
+    def _named(self) -> dict[int, Topic]:
+        return {
+            channel: Topic(name, _type(self._schemas.get(schema, "")), encoding)
+            for channel, (schema, name, encoding) in self._channels.items()
+        }
+
+
+def _type(name: str) -> str:
+    """As ROS 2 writes it: messages of ROS 1 may lie in MCAP files too."""
+    return name.replace("/", "/msg/") if name.count("/") == 1 else name
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    (length,) = struct.unpack_from("<I", data, at)
+    end = at + 4 + length
+    return data[at + 4 : end].decode(errors="replace"), end

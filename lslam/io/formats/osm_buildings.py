@@ -1,0 +1,240 @@
+"""Buildings of an OpenStreetMap extract: which elements count, their outlines in metres, their heights."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError
+from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.building import Building, Footprint
+from lslam.io.formats.osm_data import OsmData, Relation, Way
+from lslam.io.formats.osm_files import read_osm
+from lslam.io.formats.osm_rings import footprints_from_rings, join_rings
+
+Floats = NDArray[np.float64]
+
+FARTHEST = 100e3  # m
+STOREY = 3.0  # m, docs/conventions.md
+FOOT = 0.3048  # m
+TALLEST = 1000.0  # m; what is higher is a slip of the pen
+
+
+@dataclass(frozen=True)
+class BuildingExtract:
+    """The buildings of one extract, in the local frame at `origin`.
+
+    buildings : in the order of the file, ways first; skipped : why elements were left out -> how many
+    origin : (3,) lat, lon (deg), height (m) of x = y = 0; attribution : as `OsmData.attribution`; source : for messages
+    """
+
+    buildings: list[Building]
+    skipped: Mapping[str, int]
+    origin: Floats
+    attribution: str | None
+    source: str
+
+
+def read_buildings(path: Path, origin: NDArray[Any] | None = None) -> tuple[OsmData, BuildingExtract]:
+    """All of `path` (OSM XML, Overpass JSON, GeoJSON), and its buildings in the local frame at `origin` (3,) lat, lon, height.
+
+    Without `origin` it is the middle of all buildings, at height 0. Raises InputError naming the file: unreadable
+    (`read_osm`), without one building, far from the origin.
+    """
+    data = read_osm(path)
+    return data, some_buildings_of(data, middle_of(data) if origin is None else origin, path)
+
+
+def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> BuildingExtract:
+    """`buildings_of` what was read from `path`; raises InputError naming it when there is not one."""
+    extract = buildings_of(data, origin, str(path))
+    if not extract.buildings:
+        why = ", ".join(f"{count} x {reason}" for reason, count in extract.skipped.items())
+        raise InputError(
+            f"{path} holds no building outline ({len(data.ways)} ways, {len(data.relations)} relations"
+            f"{'; left out: ' + why if why else ''}): fetch an extract with the buildings of the place"
+        )
+    return extract
+
+
+def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract") -> BuildingExtract:
+    """Footprints of every building in `data`, by the rules of docs/conventions.md ("Geodesy and OpenStreetMap").
+
+    Closed ways and multipolygons count; `building=no`, what lies underground and what misses nodes does not.
+    Raises InputError when all nodes lie more than 100 km from the origin, where a local frame means nothing.
+    """
+    at = np.asarray(origin, np.float64)
+    where = _Positions(data, at)
+    if data.nodes and not (away := where.distance()) < FARTHEST:
+        far = "more than a continent" if not np.isfinite(away) else distance_text(away)
+        raise InputError(f"{source} lies {far} away from the origin: {right_place(at, _is_swapped(data, at))}")
+    skipped: Counter[str] = Counter()
+    of_relations: list[Building] = []
+    outlines: set[int] = set()
+    for relation in data.relations.values():
+        if relation.tags.get("type") != "multipolygon" or not _counts(relation.tags, skipped):
+            continue
+        footprints = _relation_footprints(relation, data, where, skipped)
+        if footprints:
+            of_relations.append(_building(f"relation/{relation.id}", footprints, relation.tags))
+            outlines |= {m.ref for m in relation.members if m.kind == "way" and m.role in ("", "outer")}
+    buildings: list[Building] = []
+    for way in data.ways.values():
+        if not _counts(way.tags, skipped):
+            continue
+        if way.id in outlines:
+            skipped["outline of a multipolygon already read"] += 1
+            continue
+        footprints = _way_footprints(way, where, skipped)
+        if footprints:
+            buildings.append(_building(f"way/{way.id}", footprints, way.tags))
+    return BuildingExtract(buildings + of_relations, dict(skipped), at, data.attribution, source)
+
+
+def middle_of(data: OsmData) -> Floats:
+    """(3,) lat, lon (deg) of the middle of the box round all buildings' nodes, as --origin takes them; height 0."""
+    ways = [way for way in data.ways.values() if "building" in way.tags]
+    members = {m.ref for r in data.relations.values() if "building" in r.tags for m in r.members if m.kind == "way"}
+    ways += [way for number, way in data.ways.items() if number in members]
+    fixes = np.array([data.nodes[node] for way in ways for node in way.nodes if node in data.nodes])
+    if not len(fixes):
+        fixes = np.array([*data.nodes.values()] or [(0.0, 0.0)])
+    first = fixes[0, 1]
+    fixes[:, 1] = first + (fixes[:, 1] - first + 180) % 360 - 180  # a place on the antimeridian is in one piece
+    return np.append(np.round((fixes.min(axis=0) + fixes.max(axis=0)) / 2, 7), 0.0)
+
+
+class _Positions:
+    """Rings of node numbers as corners in metres; every node is projected once."""
+
+    def __init__(self, data: OsmData, origin: Floats) -> None:
+        self.row = {number: k for k, number in enumerate(data.nodes)}
+        fixes = np.array([(lat, lon, 0.0) for lat, lon in data.nodes.values()]).reshape(-1, 3)
+        self.xy = to_local(fixes, origin)[:, :2]
+
+    def distance(self) -> float:
+        """From the origin to the nearest node, m; inf where the projection has no answer."""
+        return float(np.min(np.nan_to_num(np.linalg.norm(self.xy, axis=1), nan=np.inf)))
+
+    def has(self, nodes: Iterable[int]) -> bool:
+        return all(node in self.row for node in nodes)
+
+    def ring(self, nodes: Sequence[int]) -> Floats:
+        return np.asarray(self.xy[[self.row[node] for node in nodes[:-1]]])
+
+
+def _counts(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
+    """True for a building above the ground; other buildings are counted in `skipped`."""
+    kind = tags.get("building")
+    if kind is None:
+        return False
+    if kind.strip().lower() == "no":
+        skipped["building=no"] += 1
+    elif is_underground(tags):
+        skipped["underground"] += 1
+    else:
+        return True
+    return False
+
+
+def _way_footprints(way: Way, where: _Positions, skipped: Counter[str]) -> tuple[Footprint, ...]:
+    if not where.has(way.nodes) or not way.nodes:
+        skipped["nodes missing"] += 1
+    elif not way.is_closed:
+        skipped["open way"] += 1
+    elif found := footprints_from_rings([where.ring(way.nodes)], []):
+        return found
+    else:
+        skipped["no area"] += 1
+    return ()
+
+
+def _relation_footprints(
+    relation: Relation, data: OsmData, where: _Positions, skipped: Counter[str]
+) -> tuple[Footprint, ...]:
+    members = [m for m in relation.members if m.kind == "way" and m.role in ("", "outer", "inner")]
+    ways = [data.ways.get(m.ref) for m in members]
+    if not all(way is not None and way.nodes and where.has(way.nodes) for way in ways):
+        skipped["nodes missing"] += 1
+        return ()
+    parts = [(m.role == "inner", way.nodes) for m, way in zip(members, ways, strict=True) if way is not None]
+    outer, inner = (join_rings([nodes for is_inner, nodes in parts if is_inner == wanted]) for wanted in (False, True))
+    if not outer or inner is None:
+        skipped["rings that do not close"] += 1
+        return ()
+    found = footprints_from_rings([where.ring(ring) for ring in outer], [where.ring(ring) for ring in inner])
+    if not found:
+        skipped["no area"] += 1
+    return found
+
+
+def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str, str]) -> Building:
+    own = {key: value for key, value in tags.items() if key != "type"}
+    return Building(osm_id, footprints, height_of(tags), base_of(tags), own)
+
+
+def _is_swapped(data: OsmData, origin: Floats) -> bool:
+    """True when data and origin are of one place, but for the order of latitude and longitude."""
+    return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST
+
+
+def right_place(origin: Floats, is_swapped: bool = False) -> str:
+    """What to do about an extract of another place, for messages."""
+    if is_swapped:
+        return (
+            f"latitude and longitude are swapped, in --origin ({origin[0]:.5f},{origin[1]:.5f}; latitude first) or in the file "
+            "(GeoJSON has the longitude first)"
+        )
+    return f"check --origin ({origin[0]:.5f},{origin[1]:.5f}) or fetch the extract of that place"
+
+
+def distance_text(distance: float) -> str:
+    """A distance, m, for messages."""
+    return f"{distance / 1000:.1f} km" if distance > 1000 else f"{distance:.0f} m"
+
+
+def height_of(tags: Mapping[str, str]) -> float | None:
+    """Height in m from `height` (m, or feet and inches), else `building:levels` x 3 m; None when neither is a sensible number."""
+    height = _length(tags.get("height", ""))
+    if height is None:
+        levels = _number(tags.get("building:levels", ""))
+        height = None if levels is None else levels * STOREY
+    return height if height is not None and 0 < height < TALLEST else None
+
+
+def base_of(tags: Mapping[str, str]) -> float:
+    """Where the walls begin, m above the ground: `min_height`, else `building:min_level` x 3 m, else 0.
+
+    What lies above the building's own height is nonsense and counts as 0.
+    """
+    base = _length(tags.get("min_height", ""))
+    if base is None:
+        base = (_number(tags.get("building:min_level", "")) or 0.0) * STOREY
+    return base if 0 < base < (height_of(tags) or TALLEST) else 0.0
+
+
+def is_underground(tags: Mapping[str, str]) -> bool:
+    """True for `location=underground` and for a negative `layer`."""
+    layer = _number(tags.get("layer", ""))
+    return tags.get("location") == "underground" or (layer is not None and layer < 0)
+
+
+def _number(text: str) -> float | None:
+    found = re.fullmatch(r"\s*([+-]?\d+(?:[.,]\d+)?)\s*", text)
+    return float(found[1].replace(",", ".")) if found else None
+
+
+def _length(text: str) -> float | None:
+    """Metres from `12`, `12.5 m`, `40 ft` or `40'6"`."""
+    found = re.fullmatch(r"\s*(\d+(?:[.,]\d+)?)\s*(m|metres?|meters?|ft|feet|')?\s*(?:(\d+(?:\.\d+)?)\")?\s*", text)
+    if not found or (found[3] and found[2] != "'"):
+        return None
+    value = float(found[1].replace(",", "."))
+    return value * FOOT + float(found[3] or 0) * FOOT / 12 if found[2] in ("ft", "feet", "'") else value

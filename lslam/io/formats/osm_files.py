@@ -1,0 +1,198 @@
+"""OpenStreetMap files: nodes, ways and relations from XML, Overpass JSON or GeoJSON, and back to XML.
+
+XML is parsed without entities or document types, so that a hostile file cannot grow in memory.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import IO, Any
+from xml.etree.ElementTree import Element, ParseError
+from xml.sax.saxutils import quoteattr
+
+from lslam.core.errors import InputError, cause
+from lslam.core.untrusted import JsonItems
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.osm_data import DECIMALS, OsmData
+from lslam.io.formats.osm_outlines import is_geojson, osm_from_outlines
+
+GENERATOR = "lslam"
+ELEMENTS = "elements"  # of a reply
+WAY_OUT = "fetch the extract again"
+# Marks of byte order, the zeros of wide characters, and blanks, before the first that counts.
+_BEFORE = b"\xef\xbb\xbf\xff\xfe\0 \t\r\n"
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+# First bytes of gzip, bzip2, xz, zip and Zstandard.
+_COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04", b"\x28\xb5\x2f\xfd")
+
+
+def read_osm(path: Path) -> OsmData:
+    """Read an OSM XML file, a stored Overpass reply (JSON) or outlines in GeoJSON; the content decides, not the name.
+
+    Raises InputError naming the file: missing, cut short, none of the three, with entities, with positions off the Earth.
+    """
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(64)
+        if start.startswith(_COMPRESSED) or b"OSMHeader" in start:
+            raise InputError(
+                f"{path} is compressed: turn it into plain XML first (gunzip, bunzip2, or osmium cat -o map.osm)"
+            )
+        first = start.lstrip(_BEFORE)[:1]
+        if first not in (b"<", b"{", b"["):
+            what = "is neither XML nor JSON" if first else "is empty"
+            raise InputError(f"{path} {what}, so it is no OpenStreetMap extract: {WAY_OUT}")
+        return _read_xml(path, start.startswith(_UTF16)) if first == b"<" else _read_json(path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {cause(error)}") from None
+
+
+class GaveUpError(ValueError):
+    """What Overpass says, `remark`, when it ran out of time or memory: the reply is valid JSON but incomplete."""
+
+    def __init__(self, remark: Any) -> None:
+        super().__init__(f"the server gave up: {str(remark)[:200]}")
+        self.remark = str(remark)
+
+
+def add_elements(data: OsmData, items: JsonItems) -> None:
+    """Add the elements of an Overpass reply. Raises ValueError saying what is wrong with one."""
+    for element in items:
+        try:
+            data.add_element(element)
+        except (AttributeError, LookupError, TypeError, ArithmeticError) as error:
+            raise ValueError(f"an element without {error}: {str(element)[:80]}") from None
+
+
+def check_reply(items: JsonItems) -> None:
+    """Raise ValueError for what was no reply; GaveUpError, which is such, when the server did."""
+    if not items.has_list:
+        raise ValueError("no list of elements, so this is no Overpass reply")
+    if items.rest.get("remark"):
+        raise GaveUpError(items.rest["remark"])
+
+
+def write_osm(path: Path, data: OsmData) -> None:
+    """Write `data` as OSM XML 0.6, atomically, degrees with 7 decimals; what it read, or rounded, reads back equal."""
+    with atomic_write(path) as stream:
+        stream.write("".join(_xml_lines(data)).encode("utf-8", "replace"))
+
+
+def _read_json(path: Path) -> OsmData:
+    data = OsmData()
+    try:
+        with path.open("rb") as stream:
+            items = JsonItems(stream, ELEMENTS)
+            add_elements(data, items)
+        if not items.has_list and is_geojson(items.rest):
+            return osm_from_outlines(items.rest)
+        check_reply(items)
+        data.number_drawn()
+        return data
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path} is broken JSON, perhaps cut short ({error}): {WAY_OUT}") from None
+    except ValueError as error:
+        raise InputError(f"{path} cannot be used, {error}: {WAY_OUT}") from None
+
+
+def _read_xml(path: Path, is_wide: bool) -> OsmData:
+    from defusedxml import DefusedXmlException, DTDForbidden
+
+    try:
+        # What a shell turned into UTF-16 still says of itself that it is UTF-8.
+        with path.open(encoding="utf-16") if is_wide else path.open("rb") as stream:
+            return _parsed_xml(path, stream)
+    except DTDForbidden as error:
+        if str(error.name).lower() == "html":
+            raise InputError(f"{path} is a web page and no OpenStreetMap extract: {WAY_OUT}") from None
+        raise InputError(
+            f"{path} declares a document type or entities, which no OpenStreetMap file does: {WAY_OUT}"
+        ) from None
+    except DefusedXmlException:
+        raise InputError(f"{path} declares entities, which no OpenStreetMap file does: {WAY_OUT}") from None
+    except (ParseError, UnicodeError) as error:
+        raise InputError(f"{path} is broken XML or cut short ({error}): {WAY_OUT}") from None
+    except (KeyError, ValueError, LookupError) as error:
+        raise InputError(f"{path} holds an element that makes no sense ({error}): {WAY_OUT}") from None
+
+
+def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
+    """Element by element, each forgotten once it is understood: a town's extract is large."""
+    from defusedxml.ElementTree import iterparse
+
+    data, root = OsmData(), None
+    for event, element in iterparse(stream, events=("start", "end"), forbid_dtd=True):
+        if root is None:
+            root = element
+            if root.tag != "osm":
+                what = f"it begins with <{root.tag}>, not with <osm>"
+                raise InputError(f"{path} is XML but no OpenStreetMap extract: {what}")
+            # Whatever does not say that lslam made it up comes from OpenStreetMap.
+            if root.get("generator") == GENERATOR and not root.get("attribution"):
+                data.attribution = None
+        elif event == "end" and element.tag in ("node", "way", "relation"):
+            _add_xml(data, element)
+            root.clear()
+    data.number_drawn()
+    return data
+
+
+def _add_xml(data: OsmData, element: Element) -> None:
+    # JOSM marks deletions, the history API hides old versions: neither is on the ground.
+    if element.get("action") == "delete" or element.get("visible") == "false":
+        return
+    number = int(element.attrib["id"])
+    if element.get("action") == "modify":
+        data.modified.add((element.tag, number))
+    said: dict[str, Any] = {**element.attrib, "type": element.tag, "id": number}
+    if element.tag != "node":
+        said["tags"] = {tag.attrib["k"]: tag.attrib["v"] for tag in element.iter("tag")}
+    if element.tag == "way" and (corners := [corner.attrib for corner in element.iter("nd")]):
+        said["nodes"] = [corner["ref"] for corner in corners] if "ref" in corners[0] else ()
+        said["geometry"] = [corner if "lat" in corner else None for corner in corners]
+    if element.tag == "relation":
+        said["members"] = [
+            {**m.attrib, "geometry": [corner.attrib for corner in m.iter("nd")]} if len(m) else m.attrib
+            for m in element.iter("member")
+        ]
+    data.add_element(said)
+
+
+def _xml_lines(data: OsmData) -> Iterator[str]:
+    yield "<?xml version='1.0' encoding='UTF-8'?>\n"
+    credit = f" attribution={quoteattr(data.attribution)}" if data.attribution else ""
+    yield f'<osm version="0.6" generator="{GENERATOR}"{credit}>\n'
+    if data.nodes:
+        lats, lons = zip(*data.nodes.values(), strict=True)
+        sides = zip(("minlat", "minlon", "maxlat", "maxlon"), (min(lats), min(lons), max(lats), max(lons)), strict=True)
+        yield " <bounds " + " ".join(f'{name}="{value:.{DECIMALS}f}"' for name, value in sides) + "/>\n"
+    for number, (lat, lon) in data.nodes.items():
+        yield f' <node {_identity(data, "node", number)} lat="{lat:.{DECIMALS}f}" lon="{lon:.{DECIMALS}f}"/>\n'
+    for way in data.ways.values():
+        yield f" <way {_identity(data, 'way', way.id)}>\n"
+        yield from (f'  <nd ref="{node}"/>\n' for node in way.nodes)
+        yield from _tag_lines(way.tags.items())
+        yield " </way>\n"
+    for relation in data.relations.values():
+        yield f" <relation {_identity(data, 'relation', relation.id)}>\n"
+        for m in relation.members:
+            yield f'  <member type="{m.kind}" ref="{m.ref}" role={_quoted(m.role)}/>\n'
+        yield from _tag_lines(relation.tags.items())
+        yield " </relation>\n"
+    yield "</osm>\n"
+
+
+def _identity(data: OsmData, kind: str, number: int) -> str:
+    action = ' action="modify"' if (kind, number) in data.modified else ""
+    return f'id="{number}" version="{data.versions.get((kind, number), 1)}"{action}'
+
+
+def _tag_lines(tags: Iterable[tuple[str, str]]) -> Iterator[str]:
+    return (f"  <tag k={_quoted(key)} v={_quoted(value)}/>\n" for key, value in tags)
+
+
+def _quoted(text: str) -> str:
+    # XML has no way to write most control characters.
+    return quoteattr("".join(c for c in text if c.isprintable() or c in "\t\n\u00a0"))

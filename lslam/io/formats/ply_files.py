@@ -1,0 +1,145 @@
+"""PLY point files: ascii and binary of both byte orders read, binary little endian written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, input_errors
+from lslam.core.untrusted import whole_number
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.point_cloud import beyond, packed_columns, text_columns
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    properties: list[tuple[str, str]]  # name, numpy code; code "list" for lists
+
+
+def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
+    """The vertices of a PLY file by property, without faces behind them. Raises InputError naming the file and the line."""
+    with input_errors(path):
+        data = path.read_bytes()
+    encoding, elements, size = _read_header(path, data)
+    order = _ORDERS[encoding]
+    body = memoryview(data)[size:]
+    skipped = 0
+    for element in elements:
+        codes = [code for _, code in element.properties]
+        if "list" in codes and (element.name == "vertex" or encoding != "ascii"):
+            raise InputError(f"{path}: PLY element {element.name!r} has a list property where points are expected")
+        if element.name == "vertex":
+            if encoding == "ascii" and element.count:
+                return _ascii_columns(path, element, body, skipped, element is elements[-1])
+            names = [name for name, _ in element.properties]
+            dtype = np.dtype([(str(k), order + code) for k, code in enumerate(codes)])
+            is_last = element is elements[-1]
+            return packed_columns(path, "PLY", names, dtype, element.count, body, skipped, is_last=is_last)
+        record = sum(np.dtype(code).itemsize for code in codes if code != "list")
+        skipped += element.count * (record if encoding != "ascii" else 1)
+    raise InputError(f"{path}: PLY header has no element 'vertex'")
+
+
+def write_ply(
+    path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, comment: str = "", *,
+    scalars: Mapping[str, NDArray[Any]] | None = None, colours: NDArray[np.uint8] | None = None,
+) -> None:  # fmt: skip
+    """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically.
+
+    colours : (N, 3) red, green, blue, which viewers show at once
+    """
+    columns = {**({} if intensity is None else {"intensity": intensity}), **(scalars or {})}
+    shades = {} if colours is None else dict(zip(("red", "green", "blue"), np.transpose(colours), strict=True))
+    names = ["x", "y", "z", *columns]
+    table = np.empty(len(points), [*((name, "<f4") for name in names), *((name, "u1") for name in shades)])
+    for name, values in {**dict(zip("xyz", np.transpose(points), strict=True)), **columns, **shades}.items():
+        table[name] = values
+    with atomic_write(path) as stream:
+        stream.write(ply_header(len(table), names, comment, list(shades)))
+        stream.write(table.tobytes())
+
+
+def write_ply_mesh(path: Path, vertices: NDArray[Any], triangles: NDArray[Any], comment: str = "") -> None:
+    """Write a surface of vertices (V, 3), m, as float32 and triangles (F, 3), binary little endian, atomically."""
+    faces = np.empty(len(triangles), np.dtype([("n", "u1"), ("v", "<i4", 3)]))
+    faces["n"], faces["v"] = 3, triangles
+    element = f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n".encode()
+    header = ply_header(len(vertices), ["x", "y", "z"], comment).replace(b"end_header\n", element)
+    with atomic_write(path) as stream:
+        stream.write(header)
+        stream.write(np.ascontiguousarray(vertices, "<f4").data)
+        stream.write(faces.tobytes())
+
+
+def ply_header(count: int, names: Sequence[str], comment: str = "", byte_names: Sequence[str] = ()) -> bytes:
+    """Header of `count` binary little-endian vertices of float32 properties, then of bytes."""
+    comments = "".join(f"comment {line}\n" for line in comment.splitlines())
+    properties = "".join(f"property float {name}\n" for name in names)
+    properties += "".join(f"property uchar {name}\n" for name in byte_names)
+    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode(
+        "utf-8", "backslashreplace"
+    )
+
+
+def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    if not data.startswith((b"ply\n", b"ply\r")):
+        raise InputError(f"{path}: no PLY file, its first line is not 'ply'")
+    encoding, elements, position, number = "", list[_Element](), 0, 0
+    while True:
+        end = data.find(b"\n", position)
+        number += 1
+        if end < 0 or end - position > 65536:
+            raise InputError(f"{path}: PLY header ends at line {number} without end_header")
+        words = data[position:end].decode("ascii", "replace").split()
+        position = end + 1
+        if words == ["end_header"]:
+            break
+        if number == 1 or not words or words[0] in ("comment", "obj_info"):
+            continue
+        if words[0] == "format" and len(words) == 3 and words[1] in _ORDERS:
+            encoding = words[1]
+        elif words[0] == "element" and len(words) == 3 and (count := whole_number(words[2])) is not None:
+            elements.append(_Element(words[1], count, []))
+        elif words[0] == "property" and elements and len(words) == 3 and words[1] in _TYPES:
+            elements[-1].properties.append((words[2], _TYPES[words[1]]))
+        elif words[0] == "property" and elements and len(words) == 5 and words[1] == "list":
+            elements[-1].properties.append((words[4], "list"))
+        else:
+            raise InputError(f"{path}, line {number}: bad PLY header entry {' '.join(words)[:60]!r}")
+    if not encoding:
+        raise InputError(f"{path}: PLY header has no format; known: {', '.join(_ORDERS)}")
+    return encoding, elements, position
+
+
+def _ascii_columns(
+    path: Path, element: _Element, body: memoryview, skipped: int, is_last: bool
+) -> dict[str, NDArray[Any]]:
+    every = [line for line in bytes(body).split(b"\n") if line.strip()][skipped:]
+    lines = every[: element.count]
+    if len(lines) < element.count:
+        raise InputError(f"{path}: PLY header says {element.count} points, the file holds {len(lines)}")
+    try:
+        table = np.loadtxt([line.decode("ascii") for line in lines], np.float64, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{path}: PLY ascii data (counted from the first point) cannot be read: {error}") from None
+    if table.shape[1] != len(element.properties):
+        raise InputError(
+            f"{path}: PLY ascii lines hold {table.shape[1]} numbers for {len(element.properties)} properties"
+        )
+    names, codes = zip(*element.properties, strict=True)
+    columns = text_columns(table, names, [np.dtype(code) for code in codes])
+    return columns | (beyond(element.count, len(every) - element.count) if is_last else {})

@@ -1,0 +1,209 @@
+"""Point files by suffix: clouds in `.bin`, PCD, PLY and NumPy; maps in PLY, PCD, LAS and LAZ, written block by block."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from tokenize import TokenError
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, UsageError, input_errors
+from lslam.core.types.cloud import ArrayCloud, Cloud
+from lslam.core.untrusted import MISFIT
+from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.las_files import read_las, write_las
+from lslam.io.formats.pcd_files import pcd_columns, pcd_header
+from lslam.io.formats.ply_files import ply_columns, ply_header
+from lslam.io.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
+from lslam.io.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
+from lslam.io.formats.state_files import HEADERS
+from lslam.io.remote import RemotePath
+
+SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
+MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
+_MOST_COLUMNS = 64
+_PLACES = ("xyz", "point", "points", "position", "positions")
+# Coordinates beyond are those of a projection; of a map they shall lie in finer steps.
+LARGE_M, COARSE_M = 1e5, 0.01
+_FEW = 8
+log = logging.getLogger("lslam")
+
+
+def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
+    """Read one point file, chosen by its suffix; NaN, Inf and zero points are kept as they are.
+
+    record : of a `.bin` file or of a plain NumPy array; None recognises it. Raises InputError naming the file and the place.
+    """
+    return cloud_from_fields(path, _read_columns(path, record))
+
+
+def _read_columns(path: Path, record: PointRecord | None = None) -> Mapping[str, NDArray[Any]]:
+    suffix = path.suffix.lower()
+    if suffix == ".bin":
+        raw = read_bytes(path)
+        record = record or record_of({path: raw})[0]
+        check_size(path, raw, record)
+        return record.columns(raw)
+    if suffix == ".npy":
+        return _npy_columns(path, record)
+    if suffix in _COLUMNS:
+        return _COLUMNS[suffix](path)
+    raise InputError(f"{path}: no point file lslam reads; known suffixes: {', '.join(SUFFIXES)}")
+
+
+def read_bytes(path: Path) -> NDArray[np.uint8]:
+    """All bytes of a file. Raises InputError naming it when it cannot be read."""
+    with input_errors(path):
+        if isinstance(path, RemotePath):
+            return np.frombuffer(bytearray(path.read_bytes()), np.uint8)
+        with path.open("rb") as stream:
+            return np.fromfile(stream, np.uint8)
+
+
+def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
+    """Raise InputError when the bytes of a file are no multiple of those of a point."""
+    if len(raw) % record.size:
+        what = "x, y, z, intensity as float32" if record == KITTI else str(record)
+        raise InputError(
+            f"{path}: {len(raw)} bytes are no multiple of {record.size} ({what}): the file is truncated after point "
+            f"{len(raw) // record.size}, or its records are of {_other_sizes(len(raw), record)} bytes: {WAY_OUT}"
+        )
+
+
+def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str]:
+    """The record of the points in `.bin` files, by their values, and why it is not KITTI's; empty where it is.
+
+    Raises InputError with the sizes that would fit when no record fits or several do.
+    """
+    recognition = recognise(list(files.values()))
+    if recognition.record is not None:
+        return recognition.record, recognition.reason
+    path, raw = next((path, raw) for path, raw in files.items() if len(raw))
+    if recognition.fitting:
+        records = " or ".join(f"{record.size} bytes ({record})" for record in recognition.fitting)
+        could = f"its values allow records of {records}"
+    else:
+        check_size(path, raw, KITTI)
+        could = f"it could be truncated, or its records are of {_other_sizes(len(raw), KITTI)} bytes"
+    raise InputError(f"{path}: as {KITTI} of {KITTI.size} bytes {recognition.reason}; {could}: {WAY_OUT}")
+
+
+def _other_sizes(size: int, record: PointRecord) -> str:
+    sizes = [str(k) for k in range(12, 65) if k != record.size and size % k == 0]
+    return ", ".join(sizes) or "another number of"
+
+
+def write_bin(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None) -> None:
+    """Write points (N, 3), m, and intensity (N,), or zeros, as KITTI's records, atomically.
+
+    Raises UsageError on arrays that do not match, OutputError when the file cannot be written.
+    """
+    if np.ndim(points) != 2 or np.shape(points)[1] != 3 or (intensity is not None and len(intensity) != len(points)):
+        raise UsageError(f"{path}: points must be (N, 3) and intensity (N,), not {np.shape(points)}")
+    with atomic_write(path) as stream:
+        stream.write(float_table(points, np.zeros(len(points)) if intensity is None else intensity).data)
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """An array of points: structured and flat, or numbers (N, K). Raises InputError when it is something else."""
+    kinds = (*MISFIT, EOFError, SyntaxError, MemoryError, TokenError)
+    with input_errors(path, *kinds, as_what="a NumPy array"), HEADERS, path.open("rb") as stream:
+        table = np.lib.format.read_array(stream, allow_pickle=False)
+    if table.dtype.names:
+        flat: NDArray[Any] = table.ravel()
+        return flat
+    # Organised clouds (rows, cols, K) are flattened row by row.
+    if table.ndim not in (2, 3) or not 3 <= table.shape[-1] <= _MOST_COLUMNS or table.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: array of shape {table.shape} and type {table.dtype}, expected (N, 3), (N, 4) or up to "
+            f"(N, {_MOST_COLUMNS}) numbers"
+        )
+    return np.asarray(table.reshape(-1, table.shape[-1]))
+
+
+def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray[Any]]:
+    table = read_array(path)
+    if table.dtype.names:
+        return _of_structure(table)
+    names = name_columns([table]) if record is None else record.names
+    if len(names) != table.shape[1]:
+        raise InputError(f"{path}: {table.shape[1]} columns where {' '.join(names)} are {len(names)}")
+    return {name: table[:, k] for k, name in enumerate(names) if name != "_"}
+
+
+def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Fields of one number each; three together are x, y and z where no field has these names."""
+    numbers = [name for name in table.dtype.names or () if table[name].dtype.kind in "fiu"]
+    columns = {name: table[name] for name in numbers if table[name].ndim == 1}
+    is_placed = "x" in map(str.lower, columns)
+    for name in () if is_placed else numbers:
+        if name.lower() in _PLACES and table[name].shape[1:] == (3,):
+            columns |= {axis: table[name][:, k] for k, axis in enumerate(AXES)}
+    return columns
+
+
+def _text_columns(path: Path) -> dict[str, NDArray[Any]]:
+    """KITTI raw `extract` scans: x y z intensity, one point per line."""
+    with input_errors(path, ValueError, as_what="lines of x y z intensity"):
+        text = path.read_text(encoding="ascii")
+        table = np.loadtxt(text.splitlines(), np.float32, ndmin=2) if text.strip() else np.zeros((0, 4), np.float32)
+    if table.shape[1] != 4:
+        raise InputError(f"{path}: {table.shape[1]} numbers a line where x y z intensity are 4")
+    return dict(zip(KITTI.names, table.T, strict=True))
+
+
+_COLUMNS = {".pcd": pcd_columns, ".ply": ply_columns, ".txt": _text_columns}
+
+
+def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
+    """Write a cloud, m, atomically and without holding it in memory: .ply and .pcd hold float32, .las and .laz millimetres.
+
+    comment : for PLY headers; wkt : coordinate reference system, for LAS. Raises UsageError on another suffix, OutputError.
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".las", ".laz"):
+        write_las(path, cloud, wkt)
+        return
+    if suffix not in MAP_SUFFIXES:
+        raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
+    names = ["x", "y", "z", "intensity"] if cloud.has_intensity else ["x", "y", "z"]
+    with atomic_write(path) as stream:
+        stream.write(ply_header(len(cloud), names, comment) if suffix == ".ply" else pcd_header(len(cloud), names))
+        for block in cloud.blocks():
+            stream.write(float_table(block.points, block.intensity).data)
+
+
+def read_cloud(path: Path) -> ArrayCloud:
+    """Read any map or point file whole as float64, m; coordinates far from the origin in coarse steps are warned about.
+
+    Raises InputError naming the file when it is missing, damaged or of another kind.
+    """
+    if path.suffix.lower() in (".las", ".laz"):
+        cloud = read_las(path)[0]
+    else:
+        read = cloud_from_fields(path, _read_columns(path), np.float64)
+        cloud = ArrayCloud.of(read.points, read.intensity)
+    step = coordinate_step(cloud.points)
+    if step > COARSE_M:
+        log.warning(
+            "%s: its coordinates lie in steps of %.3g m, too coarse so far from the origin: write "
+            "them as double, or less an offset", path, step,
+        )  # fmt: skip
+    return cloud
+
+
+def coordinate_step(points: NDArray[np.float64]) -> float:
+    """Step of which all coordinates along an axis are multiples, m, the largest of the axes; 0 for those near the origin."""
+    steps = [0.0]
+    for column in points.T:
+        values = np.unique(column[np.isfinite(column)])
+        if len(values) >= _FEW and np.abs(values).max() > LARGE_M:
+            between = np.diff(values)
+            counted = between / between.min()
+            if np.abs(counted - np.round(counted)).max() < 0.01:
+                steps.append(float(between.min()))
+    return max(steps)

@@ -1,0 +1,197 @@
+"""`sequence.toml`: what a folder of scans cannot say by itself. Read and written; unknown keys are errors."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, input_errors, nearest
+from lslam.core.geometry import so3
+from lslam.core.printable import toml_text
+from lslam.core.untrusted import parse_toml
+from lslam.io.formats.atomic import write_text
+from lslam.io.formats.point_records import parse_record
+
+FILE_NAME = "sequence.toml"
+INSTANTS = ("scan_start", "scan_middle", "scan_end")
+UNITS = ("s", "ms", "us", "ns")
+LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # m
+REFERENCES = ("start", "end", "absolute")
+POINT_TIMES = ("field", "columns", "order", "azimuth", "none")
+FRAMES = ("lidar", "cam0", "imu")
+EXTRINSICS = ("T_cam0_lidar", "T_lidar_imu", "T_lidar_gnss")
+
+Matrix = NDArray[np.float64]
+
+
+def is_rate(rate_hz: float) -> bool:
+    """Whether it can be a sensor's: stamps are made of it."""
+    return 1e-3 < rate_hz < 1e6
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value.strip())
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _is_record(value: Any) -> bool:
+    try:
+        return isinstance(value, str) and bool(parse_record(value))
+    except ValueError:
+        return False
+
+
+def _key(is_valid: Callable[[Any], bool], expected: str) -> Any:
+    """A key and what its values are."""
+    return field(default=None, metadata={"is_valid": is_valid, "expected": expected})
+
+
+def _text(expected: str) -> Any:
+    return _key(_is_text, expected)
+
+
+def _count() -> Any:
+    return _key(lambda v: isinstance(v, int) and not isinstance(v, bool) and v > 0, "a whole number above 0")
+
+
+def _one_of(choices: Iterable[str]) -> Any:
+    names = list(choices)
+    return _key(lambda v: v in names, f"one of {', '.join(names)}")
+
+
+@dataclass(frozen=True)
+class SequenceInfo:
+    """What `sequence.toml`, or the user, says about a sequence; None where nothing is said.
+
+    sensor : its name, for example `HDL-64E`; rings : number of beams
+    rows, cols : organised clouds, point r * cols + c is row (ring) r; rate_hz : scans per second
+    motion_compensated : scans are free of motion distortion; compensated_to : the instant, one of `INSTANTS`
+    vertical_correction_deg : rotation of every point about p x z that the scans still need, 0 for none
+    per_point : folder of `<scan>.npz` with `t` (float32 s from the scan's stamp) and `ring` (uint16)
+    point_time_unit, point_time_reference : of the points' own time field, where it does not show, one of `UNITS` and of
+        `REFERENCES`: the scan's start or end, which is its stamp then, or absolute
+    bin_record : what a point of a `.bin` file or of a plain array consists of, see `parse_record`
+    point_unit : of the coordinates of points, one of `LENGTHS`
+    point_times : what tells the times of points, one of `POINT_TIMES`
+    stamps, imu, gnss, ground_truth : files, relative to the sequence folder
+    ground_truth_frame : the body whose poses `ground_truth` holds, one of `FRAMES`
+    lidar_topic, imu_topic, gnss_topic : which topics of a bag are read; lidar_frame : which of the LiDARs that share one, by
+        the frame of their messages, or `all`; several have commas between them and are merged, the first one leads
+    T_cam0_lidar, T_lidar_imu, T_lidar_gnss : (4, 4) extrinsics, written in the table `[extrinsics]`
+    lidars : further LiDARs and where they sit, T_lidar_other (4, 4) by folder, or by frame or topic of a bag
+    """
+
+    name: str | None = _text("text")
+    sensor: str | None = _text("text, for example HDL-64E")
+    rings: int | None = _count()
+    rows: int | None = _count()
+    cols: int | None = _count()
+    rate_hz: float | None = _key(
+        lambda v: _is_number(v) and is_rate(v), "a number above 0.001 and below a million, scans per second"
+    )
+    motion_compensated: bool | None = _key(lambda v: isinstance(v, bool), "true or false")
+    compensated_to: str | None = _one_of(INSTANTS)
+    vertical_correction_deg: float | None = _key(_is_number, "a number, degrees")
+    per_point: str | None = _text("a folder")
+    point_time_unit: str | None = _one_of(UNITS)
+    point_time_reference: str | None = _one_of(REFERENCES)
+    bin_record: str | None = _key(
+        _is_record, 'columns like "x y z intensity ring:u2 time:f8", float32 where no type is named'
+    )
+    point_unit: str | None = _one_of(LENGTHS)
+    point_times: str | None = _one_of(POINT_TIMES)
+    stamps: str | None = _text("a file")
+    imu: str | None = _text("a file")
+    gnss: str | None = _text("a file")
+    ground_truth: str | None = _text("a file")
+    ground_truth_frame: str | None = _one_of(FRAMES)
+    lidar_topic: str | None = _text("a topic")
+    lidar_frame: str | None = _text("a frame, or all")
+    imu_topic: str | None = _text("a topic")
+    gnss_topic: str | None = _text("a topic")
+    T_cam0_lidar: Matrix | None = None
+    T_lidar_imu: Matrix | None = None
+    T_lidar_gnss: Matrix | None = None
+    lidars: Mapping[str, Matrix] | None = None
+
+    def over(self, other: SequenceInfo) -> SequenceInfo:
+        """What this says, and what `other` says where this is silent."""
+        pairs = ((f.name, getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return SequenceInfo(**{name: theirs if mine is None else mine for name, mine, theirs in pairs})
+
+
+def read_sequence_toml(path: Path) -> SequenceInfo:
+    """Read such a file. Raises InputError naming the file, the key and the nearest known key or the values allowed."""
+    with input_errors(path, UnicodeDecodeError, as_what="TOML"):
+        text = path.read_text(encoding="utf-8")
+    return parse_sequence_toml(text, path)
+
+
+def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
+    """The same from text that was found at `path`."""
+    with input_errors(path, tomllib.TOMLDecodeError, as_what="TOML"):
+        tree = parse_toml(text)
+    extrinsics, lidars = tree.pop("extrinsics", {}), tree.pop("lidars", {})
+    for key, table, row in (
+        ("extrinsics", extrinsics, "T_lidar_imu = [...]"), ("lidars", lidars, '"FOLDER" = [T_lidar_other, 12 numbers]'),
+    ):  # fmt: skip
+        if not isinstance(table, dict):
+            raise InputError(f"{path}: {key} is a table, write [{key}] and below it {row}")
+    values: dict[str, Any] = {}
+    for key, value in tree.items():
+        if key not in _KEYS:
+            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_KEYS, 'extrinsics', 'lidars'])}")
+        if not _KEYS[key]["is_valid"](value):
+            raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['expected']}")
+        values[key] = float(value) if key in ("rate_hz", "vertical_correction_deg") else value
+    for key, value in extrinsics.items():
+        if key not in EXTRINSICS:
+            raise InputError(f"{path}: unknown key extrinsics.{key}; {nearest(key, EXTRINSICS)}")
+        values[key] = _transform(path, f"extrinsics.{key}", value)
+    if lidars:
+        values["lidars"] = {name: _transform(path, f"lidars.{name}", T) for name, T in lidars.items()}
+    if (values.get("rows") is None) != (values.get("cols") is None):
+        raise InputError(f"{path}: rows and cols of organised clouds go together, one of them is missing")
+    return SequenceInfo(**values)
+
+
+def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
+    """Write `info` to `path` atomically, leaving out what is None; it reads back equal."""
+    write_text(path, sequence_toml_text(info))
+
+
+def sequence_toml_text(info: SequenceInfo) -> str:
+    """`info` as TOML, without what is None."""
+    tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, "lidars")}
+    tables = {"extrinsics": {key: getattr(info, key) for key in EXTRINSICS}, "lidars": info.lidars or {}}
+    for key, matrices in tables.items():
+        rows = {name: np.asarray(T, np.float64).tolist() for name, T in matrices.items() if T is not None}
+        tree[key] = rows or None
+    return toml_text({key: value for key, value in tree.items() if value is not None})
+
+
+_KEYS = {f.name: f.metadata for f in fields(SequenceInfo) if f.metadata}
+
+
+def _transform(path: Path | str, key: str, value: Any) -> Matrix:
+    """3x4 or 4x4 rows, or the same numbers in one list, to a checked (4, 4) transform."""
+    try:
+        numbers = np.asarray(value, np.float64).ravel()
+    except (TypeError, ValueError):
+        numbers = np.zeros(0)
+    if len(numbers) not in (12, 16):
+        raise InputError(f"{path}: {key} needs 3x4 or 4x4 numbers, row by row")
+    T = np.eye(4)
+    T[:3] = numbers[:12].reshape(3, 4)
+    if not np.isfinite(numbers).all() or not so3.is_rotation(T[:3, :3], 1e-3):
+        raise InputError(f"{path}: {key} is no rigid transform: its left 3x3 block is not a rotation")
+    return T

@@ -1,0 +1,270 @@
+"""The time of a table's rows: one column, seconds beside their fraction, with or without names, told from a mere index.
+
+One rule for trajectories, IMU, fixes and stamps files. A name proposes; what stands in the column confirms.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError
+from lslam.io.formats.stamp_texts import date_to_ns, seconds_to_ns
+from lslam.io.formats.text_tables import Row, TextTable, read_rows, text_table
+from lslam.io.remote import as_path
+
+log = logging.getLogger("lslam")
+Floats = NDArray[np.float64]
+# The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
+Units = dict[int, int | None]
+UNITS_NS = {
+    "ns": 1, "nsec": 1, "nsecs": 1, "nanosec": 1, "nanosecs": 1, "nanosecond": 1, "nanoseconds": 1, "nanos": 1,
+    "us": 1_000, "usec": 1_000, "micros": 1_000, "usecs": 1_000, "microsec": 1_000, "microsecs": 1_000, "microseconds": 1_000,
+    "ms": 1_000_000, "msec": 1_000_000, "millis": 1_000_000, "msecs": 1_000_000, "milliseconds": 1_000_000,
+    "s": 1_000_000_000, "sec": 1_000_000_000, "secs": 1_000_000_000, "second": 1_000_000_000, "seconds": 1_000_000_000,
+}  # fmt: skip
+SECOND_NS = 1_000_000_000
+_TIMES = ("t", "time", "times", "datetime", "epoch", "ts", "utc")
+# Poses, samples and scans are less than a minute apart.
+_LONGEST_STEP_S = 60.0
+# Ranks of columns by name.
+_STAMPED, _TIMED, _ENDING = 0, 1, 2
+
+
+class RowTimes(NamedTuple):
+    """stamps_ns : (N,); note : which columns hold them and which might have, empty without others; columns : all of these"""
+
+    stamps_ns: NDArray[np.int64]
+    note: str
+    columns: set[int]
+
+
+def tokens_of(name: str) -> list[str]:
+    """Words of a column's name in small letters, without what stands in brackets.
+
+    >>> tokens_of("/odom/header/stamp.sec [s]"), tokens_of("%time")
+    (['odom', 'header', 'stamp', 'sec'], ['time'])
+    """
+    return [word for word in re.split(r"[^a-z0-9]+", re.sub(r"[\[(].*?[\])]", "", name.lower())) if word]
+
+
+def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> RowTimes | None:
+    """The time of the rows, by names or, where there are none, by the first columns; None when no column is a time.
+
+    taken : columns that are something else; default_ns : ns in a unit where the name states none, by size and step when None
+    Raises InputError with the line of a cell that is no time.
+    """
+    candidates = _by_name(table, taken) if table.names else _by_place(table, taken)
+    good = [c for c in candidates if _increases(np.sum([table.numbers(k) * (c[k] or 1) for k in c], axis=0))]
+    # An index increases as well: it is the time only where nothing else is.
+    is_dated = any(_is_since_1970(table.numbers(next(iter(c)))) for c in good)
+    good.sort(key=lambda c: len(c) == 1 and is_index(table.numbers(*c), is_dated))
+    chosen = next(iter(good or candidates), None)
+    if chosen is None:
+        return None
+    others = {k for candidate in candidates for k in candidate if k not in chosen}
+    # The index of pandas has no name.
+    named = [table.names[k] for k in sorted(others) if table.names and table.names[k]]
+    note = ""
+    if named:
+        note = f"the time is {' and '.join(table.names[k] for k in chosen)}; left out: {', '.join(named)}"
+    return RowTimes(_stamps(table, chosen, default_ns), note, others.union(chosen))
+
+
+def read_times(path: str | Path) -> NDArray[np.int64]:
+    """Stamps (N,) int64 ns that increase, as of KITTI's `times.txt`. Raises InputError for a file without any."""
+    stamps = read_stamps(as_path(path), must_increase=True)
+    if not len(stamps):
+        raise InputError(f"{path} holds no times")
+    return stamps
+
+
+def read_stamps(path: Path, must_increase: bool = False) -> NDArray[np.int64]:
+    """(N,) int64 ns of a text file, one stamp a line.
+
+    The time is in the column that a header names, else in the first one or two; an index before it and columns behind it
+    are left out. Seconds may be decimal or scientific (KITTI's times.txt), whole numbers of nanoseconds, or dates such as
+    `2011-09-26 13:04:32.349659964` (KITTI raw, taken as UTC), which keep all nine digits.
+    Raises InputError naming file and line.
+    """
+    rows, comments = read_rows(path)
+    table = text_table(path, [Row(k, text) for k, line, _ in rows if (text := line.split("#")[0].strip())], comments)
+    if not table.rows:
+        return np.zeros(0, np.int64)
+    clock = find_clock(table) or find_clock(replace(table, names=()))
+    if clock is None:
+        raise table.error(0, "no column is a time (s, ns or date)")
+    beside = max(clock.columns) + 1
+    if clock.note:
+        log.info("%s: %s", path, clock.note)
+    elif not table.names and not (clock.stamps_ns % SECOND_NS).any() and table.numbers(beside)[:1] >= 0:
+        log.warning(
+            "%s: whole seconds, column %d beside them is not read: if it is their fraction, name the columns (sec,usec)",
+            path, beside + 1,
+        )  # fmt: skip
+    if must_increase:
+        table.check_increasing(clock.stamps_ns)
+    return clock.stamps_ns
+
+
+def is_index(values: Floats, is_beside_date: bool = False) -> bool:
+    """Whether a column counts rows: whole numbers one apart but where rows are lost, three at least, smaller than any time
+    since 1970; in steps of any length beside times since 1970.
+    """
+    steps = np.diff(values)
+    is_count = (
+        len(values) > 2 and bool(np.all((steps >= 1) & (values[1:] == np.rint(values[1:])))) and abs(values[0]) < 1e8
+    )
+    return is_count and (is_beside_date or float(np.mean(steps == 1)) > 0.5)
+
+
+def unread_columns(table: TextTable, columns: Collection[int]) -> list[str]:
+    """Names of the columns that are none of `columns` and do not just count the rows."""
+    others = [k for k, name in enumerate(table.names) if name and k not in columns]
+    return [table.names[k] for k in others if not is_index(table.numbers(k))]
+
+
+def unit_of_fraction(whole: Floats, rest: Floats, unit_ns: int | None = None) -> int | None:
+    """Nanoseconds in the unit in which `rest` (N,) is the fraction of the whole seconds `whole` (N,); None when it is none.
+
+    unit_ns : that which the name of `rest` states. Without it, fractions are whole ns that reach beyond a million and do not
+    merely count; where the seconds repeat, decimals of a second, or whole ms or us, too. Rows without a number do not count.
+    """
+    both = np.isfinite(whole) & np.isfinite(rest)
+    whole, rest = whole[both], rest[both]
+    if not len(whole) or np.any(whole != np.rint(whole)) or rest.min() < 0 or np.abs(whole).max() >= 1e11:
+        return None
+    is_whole = not np.any(rest != np.rint(rest))
+    if unit_ns is not None:
+        return unit_ns if is_whole and rest.max() * unit_ns < SECOND_NS else None
+    # As many ms or us as make a second at least, or the decimals.
+    largest = 1 if not is_whole else next((n for n in (10**3, 10**6, SECOND_NS) if rest.max() < n), 0)
+    is_long = (len(rest) > 2 and not is_index(rest)) or _is_since_1970(whole)
+    if not is_long or rest.max() >= largest or (largest < SECOND_NS and _increases(whole)):
+        return None
+    return SECOND_NS // largest if _increases(whole + rest / largest) else None
+
+
+def _is_since_1970(values: Floats) -> bool:
+    """Whether a column has the size of times since 1970 in seconds, which have ten digits, or in finer units."""
+    return bool(len(values)) and bool(np.all(values >= SECOND_NS))
+
+
+def unit_ns_of(name: str) -> int | None:
+    """Nanoseconds in the unit that a column's name states, in brackets or as its last word; None when it states none."""
+    bracket = re.search(r"[\[(]\s*(\w+)\s*[\])]", name.lower())
+    words = [bracket.group(1)] if bracket and bracket.group(1) in UNITS_NS else tokens_of(name)
+    return UNITS_NS.get(words[-1]) if words else None
+
+
+def _by_name(table: TextTable, taken: Collection[int]) -> list[Units]:
+    words = [tokens_of(name) for name in table.names]
+    width = len(table.rows[0].cells) if table.rows else len(words)
+    free = [k for k in range(min(len(words), width)) if k not in taken]
+    ranked: list[tuple[int, bool, int, Units]] = []
+    for k in free:
+        # pandas writes its index without a name.
+        rank = _rank(words[k]) if words[k] else (_ENDING if k == 0 else None)
+        if rank is not None:
+            units = _with_fraction(table, words, k, free)
+            ranked.append((rank, len(units) == 1, k, units))
+    fractions = {j for _, _, k, units in ranked for j in units if j != k}
+    return [units for _, _, k, units in sorted(ranked, key=lambda row: row[:3]) if k not in fractions]
+
+
+def _rank(words: list[str]) -> int | None:
+    """How likely a column of this name is the time of the row, 0 first; None when it is no time."""
+    core = words[:-1] if len(words) > 1 and words[-1] in UNITS_NS else words
+    if core[-1] in ("stamp", "timestamp", "stamps", "timestamps"):
+        return _STAMPED
+    if "header" in core:
+        return None
+    if len(core) == 1 and (core[0] in _TIMES or core[0] in UNITS_NS):
+        return _TIMED
+    return _ENDING if core[-1] == "t" or core[-1].endswith(("time", "timestamp")) else None
+
+
+def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[int]) -> Units:
+    """Column `k` and, if it has seconds, that of their fractions: of the same name but the unit, else the next column."""
+    stated_ns = unit_ns_of(table.names[k])
+    if stated_ns not in (None, SECOND_NS):
+        return {k: stated_ns}
+    stem = words[k][:-1] if words[k] and words[k][-1] in UNITS_NS else words[k]
+    parts: Units = {
+        j: UNITS_NS[words[j][-1]]
+        for j in free
+        if words[j] and UNITS_NS.get(words[j][-1], SECOND_NS) < SECOND_NS and words[j][:-1] == stem
+    }
+    if k + 1 in free and words[k + 1] and _rank(words[k + 1]) is None:
+        parts[k + 1] = None
+    whole = table.numbers(k)
+    for j, stated in parts.items():
+        unit_ns = unit_of_fraction(whole, table.numbers(j), stated)
+        if unit_ns is not None:
+            return {k: SECOND_NS, j: unit_ns}
+    return {k: stated_ns}
+
+
+def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
+    """First columns without names: a time, seconds and nanoseconds, and either behind an index or a text."""
+    width = min([3, *taken, *(len(row.cells) for row in table.rows)]) if table.rows else 0
+    numbers = [table.numbers(k) for k in range(width)]
+    out: list[Units] = []
+    for k in range(width):
+        if np.isnan(numbers[k]).all() and k + 1 < width:
+            continue
+        if out and not is_index(numbers[k - 1], _is_since_1970(numbers[k])):
+            break
+        unit_ns = unit_of_fraction(numbers[k], numbers[k + 1]) if k + 1 < width else None
+        out.append({k: None} if unit_ns is None else {k: SECOND_NS, k + 1: unit_ns})
+    return out
+
+
+def _increases(values: Floats) -> bool:
+    """Whether all are numbers and hardly any stands behind the one before: lines may be wrong, clocks not."""
+    if not len(values) or not np.isfinite(values).all():
+        return False
+    return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > 0.9
+
+
+def _stamps(table: TextTable, units: Units, default_ns: int | None) -> NDArray[np.int64]:
+    out = np.zeros(len(table.rows), np.int64)
+    for column, stated_ns in units.items():
+        texts = [row.cells[column] if column < len(row.cells) else "" for row in table.rows]
+        unit_ns = stated_ns or default_ns or unit_by_size(table.numbers(column), any("." in text for text in texts))
+        for k, text in enumerate(texts):
+            try:
+                date_ns = date_to_ns(text)
+            except ValueError as error:
+                raise table.error(k, f"{text!r} is no time: {error}") from None
+            out[k] += seconds_to_ns(text, table.path, table.rows[k].number, unit_ns) if date_ns is None else date_ns
+            if stated_ns == 1 and date_ns is None and re.fullmatch(r"[-+]?\d*\.\d*[1-9]\d*", text):
+                raise table.error(k, f"{text!r} is no whole number of nanoseconds")
+    return out
+
+
+def unit_by_size(values: Floats, is_decimal: bool = False) -> int:
+    """Nanoseconds in one unit of a column of times (N,).
+
+    Times since 1970 have 10 digits in s, 13 in ms, 16 in us, 19 in ns. Other whole numbers that lie more than a minute apart
+    as seconds are in the unit in which they lie about 30 ms apart, unless they are written with a decimal point.
+    """
+    values = values[np.isfinite(values)]
+    size = float(np.abs(values).max()) if len(values) else 0.0
+    steps = np.diff(values)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    for least, ns in ((1e15, 1_000), (1e12, 1_000_000)):
+        if least <= size < 10 * least and step * ns < _LONGEST_STEP_S * SECOND_NS:
+            return ns
+    if size >= 1e14:
+        return 1
+    if size < 1e11 and (is_decimal or step < _LONGEST_STEP_S or np.any(values != np.rint(values))):
+        return SECOND_NS
+    return min((1, 1_000, 1_000_000), key=lambda ns: abs(np.log10(max(step, 1.0) * ns / 3e7)))

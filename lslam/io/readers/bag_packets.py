@@ -1,0 +1,121 @@
+"""Packets of Velodyne and Ouster sensors in bags: read as those of a capture are, a scan is a revolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError
+from lslam.io.formats import velodyne_packets
+from lslam.io.formats.bag_files import Bag, BagTopic
+from lslam.io.formats.bag_streams import read_text
+from lslam.io.formats.ouster_packets import OusterSensor, parse_metadata, read_metadata
+from lslam.io.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
+from lslam.io.readers.ground_truth import Voice
+from lslam.io.readers.pcap_ouster import open_with_metadata
+from lslam.io.readers.pcap_revolutions import Integers, Opened, metadata_beside
+from lslam.io.readers.pcap_velodyne import open_velodyne
+
+# The frame of the points that `lslam.io.formats.ouster_packets` makes, as its driver calls it.
+_OUSTER_FRAME = "os_sensor"
+
+
+@dataclass(frozen=True)
+class BagPackets:
+    """Satisfies `Packets`.
+
+    stamps_ns, sizes, sources : (N,); places : (N, 3) which of `topics`, message of the topic, and packet of the message
+    heads : (N, P) the bytes at `positions` of each
+    """
+
+    bag: Bag
+    topics: tuple[BagTopic, ...]
+    stamps_ns: Integers
+    sizes: Integers
+    sources: Integers
+    places: NDArray[np.int32]
+    positions: tuple[int, ...]
+    heads: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
+        """(K, P) the bytes at `positions`, which are some of those that were kept, of the packets `which`."""
+        return self.heads[which][:, [self.positions.index(p) for p in positions]]
+
+    def payloads(self, which: Integers) -> NDArray[np.uint8]:
+        """(K, size) the packets `which`, which are of one size."""
+        rows = []
+        for (n, message), places in groupby(self.places[which].tolist(), itemgetter(0, 1)):
+            packets = read_packets(self.topics[n], self.bag.message(self.topics[n], message))[1]
+            rows.append(packets[[number for _, _, number in places]])
+        return np.concatenate(rows) if rows else np.zeros((0, 0), np.uint8)
+
+
+def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
+    """The revolutions on `topic`, and the frame of their points.
+
+    Raises InputError when no packet is whole or known, or the metadata of an Ouster sensor are missing.
+    """
+    where = Path(f"{bag.path}, {topic.name}")
+    if topic.type.endswith(SCANS):
+        size = velodyne_packets.SIZE
+        packets, frame = _gather(bag, [topic], (0, 1, 2, 3, *range(size - 6, size)), voice)
+        return open_velodyne(where, packets, voice), frame
+    sensor, source = _metadata(bag, topic)
+    inertial = [t for t in bag.of_type(PACKET) if _namespace(t) == _namespace(topic) and is_imu(bag, t)]
+    packets, _ = _gather(bag, [topic, *inertial], sensor.profile.positions, voice)
+    uses = {source: "metadata", **{t.name: "IMU" for t in inertial}}
+    return replace(open_with_metadata(where, packets, sensor, source, voice), uses=uses), _OUSTER_FRAME
+
+
+def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice: Voice) -> tuple[BagPackets, str]:
+    """All packets of the topics, and the first frame; messages that are damaged are named."""
+    stamps, sizes, heads, places = [], [], [], []
+    frame = ""
+    for n, topic in enumerate(topics):
+        read = partial(read_packets, topic)
+        for k, (own, packets, of) in bag.each(topic, read, voice.problems):
+            frame = frame or of
+            count, size = packets.shape
+            stamps.append(np.where(own == 0, topic.stamps_ns[k], own))
+            sizes.append(np.full(count, size, np.int64))
+            head = np.zeros((count, len(positions)), np.uint8)
+            inside = [i for i, p in enumerate(positions) if p < size]
+            head[:, inside] = packets[:, [positions[i] for i in inside]]
+            heads.append(head)
+            places.append(np.column_stack([np.full((count, 2), (n, k)), np.arange(count)]).astype(np.int32))
+    if not sum(map(len, sizes)):
+        raise InputError(f"{bag.path}: {topics[0].name} holds no packets that can be read")
+    all_sizes = np.concatenate(sizes)
+    packets_of_all = BagPackets(
+        bag, tuple(topics), np.concatenate(stamps), all_sizes, np.zeros_like(all_sizes),
+        np.concatenate(places), positions, np.concatenate(heads),
+    )  # fmt: skip
+    return packets_of_all, frame
+
+
+def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
+    """What the sensor says of itself, on a topic beside its packets or in a file beside the bag, and where that was."""
+    named = [t for t in bag.of_type("String") if "metadata" in t.name.rsplit("/", 1)[-1]]
+    own = [t for t in named if _namespace(t) == _namespace(topic)] or named
+    if len(own) == 1 and (text := read_text(bag, own[0].name)) is not None:
+        return parse_metadata(text, f"{bag.path}, {own[0].name}"), own[0].name
+    beside = sorted(bag.path.glob("*.json")) if bag.path.is_dir() else list(metadata_beside(bag.path))
+    if len(beside) == 1:
+        return read_metadata(beside[0]), beside[0].name
+    raise InputError(
+        f"{bag.path}: for the Ouster packets of {topic.name} the sensor's metadata are needed, as std_msgs/String on "
+        f"{_namespace(topic)}/metadata or as the only *.json beside the bag; there are {len(own)} and {len(beside)}"
+    )
+
+
+def _namespace(topic: BagTopic) -> str:
+    return topic.name.rpartition("/")[0]

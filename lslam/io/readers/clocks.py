@@ -1,0 +1,282 @@
+"""Clocks of a stream of messages held against each other: where one is impossible the others win, and a sentence says so.
+
+The stamps of the headers are the finest clock and the one that fails: it steps when the sensor learns the time, stands still when
+a driver repeats its own start, or is two clocks in turns. The times of recording are late, never early, and go on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.io.readers.ground_truth import Voice
+
+Stamps = NDArray[np.int64]
+
+# Median intervals of two clocks that both tell the time of the drive; beyond, one was played back at another speed.
+_SLOWEST, _FASTEST = 0.8, 1.25
+_WINDOWS = (1, 2, 6, 14, 50)  # intervals; where they are even in number, two clocks in turns cancel
+_LEVEL_SAMPLES = 100  # the one of them that was recorded with the least delay says how far apart two clocks are
+_SPREAD_SAMPLES = 8  # and four times as many
+_REGULAR = 0.02  # of the interval, the median deviation of a clock that ticks
+_SNAP = 0.3  # of the interval, how far an interval across a step may lie from whole ones
+_MIN_SHARE = 0.05  # of all samples on a clock that may be the one the others are brought onto
+MESSAGES_PER_STAMP = 5  # fewer are parts of one scan
+_JUMP_INTERVALS = 10  # by which the times of recording jump before a sentence says so
+_OFFSETS = 100  # of different clocks that are tried
+_LATER_NS = 10**9  # by which some messages are recorded later than others; ten times that where their stamps share time
+_JITTER = 0.03  # of the interval, by which stamps of arrival vary and those of a sensor do not
+_MANY, _UNEVEN = 0.3, 0.25  # share of all messages; of the interval
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Readings of one clock for all messages, (N,) ns, and its name in the plural."""
+
+    name: str
+    stamps_ns: Stamps
+
+
+def stands_still(stamps: Stamps, witness: Stamps) -> bool:
+    """Whether a clock gives several messages in a row one reading nearly everywhere, while the witness goes on."""
+    if not len(stamps) or np.any(np.diff(witness) < 0) or len(np.unique(witness)) < len(witness) / 2:
+        return False
+    if len(stamps) == 1:
+        return not stamps.any() and bool(witness.any())
+    return len(np.unique(stamps)) <= max(1, len(stamps) / MESSAGES_PER_STAMP)
+
+
+def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Voice) -> Stamps:
+    """`headers` (N,) with their steps taken out by the witness (N,), both in the order of recording; themselves without any.
+
+    late_ns : (N,) by how much messages came after their turn, 0 for most; these say nothing about the clock
+
+    Where both clocks pause, nothing is wrong. An interval of the headers is a step where the witness contradicts it and it is
+    impossible for a clock whose messages are recorded late and never early. Regular headers remain regular: the interval
+    across a step is a whole number of periods. A witness that runs at another speed does not count.
+    """
+    is_set_back = _in_turns(headers, witness.stamps_ns) or _set_back(headers, witness.stamps_ns, late_ns)
+    late_ns = np.where(is_set_back, 0, late_ns)
+    keep = np.flatnonzero(late_ns == 0)
+    h, w = headers[keep], witness.stamps_ns[keep]
+    period, speed = _period_and_speed(h, w)
+    if not period or _in_parts(h):
+        return headers
+    if not _SLOWEST <= speed <= _FASTEST:
+        # A clock that stands still for a part of the drive seems slow.
+        moves = np.diff(h, prepend=h[0] - 1) != 0
+        period, speed = _period_and_speed(h[moves], w[moves])
+    if not _SLOWEST <= speed <= _FASTEST:
+        voice.notes.append(
+            f"{what}: {witness.name} run {speed:.3g} times as fast as the stamps of the headers, as of a recording that was "
+            "played back or written anew: the headers count"
+        )
+        return headers
+    steps, jumps = np.diff(h), np.diff(w)
+    spread = _recording_spread(w, period)
+    limit = max(0.5 * period + float(late_ns.max()), spread)
+    is_apart = np.abs(steps - jumps) > limit
+    is_odd = np.abs(steps - period) > 0.5 * period
+    edges = np.flatnonzero(is_apart & is_odd)
+    sizes = _step_sizes(h, w, edges, limit)
+    longest = np.abs(jumps[is_apart & ~is_odd]).max(initial=0)
+    if longest > _JUMP_INTERVALS * max(period, spread):
+        voice.notes.append(
+            f"{what}: {witness.name} jump by up to {longest * 1e-9:.3f} s where the stamps of the headers go on: the headers "
+            "count"
+        )
+    edges, sizes = edges[sizes != 0], sizes[sizes != 0]
+    if not len(edges):
+        return headers
+    repaired = steps.copy()
+    repaired[edges] = _intervals(steps[edges] - sizes, steps, period)
+    since_first = np.concatenate([[0], np.cumsum(repaired)])
+    offset = _offsets(h - h[0] - since_first, h - w, limit)
+    first = int(edges[0])
+    places = f" and at {len(edges) - 1} more" if len(edges) > 1 else ""
+    how = f"step by {steps[first] * 1e-9:+.3f} s" if steps[first] else "stand still"
+    voice.problems.append(
+        f"{what}: the stamps of their headers {how} at message {keep[first + 1]}{places}, where {witness.name} go on by "
+        f"{jumps[first] * 1e-9:.3f} s: brought onto one clock by {witness.name}"
+    )
+    return headers - offset[np.maximum(np.searchsorted(keep, np.arange(len(headers)), "right") - 1, 0)]
+
+
+def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Voice) -> Stamps:
+    """Stamps (N,) moved as `repaired` (M,) from `scans` (M,) where they step with these; otherwise as they are."""
+    interval = float(np.median(np.diff(repaired))) if len(scans) > 1 else 0.0
+    removed = np.diff(scans) - np.diff(repaired)
+    at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
+    if not len(at) or len(stamps) < 3:
+        return stamps
+    steps = np.diff(stamps)
+    slack = 0.5 * interval + float(np.median(steps))
+    offset = np.full(len(stamps), scans[0] - repaired[0])
+    last = -1
+    for k, size in zip(at.tolist(), removed[at].tolist(), strict=True):
+        is_alike = (np.abs(steps - size) < slack) & (np.abs(stamps[:-1] - scans[k]) < 2 * interval + slack)
+        is_alike[: last + 1] = False
+        if not is_alike.any():
+            return stamps
+        last = int(np.argmax(is_alike))
+        offset[last + 1 :] += size
+    voice.problems.append(f"{what}: its stamps step with those of the scans, {len(at)} times: moved alike")
+    return np.asarray(stamps - offset)
+
+
+def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
+    """`repaired` (M,) on that of the clocks of `scans` (M,) on which it shares the most time with another stream (N,)."""
+    shared = {
+        int(offset): np.count_nonzero((repaired + offset >= stamps.min()) & (repaired + offset <= stamps.max()))
+        for offset in [0, *np.unique(scans - repaired)[:_OFFSETS]]
+    }
+    best: Stamps = repaired + max(shared, key=lambda offset: (shared[offset], offset == 0))
+    return best
+
+
+def ahead_of(own: Stamps, recorded: Stamps, stamps: Stamps, its_recorded: Stamps, what: str, voice: Voice) -> int:
+    """By how much the clock of a stream, `stamps` (N,), is ahead of that of the scans, `own` (M,), ns; 0 unless these are two
+    clocks of one time.
+
+    recorded, its_recorded : when the messages of each were recorded; the one with the least delay says how far apart clocks are,
+    unless the times of recording run at another speed
+    """
+    for h, w in (own, recorded), (stamps, its_recorded):
+        if len(h) < 2 or not _SLOWEST <= _period_and_speed(h, w)[1] <= _FASTEST:
+            return 0
+    ahead = int((stamps - its_recorded).max() - (own - recorded).max())
+    is_apart = stamps[0] > own[-1] or stamps[-1] < own[0]
+    is_together = its_recorded.min() <= recorded.max() and its_recorded.max() >= recorded.min()
+    if not is_together or abs(ahead) <= (_LATER_NS if is_apart else 10 * _LATER_NS):
+        return 0
+    voice.problems.append(
+        f"{what}: its clock is {ahead * 1e-9:+.3f} s off that of the scans, though both were recorded at one time: moved onto it "
+        "by the times of recording"
+    )
+    return ahead
+
+
+def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
+    """Note that intervals vary more than those of a sensor do, (N,) stamps that increase."""
+    steps = np.diff(stamps).astype(np.float64)
+    if len(steps) < _SPREAD_SAMPLES or steps.min() <= 0:
+        return
+    period = float(np.median(steps))
+    off = steps - np.maximum(np.rint(steps / period), 1) * period
+    sigma = 1.4826 * float(np.median(np.abs(off)))
+    if sigma >= _JITTER * period:
+        voice.notes.append(
+            f"{what} follow each other unevenly, {sigma * 1e-6:.1f} ms (one sigma) about {period * 1e-6:.1f} ms: stamps of "
+            "arrival, not of the sensor"
+        )
+
+
+def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
+    """The interval, ns, 0 where a clock does not go on, and by how much faster `w` runs, by the windows that agree best."""
+    best = (np.inf, 0.0, 0.0)
+    for length in _WINDOWS:
+        if len(h) < 2 * length:
+            break
+        a, b = (float(np.median(c[length:] - c[:-length])) / length for c in (h, w))
+        if a > 0 and b > 0:
+            best = min(best, (abs(float(np.log(a / b))), a, a / b))
+    return best[1], best[2]
+
+
+def _in_turns(h: Stamps, w: Stamps) -> bool:
+    """Whether two clocks take turns: many stamps are late, and sorted they are irregular, unlike the times of recording."""
+    if len(h) < _SPREAD_SAMPLES or np.mean(np.maximum.accumulate(h) > h) < _MANY:
+        return False
+    period, _ = _period_and_speed(h, w)
+    is_irregular = np.abs(np.diff(np.sort(h)).astype(np.float64) - period) > _UNEVEN * period
+    return bool(np.mean(is_irregular) > _MANY and _recording_spread(w, period) < 0.5 * period)
+
+
+def runs(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(K, 2) where each run of true values begins and, behind its last, ends."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))).reshape(-1, 2)
+
+
+def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> NDArray[np.bool_]:
+    """(N,) which late messages came in their turn, of a clock that was set back: those behind are as far from the witness."""
+    back = np.zeros(len(h), np.bool_)
+    if not late_ns.any():
+        return back
+    ahead, period = h - w, _period_and_speed(h, w)[0]
+    limit = max(0.5 * period, _recording_spread(w, period))
+    for begin, end in runs(late_ns > 0):
+        before, after = ahead[max(begin - _LEVEL_SAMPLES, 0) : begin], ahead[end : end + _LEVEL_SAMPLES]
+        own = ahead[begin:end].max()
+        back[begin:end] = own < before.max() - limit and len(after) > 0 and after.max() < own + limit
+    return back
+
+
+def _in_parts(h: Stamps) -> bool:
+    """Whether each scan comes as the same number of messages of one stamp."""
+    counts = np.bincount(np.unique(h, return_inverse=True)[1], minlength=1)
+    usual = int(np.median(counts))
+    return 1 < usual < MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
+
+
+def _recording_spread(w: Stamps, period: float) -> float:
+    """How far apart the delays of neighbouring messages lie, ns: they often arrive in batches."""
+    even = w - w[0] - np.arange(len(w)) * period
+    spread = 0.0
+    for length in _SPREAD_SAMPLES, 4 * _SPREAD_SAMPLES:
+        if len(w) >= 3 * length:
+            windows = np.lib.stride_tricks.sliding_window_view(even, length)
+            spread = max(spread, float(np.median(windows.max(1) - windows.min(1))))
+    return spread
+
+
+def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
+    """Step of the clock `h` between messages k and k + 1 for every k of `edges`, ns, 0 where there is none.
+
+    h - w is an offset less the delay of recording, so its largest values tell. Where the clock goes back or stands still it is
+    wrong. Where it goes on, a delay could be the reason instead: it is a step only if no message on the same stretch that
+    increases was recorded with so little delay.
+    """
+    ahead = h - w
+    backward = np.flatnonzero(np.diff(h) <= 0)
+    bounds = np.concatenate([[-1], edges, [len(h) - 1]])
+    sizes = np.zeros(len(edges), np.int64)
+    for i, k in enumerate(edges.tolist()):
+        before = int(ahead[max(bounds[i] + 1, k + 1 - _LEVEL_SAMPLES) : k + 1].max())
+        after = int(ahead[k + 1 : min(bounds[i + 2], k + _LEVEL_SAMPLES) + 1].max())
+        step = after - before
+        if h[k + 1] > h[k]:
+            at = int(np.searchsorted(backward, k))
+            begin = backward[at - 1] + 1 if at else 0
+            end = backward[at] + 1 if at < len(backward) else len(h)
+            stretch = ahead[begin : k + 1] if step > 0 else ahead[k + 1 : end]
+            is_step = max(before, after) > stretch.max() + limit
+        else:
+            is_step = abs(step) > limit
+        sizes[i] = step if is_step else 0
+    return sizes
+
+
+def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
+    """Intervals across steps, ns: whole periods where the clock ticks regularly, positive ever."""
+    is_regular = np.median(np.abs(steps - np.float64(period))) < _REGULAR * period
+    count = np.maximum(np.rint(across / period), 1)
+    is_near = np.abs(across / period - count) < _SNAP
+    repaired = np.where(is_regular & is_near, np.rint(count * period), np.where(across > 0, across, period))
+    return repaired.astype(np.int64)
+
+
+def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:
+    """Offsets of all messages, ns: one for each clock, 0 for the one nearest to the witness that tells enough messages."""
+    order = np.argsort(offset, kind="stable")
+    clocks = np.split(order, np.flatnonzero(np.diff(offset[order]) > 0.5 * limit) + 1)
+    levels = offset[[int(clock[len(clock) // 2]) for clock in clocks]]
+    enough = max(_MIN_SHARE * len(offset), 2)
+    candidates = [k for k, clock in enumerate(clocks) if len(clock) >= enough] or range(len(clocks))
+    nearest = min(candidates, key=lambda k: abs(int(ahead[clocks[k]].max())))
+    moved = np.empty_like(offset)
+    for clock, level in zip(clocks, levels - levels[nearest], strict=True):
+        moved[clock] = level
+    return moved

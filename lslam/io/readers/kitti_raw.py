@@ -1,0 +1,208 @@
+"""KITTI raw drives: `<date>/<date>_drive_NNNN_{sync,extract}` with `velodyne_points/` and `oxts/`.
+
+`sync` scans go with the camera and OXTS sample of their number, at the instant at which the scanner looks ahead. They are
+distorted: KITTI's readme of the raw data asks to untwist them, that of the odometry benchmark says that its scans are
+compensated "in contrast to the raw data". Times from the azimuth lie about that instant, so poses belong to it.
+
+On drive 0005 points lie nearest to the map's planes when all of a sweep's motion is taken out (46 mm for 56 in a bend), and
+icp, gicp, vgicp, ndt and loam, .02 to .17 deg apart over 10 m with it left in, agree to .01 to .03 deg. All of them are then .21
+deg from OXTS, .14 when OXTS is taken to lag by 14 ms: its yaw is late in bends.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, input_errors
+from lslam.core.types.gnss import GnssStream
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.sequence import Calibration
+from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.calibration_files import read_raw_cam0_lidar, read_rigid
+from lslam.io.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
+from lslam.io.formats.point_files import SUFFIXES
+from lslam.io.formats.sequence_toml import SequenceInfo
+from lslam.io.readers.folder_sequence import Folder, FolderSequence
+from lslam.io.readers.ground_truth import find_ground_truth, oxts_truth, to_lidar
+from lslam.io.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps, rows_of
+from lslam.io.readers.lookup import DRIVE
+from lslam.io.readers.sidecars import calibration_over, load_streams, vertical_correction
+
+KIND = "kitti-raw"
+# OXTS measures every 10 ms: a scan gets one of the two samples about it, mostly the nearer one.
+_OXTS_NS = 10_000_000
+_EVEN = 21
+# Share of a sweep that is over at its start, and when the scanner looks ahead, which is what KITTI ties cameras and OXTS to.
+AT_START, AHEAD = 0.0, 0.5
+
+
+def locate(folder: Path) -> tuple[Path, str] | None:
+    """The drive in or at `folder` and why it is one, else None. Raises InputError listing the drives of a day of several."""
+    if (folder / "velodyne_points").is_dir():
+        return folder, "it has velodyne_points/, as KITTI raw drives do"
+    if (folder / "oxts").is_dir():
+        raise InputError(f"{folder} is a KITTI raw drive without velodyne_points/: fetch its velodyne data")
+    with input_errors(folder):
+        drives = sorted(p for p in folder.iterdir() if DRIVE.match(p.name) and (p / "velodyne_points").is_dir())
+    if len(drives) > 1:
+        raise InputError(f"{folder} holds {len(drives)} drives ({', '.join(p.name for p in drives)}): name one")
+    return (drives[0], f"{folder} holds this single KITTI raw drive") if drives else None
+
+
+def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence:
+    """Open the drive in `path`. Raises InputError when it has no scans or a broken `sequence.toml`."""
+    data = path / "velodyne_points" / "data"
+    # Unsynchronised (`extract`) drives come as text.
+    scans = list_scans(data, (*SUFFIXES, ".txt")) if data.is_dir() else ([], [])
+    nothing = f"{data} holds no scans (*.bin or *.txt): fetch the velodyne data of this drive"
+    folder = Folder.begin(path, KIND, why, overrides, scans, nothing)
+    info, voice = folder.info, folder.voice
+    is_extract = path.name.endswith("_extract")
+    oxts = _oxts(folder)
+    compensated = bool(info.motion_compensated)
+    stamps, rate, passed = _stamps(folder, oxts, is_extract)
+    calibration = calibration_over(info, _calibration(folder))
+    sweep = None
+    if not compensated and info.per_point is None:
+        seconds = _sweeps(folder, rate)
+        wanted = AT_START if is_extract else AHEAD
+        sweep = np.outer(seconds, [-wanted, 1 - wanted])
+        if passed is not None and passed != wanted:
+            stamps = stamps + np.round(1e9 * (wanted - passed) * seconds).astype(np.int64)
+            voice.notes.append(
+                "these stamps are of the scanner looking ahead: each scan begins half a sweep earlier" if is_extract else
+                "these stamps are of the beginnings of sweeps: the scanner looks ahead half a sweep later"
+            )  # fmt: skip
+    if info.motion_compensated is None:
+        voice.notes.append(
+            "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
+            "leaves scans as they are)"
+        )
+    imu, gnss = load_streams(path, info, voice)
+    if oxts is not None and oxts.stamps_ns is not None:
+        of_oxts = oxts_streams(oxts, oxts.stamps_ns)
+        imu, gnss = imu or of_oxts[0], gnss or of_oxts[1]
+    return folder.sequence(
+        stamps_ns=stamps, rate_hz=rate, motion_compensated=compensated, calibration=calibration,
+        ground_truth=_ground_truth(folder, stamps, oxts, calibration),
+        imu=imu, gnss=gnss,
+        correction_deg=vertical_correction(info, folder.files, folder.record, voice.notes), sweep_s=sweep,
+        sensor=info.sensor or (None if folder.has_toml else "HDL-64E"),
+    )  # fmt: skip
+
+
+def _oxts(folder: Folder) -> Oxts | None:
+    place, problems = folder.path / "oxts", folder.voice.problems
+    try:
+        oxts = read_oxts(place)
+    except InputError as error:
+        problems.append(f"OXTS is not used: {error}")
+        return None
+    if oxts is None:
+        problems.append(f"{place} holds no samples: no ground truth, IMU or GNSS")
+        return None
+    problems += oxts.problems
+    back = np.flatnonzero(np.diff(() if oxts.stamps_ns is None else oxts.stamps_ns) <= 0)
+    if len(back):
+        problems.append(
+            f"{place / 'timestamps.txt'}: time repeats or goes back at line {back[0] + 2} "
+            f"({len(back)} place{'s' if len(back) > 1 else ''})"
+        )
+    return oxts
+
+
+def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[NDArray[np.int64], float, float | None]:
+    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the share of the sweep that is over by then."""
+    info, voice = folder.info, folder.voice
+    compensated = bool(info.motion_compensated)
+    passed = {"timestamps.txt": AHEAD, "timestamps_start.txt": AT_START}
+    names = reversed(passed) if is_extract and not compensated else passed
+    paths = [folder.path / "velodyne_points" / name for name in names]
+    if info.stamps is not None:
+        paths.insert(0, folder.path / info.stamps)
+    path = next((p for p in paths if p.is_file()), None)
+    stamps = load_stamps(path, voice.problems) if path else None
+    if path is not None and stamps is not None:
+        voice.notes.append(f"scan stamps from {path.name}")
+        is_own = info.stamps is None or path != paths[0]
+        return *folder.take_rows(path, stamps), passed[path.name] if is_own else None
+    by_oxts = np.zeros(0, np.int64) if oxts is None or oxts.stamps_ns is None else oxts.stamps_ns
+    if oxts is None or not len(by_oxts) or is_extract:
+        rate = info.rate_hz or DEFAULT_RATE_HZ
+        voice.problems.append(
+            f"no stamps of the scans in {folder.path / 'velodyne_points'}: they are stamped at {rate:g} Hz"
+        )
+        return nominal_stamps(len(folder.files), rate, int(by_oxts[0]) if len(by_oxts) else 0), rate, None
+    voice.notes.append("no velodyne_points/timestamps*.txt: scan i goes with OXTS sample i and takes its stamp")
+    even = by_oxts if compensated else _evened(oxts.numbers, by_oxts, folder)
+    full = np.full(int(oxts.numbers.max()) + 1, -1, np.int64)
+    full[oxts.numbers] = even
+    source = folder.path / "oxts" / "timestamps.txt"
+    return *folder.take_rows(source, even if (full < 0).any() else full), AHEAD
+
+
+def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], folder: Folder) -> NDArray[np.int64]:
+    """Stamps of scans `numbers`, each that of an OXTS sample near to it, as a scanner that turns evenly takes them.
+
+    Its rate wanders by parts in a thousand: each stamp becomes that of the line through the `_EVEN` about it.
+    """
+    if len(stamps_ns) < 3:
+        return stamps_ns
+    even = np.empty_like(stamps_ns)
+    for k in range(len(stamps_ns)):
+        first = max(min(k - _EVEN // 2, len(stamps_ns) - _EVEN), 0)
+        near = slice(first, first + _EVEN)
+        x, y = numbers[near] - numbers[k], stamps_ns[near] - stamps_ns[k]
+        even[k] = stamps_ns[k] + round(np.polyfit(x, y, 1)[1])
+    off = np.abs(even - stamps_ns)
+    if not 0 < off.max() <= _OXTS_NS:
+        return stamps_ns
+    folder.voice.notes.append(
+        f"OXTS samples lie 10 ms apart: stamps are evened out, by {1e-6 * off.max():.1f} ms at most"
+    )
+    return even
+
+
+def _sweeps(folder: Folder, rate: float) -> NDArray[np.float64]:
+    """Duration of each sweep, s, from KITTI's start and end stamps, else one period."""
+    folder.voice.notes.append("per-point times from the azimuth: the HDL-64E turns clockwise and a scan starts behind")
+    ends = [folder.path / "velodyne_points" / f"timestamps_{which}.txt" for which in ("start", "end")]
+    nominal = np.full(len(folder.files), 1 / rate)
+    if not all(p.is_file() for p in ends):
+        return nominal
+    start, end = (load_stamps(p, folder.voice.problems) for p in ends)
+    if start is None or end is None or len(start) != len(end):
+        return nominal
+    rows, _ = rows_of(folder.files, len(start))
+    seconds = ((end - start) * 1e-9)[rows]
+    return np.where((rows >= 0) & (seconds > 0.5 / rate) & (seconds < 2 / rate), seconds, nominal)
+
+
+def _calibration(folder: Folder) -> Calibration:
+    matrices = []
+    for name, read in (("imu_to_velo", read_rigid), ("velo_to_cam", lambda path: read_raw_cam0_lidar(path.parent))):
+        path = folder.path.parent / f"calib_{name}.txt"
+        if not path.is_file():
+            folder.voice.notes.append(f"{path} is missing")
+        matrices.append(folder.calibration(path, read) if path.is_file() else None)
+    T_lidar_imu, T_cam0_lidar = matrices
+    # The OXTS position is that of the IMU's origin (devkit readme), so both extrinsics are one.
+    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu)
+
+
+def oxts_streams(oxts: Oxts, stamps_ns: NDArray[np.int64]) -> tuple[ImuStream, GnssStream]:
+    """The IMU and the fixes of OXTS at `stamps_ns` (N,)."""
+    imu = ImuStream(stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
+    return imu, GnssStream(stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
+
+
+def _ground_truth(
+    folder: Folder, stamps: NDArray[np.int64], oxts: Oxts | None, calibration: Calibration
+) -> Trajectory | None:
+    if folder.info.ground_truth is None:
+        return None if oxts is None else oxts_truth(oxts, stamps, calibration.T_lidar_imu, folder.voice)
+    truth = folder.truth(find_ground_truth(folder.path, folder.info, folder.voice), stamps)
+    return None if truth is None else to_lidar(truth, truth.frame, calibration, folder.voice)

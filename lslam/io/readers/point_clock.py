@@ -1,0 +1,240 @@
+"""The per-point times of each scan by the rule of its recording; a scan or a point that breaks the rule is treated by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError
+from lslam.core.types.scan import is_measured
+from lslam.core.types.sequence import readable
+from lslam.io.formats.point_cloud import PointCloud
+from lslam.io.formats.sequence_toml import SequenceInfo
+from lslam.io.readers.point_times import Sample, TimeRule, apply_rule, densest, is_usable, learn_rule
+
+# Sweeps of a sensor differ by less than this factor in length; what is wider holds times that are wrong.
+_WIDER = 1.6
+# One that is longer than usual by more may hold two clocks, where its points say so.
+_LONGER = 1.1
+# A full scan whose times span less of a sweep has no times.
+_FLAT = 0.02
+# More points than this share behind a gap are no stray ones: the clock was set while the sensor turned.
+_STEP_SHARE = 0.05
+# Scans from the beginning that a rule is learnt on, and about how many points of each.
+_FIRST, _ENOUGH = 3, 5000
+# A part of the sweep begins and ends once in each ring at most: more changes per point are no order of measuring.
+_OFTEN = 0.02
+# Absolute times that lie farther from the stamp are of another clock.
+_OTHER_CLOCK_NS = 10**9
+
+
+class TimedCloud(NamedTuple):
+    """The points of a scan and their times, (N,) float32 s, or None; ns to add to the stamp; what was wrong, or empty.
+
+    unmeasured : points without a place whose times lie outside the sweep; they stay, at its beginning
+    """
+
+    cloud: PointCloud
+    times: NDArray[np.float32] | None
+    shift_ns: int
+    fault: str = ""
+    unmeasured: int = 0
+
+
+@dataclass(frozen=True)
+class PointClock:
+    """Reads the times of every scan of a recording."""
+
+    rule: TimeRule
+    rate_hz: float
+    is_of_one_scan: bool = False
+
+    def read(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
+        """Times of the points and their shift from `stamp_ns`, the stamp of the header.
+
+        Points that were measured and whose time cannot be right are left out. Others stay: no method looks at them.
+        """
+        timed = self._timed(cloud, stamp_ns)
+        # Another clock or only nominal stamps: the sequence's own stamps stay.
+        is_other = self.rule.is_absolute and abs(timed.shift_ns) >= _OTHER_CLOCK_NS
+        return timed._replace(shift_ns=0) if is_other else timed
+
+    def begin_ns(self, cloud: PointCloud) -> int | None:
+        """When the first point was measured, by absolute times; None for a scan that breaks the rule."""
+        times, begin = replace(self, is_of_one_scan=True)._timed(cloud, 0)[1:3]
+        return None if times is None or not len(times) else begin
+
+    def _timed(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
+        rule = self.rule
+        if not len(cloud):
+            return TimedCloud(cloud, np.zeros(0, np.float32), 0)  # an empty scan is no scan of a sensor without times
+        values = next((clock.values for clock in cloud.clocks if clock.name == rule.field), None)
+        if values is None:
+            return self._by_itself(cloud, stamp_ns, f"the scan has no field {rule.field!r}, unlike the others")
+        if self._is_sound(values, len(cloud)):
+            return TimedCloud(cloud, *apply_rule(rule, values, stamp_ns))
+        return self._mended(cloud, values, stamp_ns)
+
+    def first_whole(self, samples: dict[int, Sample]) -> int:
+        """Number of the first sample with a sound sweep of the usual length, or else of the first."""
+        timed = ((index, self.read(s.cloud, s.stamp_ns)) for index, s in samples.items())
+        whole = (
+            index
+            for index, t in timed
+            if t.times is not None and not t.fault and 2 * np.ptp(t.times) >= self.rule.sweep_s
+        )
+        return next(whole, next(iter(samples)))
+
+    def _mended(self, cloud: PointCloud, values: NDArray[Any], stamp_ns: int) -> TimedCloud:
+        rule, width = self.rule, _WIDER * self.rule.sweep
+        usable = is_usable(cloud, values)
+        values, over = _unwrapped(values, usable, width)
+        good = densest(values, usable, width)
+        step = _step(values, usable, good, rule.sweep)
+        if step is not None:
+            values, good = step
+        if 2 * np.count_nonzero(good) <= np.count_nonzero(usable) or not self._is_sound(values[good], len(cloud)):
+            return self._by_itself(cloud, stamp_ns, f"field {rule.field!r} does not hold times as in the other scans")
+        times, shift = apply_rule(rule, np.where(good, values, values[good].min()), stamp_ns)
+        wrong = is_measured(cloud.points) & ~good
+        count = np.count_nonzero(wrong)
+        faults = []
+        if over:
+            faults.append(
+                f"the times of {over} points ran over the bits of field {rule.field!r} and are read beyond them"
+            )
+        if step is not None:
+            faults.append("the clock of the points was set within the sweep and is read on as before")
+        if count:
+            faults.append(f"{count} of {len(cloud)} points have times outside the sweep and are left out")
+        unmeasured = len(cloud) - int(np.count_nonzero(good | wrong))
+        if count:
+            cloud, times = cloud.select(~wrong), times[~wrong]
+        return TimedCloud(cloud, times, shift, "; ".join(faults), unmeasured)
+
+    def _is_sound(self, values: NDArray[Any], count: int) -> bool:
+        """Whether all times of a scan of `count` points can belong to one sweep; not where one of them is NaN."""
+        rule = self.rule
+        low, high = values.min(), values.max()
+        span = float(high) - float(low)
+        if not span <= _WIDER * rule.sweep or (span < _FLAT * rule.sweep and 2 * count > rule.points):
+            return False
+        if _is_set_back(values, rule.sweep):
+            return False
+        return rule.is_absolute or bool(low >= -rule.reach and high <= rule.reach)
+
+    def _by_itself(self, cloud: PointCloud, stamp_ns: int, why: str) -> TimedCloud:
+        """The times of a scan that breaks the rule by what it says alone, or none."""
+        with suppress(InputError):
+            rule = None if self.is_of_one_scan else learn_rule([Sample(cloud, stamp_ns)], self.rate_hz)
+            if rule is not None:
+                timed = PointClock(rule, self.rate_hz, True).read(cloud, stamp_ns)
+                if timed.times is not None:
+                    return timed._replace(fault=f"{why}: {rule.sentence}")
+        return TimedCloud(cloud, None, 0, f"{why}: it is not deskewed")
+
+
+def read_samples(count: int, read: Callable[[int], Sample]) -> dict[int, Sample]:
+    """The scans of a recording of `count` that a rule is learnt on, by their number: the first with points, one in the middle
+    and the last; those that cannot be read are left out."""
+    first = range(min(count, 2 * _FIRST))
+    others = [k for k in dict.fromkeys((count // 2, count - 1)) if k not in first]
+    some = chain(islice(readable(first, read), _FIRST), readable(others, read))
+    return {index: sample.thinned(_ENOUGH) for index, sample in some}
+
+
+def open_clock(
+    samples: Sequence[Sample], rate_hz: float, info: SequenceInfo, notes: list[str], problems: list[str]
+) -> PointClock | None:
+    """The clock of a recording's points by a few of its scans, and what is to be said of it and of fields that nobody reads."""
+    rule = None
+    if not info.motion_compensated:
+        try:
+            rule = learn_rule(samples, rate_hz, info.point_time_unit, info.point_time_reference)
+        except InputError as error:
+            problems.append(f"no deskew: {error}")
+    clock = None if rule is None else PointClock(rule, rate_hz)
+    if clock is not None:
+        notes.append(clock.rule.sentence)
+        unmeasured = max(clock.read(s.cloud, s.stamp_ns).unmeasured / len(s.cloud) for s in samples)
+        if unmeasured:
+            notes.append(
+                f"up to {unmeasured:.1%} of the points of a scan are no returns (zeros or NaN) with times outside the sweep, "
+                "which are not looked at"
+            )
+    read = [] if rule is None else rule.field.removesuffix(")").split(" (")[0].split(" + ")
+    fields = dict.fromkeys(name for sample in samples for name in (*sample.cloud.fields, *read))
+    unread = dict.fromkeys(name for sample in samples for name in sample.cloud.unread if name not in fields)
+    if fields:
+        notes.append(
+            f"fields of the points: {', '.join(fields)}" + (f"; not read: {', '.join(unread)}" if unread else "")
+        )
+    times = [column for sample in samples for column in sample.cloud.clocks]
+    if rule is None and times and all(column.is_constant for column in times):
+        names = dict.fromkeys(column.name for column in times)
+        notes.append(f"no point times: {', '.join(names)} holds one value for all points of a scan")
+    return clock
+
+
+def _unwrapped(values: NDArray[Any], usable: NDArray[np.bool_], width: float) -> tuple[NDArray[Any], int]:
+    """The values, integers as int64 and short ones counted on beyond their range, and how many usable ones that changed."""
+    if values.dtype.kind not in "iu":
+        return values, 0
+    plain = values.astype(np.int64)
+    if values.dtype.itemsize > 4 or not usable.any():
+        return plain, 0
+    full = 1 << (8 * values.dtype.itemsize)
+    first = plain[densest(plain, usable, width)].min()
+    beyond = np.asarray((plain - first + full // 2) % full - full // 2 + first)
+    # What is no nearer after it did not run over.
+    beyond = np.where(np.abs(beyond - first) <= width, beyond, plain)
+    return beyond, int(np.count_nonzero((beyond != plain) & usable))
+
+
+def _step(
+    values: NDArray[Any], usable: NDArray[np.bool_], good: NDArray[np.bool_], sweep: float
+) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
+    """Values with those behind a step of the clock moved to follow on the others, and which are good then; None without a step.
+
+    good : the largest part; sweep : usual length of one
+    """
+    width = _WIDER * sweep
+    rest = densest(values, usable & ~good, width)
+    both = good | rest if np.count_nonzero(rest) > _STEP_SHARE * np.count_nonzero(usable) else good
+    some = values[both]
+    parts = _parts(some)
+    if parts is None or (np.ptp(some) <= width and not _is_set_back(some, sweep)):
+        return None
+    earlier, later = parts
+    if float(np.ptp(some[earlier])) + float(np.ptp(some[later])) > width:
+        return None
+    some[later] += some[earlier].max() - some[later].min()
+    moved = values.copy()
+    moved[both] = some
+    return moved, both
+
+
+def _is_set_back(values: NDArray[Any], sweep: float) -> bool:
+    """Whether times (N,) are too many for a sweep because those of the points that come first are the later ones."""
+    parts = _parts(values) if np.ptp(values) > _LONGER * sweep else None
+    if parts is None or not all(values[part][0] < values[part][-1] for part in parts):
+        return False
+    return bool(values[parts[0]].min() > values[parts[1]].max())
+
+
+def _parts(values: NDArray[Any]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """The times (N,) on either side of the largest hole, those first that come first; None where few are on one side."""
+    if len(values) < 2:
+        return None
+    ordered = np.sort(values)
+    is_high = values > ordered[np.argmax(np.diff(ordered))]
+    high, changes = np.count_nonzero(is_high), np.count_nonzero(np.diff(is_high))
+    if min(high, len(values) - high) <= _STEP_SHARE * len(values) or changes > _OFTEN * len(values):
+        return None
+    return (is_high, ~is_high) if is_high[0] else (~is_high, is_high)

@@ -1,0 +1,192 @@
+"""What a run leaves behind on its way, so that `--resume` goes on there and ends with the same bytes."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lslam.core.errors import InputError
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import State
+from lslam.core.types.warned import warnings_so_far
+from lslam.io.formats.state_files import Records, read_state, write_state
+from lslam.odometry.base import Resumable
+from lslam.odometry.frontend.keyframing import Keyframing
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.windows import WindowTracker
+
+log = logging.getLogger("lslam")
+
+# The last one may be damaged when the machine itself went down while it was written.
+KEPT = 2
+
+
+class CheckpointSchedule:
+    """When a checkpoint is due: after each twentieth of the time so far, but never later than `every_s` after the last.
+
+    So a run that is killed loses a twentieth of what it had done, whatever its length, and a long one `every_s`. What
+    checkpoints cost stays below a fiftieth of the time between them.
+    """
+
+    SOONEST_S, PART, MOST_SHARE = 1.0, 0.05, 0.02
+
+    def __init__(self, every_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._every_s, self._clock = every_s, clock
+        self._began = clock()
+        self._next = self._began + min(every_s, self.SOONEST_S)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time; never when `every_s` is 0."""
+        return self._every_s > 0 and self._clock() >= self._next
+
+    def wrote(self, seconds: float) -> None:
+        """A checkpoint was written, which took so long."""
+        now = self._clock()
+        wait = min(self._every_s, max(self.SOONEST_S, self.PART * (now - self._began)))
+        self._next = now + max(wait, seconds / self.MOST_SHARE)
+
+
+class Checkpoints:
+    """The checkpoints of one stage of a run in a folder, the newest two of them.
+
+    folder : made when it is needed; stage : the beginning of their names
+    """
+
+    def __init__(self, folder: Path, stage: str, every_s: float) -> None:
+        self.folder, self._stage = folder, stage
+        self.schedule = CheckpointSchedule(every_s)
+
+    def write(self, scans: int, content: Callable[[], State]) -> None:
+        """Write what is known after `scans` scans, and what the run was warned of until there; raises OutputError.
+
+        To gather it counts as time for the pace.
+        """
+        began = time.perf_counter()
+        self.folder.mkdir(exist_ok=True)
+        known = {**content(), "warned": warnings_so_far().state()}
+        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", known)
+        for old in self._files()[:-KEPT]:
+            with contextlib.suppress(OSError):
+                old.unlink()
+        self.schedule.wrote(time.perf_counter() - began)
+
+    def latest(self) -> Any:
+        """What the newest checkpoint that can be read holds, its warnings being those of this run now; None without one."""
+        for path in reversed(self._files()):
+            try:
+                known = read_state(path, STATE_CLASSES)
+                warnings_so_far().take_over(known.pop("warned", {"texts": [], "places": []}))
+                return known
+            except InputError as error:
+                log.warning("a checkpoint is left out: %s", error)
+                with contextlib.suppress(OSError):
+                    path.unlink()
+        return None
+
+    def clear(self) -> None:
+        """Forget them all: what begins again counts its scans from 0, and must not be mistaken for older."""
+        for path in self._files():
+            path.unlink(missing_ok=True)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob(f"{self._stage}-*.npz"))
+
+
+class OdometryCheckpoints:
+    """Checkpoints of odometry: results so far, keyframes, and the state of whatever a next scan depends on.
+
+    A method that is not `Resumable` leaves one at the end of odometry only: before, it has to begin again.
+    """
+
+    def __init__(self, checkpoints: Checkpoints) -> None:
+        self._checkpoints = checkpoints
+        self._latest = checkpoints.latest()
+        self.resumed_after: list[int] = []
+        self._seconds = 0.0
+        self._began = time.monotonic()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether an earlier run came to the end of odometry."""
+        return self._latest is not None and bool(self._latest["is_over"])
+
+    @property
+    def scans(self) -> int:
+        """After how many scans an earlier run left off; 0 when there is nothing to go on from."""
+        return len(self.results)
+
+    @property
+    def results(self) -> list[ScanResult]:
+        """What an earlier run found until there."""
+        return [] if self._latest is None else list(self._latest["results"])
+
+    @property
+    def folder(self) -> Path:
+        """Where they lie."""
+        return self._checkpoints.folder
+
+    @property
+    def seconds(self) -> float:
+        """What earlier runs spent on the results that were taken over, s."""
+        return self._seconds
+
+    def begin(self, tracker: WindowTracker, keyframing: Keyframing) -> list[ScanResult]:
+        """Put the tracker and the keyframes where the newest checkpoint left them; the results until there."""
+        self._began = time.monotonic()
+        latest = self._latest
+        if latest is not None:
+            try:
+                keyframing.restore(latest["keyframes"])
+            except InputError as error:
+                log.warning("%s: the run begins again", error)
+                self._latest = latest = None
+        if latest is None:
+            self._checkpoints.clear()
+            keyframing.store.clear()
+            return []
+        try:
+            tracker.restore(latest["tracker"])
+        except (InputError, KeyError, ValueError, TypeError) as error:
+            raise InputError(
+                f"the checkpoint in {self._checkpoints.folder} is damaged ({error}): --overwrite the run"
+            ) from None
+        results: list[ScanResult] = latest["results"]
+        self._seconds = latest["seconds"]
+        self.resumed_after = [*latest["resumed_after"], len(results)]
+        log.info("going on after %d scans", len(results))
+        return results
+
+    def offer(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing) -> None:
+        """Write a checkpoint when one is due."""
+        if self._checkpoints.schedule.is_due and isinstance(tracker.odometry, Resumable):
+            self._write(results, tracker, keyframing, is_over=False)
+
+    def close(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
+        """Write the last one: odometry is over, or somebody asked to stop."""
+        if (is_over and not self.is_over) or (not is_over and isinstance(tracker.odometry, Resumable)):
+            self._write(results, tracker, keyframing, is_over)
+
+    def _write(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
+        if all(result.status == "skipped" for result in results):
+            return  # bad input: nothing to go on with
+        if not is_over and (keyframing.is_waiting or not tracker.is_settled):
+            return  # the next scan is needed to say what the first one was
+        if is_over:
+            keyframing.settle()
+
+        def content() -> State:
+            return {
+                "results": Records(results),
+                "tracker": tracker.state() | ({"odometry": None} if is_over else {}),
+                "keyframes": keyframing.state(),
+                "is_over": is_over,
+                "seconds": self._seconds + time.monotonic() - self._began,
+                "resumed_after": self.resumed_after,
+            }
+
+        self._checkpoints.write(len(results), content)

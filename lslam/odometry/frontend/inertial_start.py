@@ -1,0 +1,258 @@
+"""From a sequence with an IMU to the motion model of a run: a few scans are registered without it first."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config import Config
+from lslam.core.config.odometry import TIGHTLY_COUPLED
+from lslam.core.errors import InputError
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.sequence import Selection, Sequence, select
+from lslam.io.formats.state_files import read_state, write_state
+from lslam.odometry import create_odometry
+from lslam.odometry.frontend.inertial_calibration import calibration_found, mounting_problem
+from lslam.odometry.frontend.motion_models import motion_of
+from lslam.odometry.frontend.register_scans import read_ahead
+from lslam.odometry.frontend.scene_scale import in_scale
+from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.tracker import Tracker
+from lslam.odometry.inertial import fusion
+from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.odometry.inertial.imu_cleaning import LEAST_RATE_HZ, ImuRefusedError, is_slow, rate_of
+from lslam.odometry.inertial.initialise import FirstPoses, InertialStart, start
+
+log = logging.getLogger("lslam")
+
+
+@dataclass
+class Inertial:
+    """The IMU's part in a run.
+
+    motion : None when it was refused from the start; problems : why it was, or could not do all of its work
+    """
+
+    motion: InertialMotion | None
+    start: InertialStart | None = None
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+def warm_up() -> None:
+    """Compile what the motion model and the scans before the run need."""
+    create_odometry(Config()).warm_up()
+    fusion.warm_up()
+
+
+def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
+    """Check and align the sequence's IMU; a refused one leaves the run to constant velocity.
+
+    Raises InputError when the sequence has no IMU, or a refused or slow one and a tightly coupled method.
+    """
+    is_needed = config.odometry.method in TIGHTLY_COUPLED
+    if sequence.imu is None:
+        raise InputError(
+            f"{sequence.path} has no IMU: name its file with `imu` in sequence.toml, or run without --imu, by a method that "
+            "needs none"
+        )
+    if is_needed:
+        _require_rate(sequence, sequence.imu, config.odometry.method)
+    part = Inertial(None)
+    T_lidar_imu = sequence.calibration.T_lidar_imu
+    if T_lidar_imu is None:
+        part.problems.append("T_lidar_imu is not known: the IMU is taken to sit in the LiDAR with the same axes")
+        T_lidar_imu = np.eye(4)
+    try:
+        begun = _begin(sequence, sequence.imu, T_lidar_imu, config)
+    except ImuRefusedError as error:
+        if is_needed:
+            raise InputError(f"{config.odometry.method} needs an IMU, and this one is refused: {error}") from None
+        part.problems.append(f"the IMU is refused, the run goes on without it: {error}")
+        log.warning("%s", part.problems[-1])
+        return part
+    part.start, part.notes = begun, list(begun.notes)
+    part.problems += begun.problems
+    part.motion = motion_of(begun, config)
+    for note in part.notes:
+        log.info("%s", note)
+    return part
+
+
+def _require_rate(sequence: Sequence, imu: ImuStream, method: str) -> None:
+    """Raise InputError for an IMU that a filter cannot propagate within a sweep."""
+    rate = rate_of(imu)
+    if is_slow(rate):
+        extract = ", or take KITTI's `_extract` drive (100 Hz)" if sequence.kind.startswith("kitti") else ""
+        raise InputError(
+            f"{sequence.path}: {method} is tightly coupled and needs an IMU of {LEAST_RATE_HZ:.0f} Hz or more, this one has "
+            f"{rate:.1f} Hz: run a loosely coupled method with it (--method icp --imu){extract}"
+        )
+
+
+def save_start(path: Path, part: Inertial) -> None:
+    """Keep what `begin_inertial` found, for `load_start`. Raises OutputError."""
+    write_state(path, {"start": part.start, "notes": part.notes, "problems": part.problems})
+
+
+def load_start(path: Path, config: Config) -> Inertial | None:
+    """What `begin_inertial` found in an earlier run; None when that is not there, or cannot be read."""
+    try:
+        known = read_state(path, STATE_CLASSES) if path.is_file() else None
+    except InputError as error:
+        log.warning("the IMU is aligned again: %s", error)
+        known = None
+    if known is None:
+        return None
+    part = Inertial(None, known["start"], known["notes"], known["problems"])
+    if part.start is not None:
+        part.motion = motion_of(part.start, config)
+    return part
+
+
+def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> InertialStart:
+    """The start by scans registered without the IMU; again by scans that it then deskewed, where that matters."""
+    last_ns = int(sequence.stamps_ns[-1])
+    first = first_poses(sequence, config, None)
+    begun = start(imu, T_lidar_imu, first, last_ns, config.imu)
+    is_moved = begun.offset_s != 0 and config.imu.time_offset_s is None
+    if not is_moved and first.covariances is not None:
+        return begun
+    motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
+    better = first_poses(sequence, config, motion)
+    if not is_moved:
+        on_time = config.imu.model_copy(update={"time_offset_s": 0.0})
+        again = start(begun.imu, T_lidar_imu, better, last_ns, on_time)
+        return replace(again, offset_s=begun.offset_s, notes=begun.notes, problems=begun.problems)
+    again = start(begun.imu, T_lidar_imu, better, last_ns, config.imu, 0.0)
+    offset = begun.offset_s + again.offset_s
+    said = f"IMU stamps moved by {1e3 * offset:+.1f} ms: its turns then fit those of the scans best"
+    return replace(again, offset_s=offset, notes=[*begun.notes, said])
+
+
+def with_imu_settings(config: Config) -> Config:
+    """The configuration of a run that the IMU predicts: better priors want a narrower search."""
+    if not config.imu.use or config.imu.inlier_distance is None:
+        return config
+    narrow = config.registration.model_copy(update={"inlier_distance": config.imu.inlier_distance})
+    return config.model_copy(update={"registration": narrow})
+
+
+def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | None) -> FirstPoses:
+    """The first seconds, every scan of them, by `icp` in its defaults, up to the first that fails.
+
+    Where the IMU begins later, its first seconds, and all scans before.
+    """
+    whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
+    begin_ns = first_heard_ns(sequence.imu, whole.stamps_ns[first:], config)
+    if motion is None and begin_ns > whole.stamps_ns[first]:
+        log.info("the IMU begins %.1f s after the first scan", 1e-9 * (begin_ns - whole.stamps_ns[first]))
+    end_ns = begin_ns + round(1e9 * config.imu.start_s)
+    few = select(whole, first, max(int(np.searchsorted(whole.stamps_ns[first:], end_ns)), 1))
+    gate = config.preprocess.model_dump(include={"range_min", "range_max", "up", "deskew"})
+    odometry = create_odometry(in_scale(Config.model_validate({"preprocess": gate}), few))
+    tracker = Tracker(odometry, motion=motion)
+    stamps: list[int] = []
+    poses: list[NDArray[np.float64]] = []
+    instants: list[int] = []
+    middles: list[NDArray[np.float64]] = []
+    covariances: list[NDArray[np.float64]] = []
+    for loaded in read_ahead(few, odometry.prepare, config.input.workers):
+        result = tracker.track(loaded)
+        if result.status == "skipped":
+            continue
+        if result.status != "ok":
+            break
+        stamps.append(result.stamp_ns)
+        poses.append(result.T_world_lidar)
+        instants.append(tracker.middle[0])
+        middles.append(tracker.middle[1])
+        # Where constant velocity deskews, poses are worse than a registration can know.
+        if result.registration_covariance is not None and (motion is not None or len(tracker.sweep.times) == 1):
+            covariances.append(result.registration_covariance)
+    if not stamps:
+        stamps, poses = [int(whole.stamps_ns[first])], [np.eye(4)]
+    # The sweep of the first scan is not known before the second without an IMU.
+    turns = slice(1 if motion is None else 0, None)
+    return FirstPoses(
+        np.array(stamps, np.int64), np.stack(poses), np.array(instants[turns], np.int64),
+        np.array(middles[turns]).reshape(-1, 4, 4), np.stack(covariances)[turns] if len(covariances) == len(poses) else None,
+    )  # fmt: skip
+
+
+def first_heard_ns(imu: ImuStream | None, stamps_ns: NDArray[np.int64], config: Config) -> int:
+    """Since when the IMU tells of the scans: from the first on, unless it begins among the later ones."""
+    first_ns = int(stamps_ns[0])
+    if imu is None:
+        return first_ns
+    shifted = imu.stamps_ns + round(1e9 * (config.imu.time_offset_s or 0.0))
+    during = shifted[(shifted >= first_ns) & (shifted <= stamps_ns[-1])]
+    silent_s = 1e-9 * (int(during.min()) - first_ns) if len(during) else 0.0
+    return first_ns if silent_s <= config.imu.gap_s else int(during.min())
+
+
+def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
+    """What the manifest says of the IMU when the run is over; problems that arose on the way are added to `part`."""
+    motion, begun = part.motion, part.start
+    if motion is None or begun is None:
+        return {"used": False, "decisions": [*part.notes, *part.problems]}
+    if motion.gap_scans:
+        part.problems.append(
+            f"IMU: {motion.gap_scans} scans fell into gaps of the IMU and were predicted by constant velocity"
+        )
+    if said := mounting_problem(motion):
+        part.problems.append(said)
+    if motion.refusal:
+        part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")
+    last = motion.estimate
+    errors = motion.prior_errors()
+    norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
+    steady = [r.imu.steady_norm for r in results[1:] if r.status == "ok" and r.imu.steady_norm is not None]
+    iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.is_repeated]
+    return {
+        "used": not motion.refusal,
+        "decisions": part.notes,
+        "velocity": motion.config.velocity,
+        "time_offset_s": round(begun.offset_s + last.gyroscope.offset_s, 5),
+        **calibration_found(last.gyroscope, begun),
+        "is_checked_by_turns": begun.is_checked,
+        "is_static_start": begun.is_static,
+        "gyro_bias_rad_s": _rounded(last.gyroscope.bias, 5),
+        "accel_bias_m_s2": _rounded(last.accel_bias, 4),
+        "gravity_in_world_m_s2": _rounded(last.gravity, 4),
+        "scans_in_gaps": motion.gap_scans,
+        "median_prior_norm": round(float(np.median(norms)), 5) if norms else None,
+        "median_constant_velocity_norm": round(float(np.median(steady)), 5) if steady else None,
+        "mean_iterations": round(float(np.mean(iterations)), 2) if iterations else None,
+        **_savings(results),
+        "prior_error_m": None if errors is None else round(errors[0], 5),
+        "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
+    }
+
+
+def _savings(results: list[ScanResult]) -> dict[str, Any]:
+    """What the IMU saved on the scans that were registered from constant velocity too; means over them."""
+    sample = [
+        (r.iterations, r.imu.steady_iterations, r.imu.saved_s)
+        for r in results
+        if r.imu.steady_iterations is not None and r.imu.saved_s is not None
+    ]
+    if not sample:
+        return {"compared_scans": 0}
+    own, steady, saved = np.mean(sample, axis=0)
+    return {
+        "compared_scans": len(sample),
+        "compared_iterations": round(float(own), 2),
+        "constant_velocity_iterations": round(float(steady), 2),
+        "saved_ms_per_scan": round(1e3 * float(saved), 2),
+    }
+
+
+def _rounded(values: NDArray[np.float64], digits: int) -> list[float]:
+    return [round(float(v), digits) for v in values]

@@ -1,0 +1,164 @@
+"""Times for the points of a recording: its own field, what is stated, or a clock that the agreement of scans decides on."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+
+from lslam.core.config import Config
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.errors import InputError
+from lslam.core.kernels import jit
+from lslam.core.machine import one_at_a_time
+from lslam.core.types.scan import Scan
+from lslam.core.types.sequence import Sequence, SequenceView, StatedTimes, select
+from lslam.odometry import create_odometry
+from lslam.odometry.frontend.clock_agreement import FEWEST_SCANS
+from lslam.odometry.frontend.clock_changes import later_choices
+from lslam.odometry.frontend.clock_choice import ClockChoice, choose_clock
+from lslam.registration.preprocessing.clock_proposals import (
+    Proposal,
+    azimuth_proposal,
+    columns_clock,
+    order_clock,
+    propose_clock,
+)
+from lslam.registration.preprocessing.merged_lidars import MergedLidars
+from lslam.registration.preprocessing.sweep_clock import SweepClock
+from lslam.registration.preprocessing.views import Clocked
+
+log = logging.getLogger("lslam")
+
+# Scans that propose a clock, spread over the recording.
+_SAMPLES = 5
+
+
+def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated_only: bool = False) -> Sequence:
+    """The sequence with the times of its points where no field has them; what was decided is among its notes.
+
+    is_stated_only : no scan is registered, so nothing is found out
+
+    A sequence with times, one that is motion compensated and one whose points no clock fits come back as they are. The
+    recording decides, whatever part of it is used. Raises InputError when what is stated does not fit the scans.
+    """
+    stated = getattr(sequence, "stated_times", StatedTimes())
+    if getattr(sequence, "further_lidars", ()):
+        # The order and the azimuths of points of several LiDARs tell nothing; their reader said which have no times.
+        if stated.kind not in (None, "field"):
+            raise InputError(f"{sequence.path}: point_times = {stated.kind!r} is of one LiDAR, and several are merged")
+        return sequence
+    is_merged = isinstance(
+        sequence, MergedLidars
+    )  # their points follow one another: no order, and no azimuth of one sensor
+    if stated.kind is None and (sequence.motion_compensated or is_stated_only or is_merged):
+        return sequence
+    if stated.kind == "none":
+        return _with(sequence, ClockChoice(None, "stated", "point times: none, as stated"))
+    scans = _samples(sequence)
+    if not scans:
+        return sequence  # nothing can be read, which is said in its turn
+    # A message without times, as the first may be, is read by itself.
+    has_times = 2 * sum(scan.times is not None for scan in scans) > len(scans)
+    if stated.kind == "field" and not has_times:
+        raise InputError(f"{sequence.path}: point_times = 'field', and the points have no time field that can be read")
+    if stated.kind == "field" or (stated.kind is None and has_times):
+        return sequence
+    nominal = SweepClock("order", 1 / sequence.rate_hz, stated.reference == "end")
+    if stated.kind is not None:
+        return _with(sequence, _as_stated(sequence, scans, stated.kind, nominal, preprocess))
+    if len(sequence) < FEWEST_SCANS:
+        return sequence
+    choice = _by_agreement(sequence, scans, nominal, preprocess)
+    return sequence if choice is None else _with(sequence, choice)
+
+
+def _by_agreement(
+    sequence: Sequence, scans: list[Scan], nominal: SweepClock, preprocess: PreprocessConfig
+) -> ClockChoice | None:
+    """What the order of points proposes and the agreement of scans decides, again where it no longer fits.
+
+    None where nothing is proposed.
+    """
+    rows = getattr(sequence, "rows", None)
+
+    def decide(first: int) -> ClockChoice:
+        part = select(sequence, first)
+        samples = _samples(part) if first else scans
+        proposal = propose_clock(samples, nominal, rows)
+        if proposal is None:
+            return ClockChoice(None, "unknown", "point times: none, the sensor makes no full turns")
+        return _decided(part, proposal, samples[0], preprocess)
+
+    choice = decide(0)
+    if choice.clock is None:
+        return None if choice.verdict == "unknown" else choice
+    return replace(choice, later=tuple(later_choices(sequence, choice.clock, decide, preprocess)))
+
+
+def _decided(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
+    """As `choose_clock`, with the kernels compiled before."""
+    with jit.announced(log):
+        # Other processes wait while this one compiles, not while it registers.
+        with one_at_a_time(jit.lock_file(), "compiles kernels"):
+            create_odometry(Config()).warm_up()
+        return choose_clock(sequence, proposal, sample, preprocess)
+
+
+def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
+    """The sequence with the clock of the choice, which the manifest finds as `clock_choice`."""
+    again = [f"from scan {first} on the clock no longer fits: {later.sentence}" for first, later in choice.later]
+    notes = [*sequence.notes, choice.sentence, *again]
+    if choice.verdict == "compensated" and sequence.motion_compensated is None:
+        return SequenceView(sequence, notes=notes, clock_choice=choice, motion_compensated=True)
+    if choice.clock is None and choice.verdict != "stated":
+        return SequenceView(sequence, notes=notes, clock_choice=choice)
+    clocks = [(first, later.clock) for first, later in choice.later]
+    return Clocked(sequence, choice.clock, clocks, notes=notes, clock_choice=choice)
+
+
+def _as_stated(
+    sequence: Sequence, scans: list[Scan], kind: str, nominal: SweepClock, preprocess: PreprocessConfig
+) -> ClockChoice:
+    """The clock that is stated. Raises InputError where the scans do not have it."""
+    clock: SweepClock | None
+    if kind == "columns":
+        clock = columns_clock(scans, nominal, getattr(sequence, "rows", None))
+        if clock is None:
+            raise InputError(
+                f"{sequence.path}: point_times = 'columns', and the clouds are not organised in rows of equal length: state "
+                "rows and cols, or point_times = 'order' or 'azimuth'"
+            )
+    elif kind == "order":
+        clock = order_clock(scans, nominal) or nominal
+    else:
+        proposal = azimuth_proposal(scans, nominal)
+        clock = proposal.clock
+        if proposal.is_guess:
+            choice = _decided(sequence, proposal, scans[0], preprocess)
+            if choice.clock is None:
+                raise InputError(
+                    f"{sequence.path}: point_times = 'azimuth', and neither the order of the points nor the agreement of "
+                    f"scans tells in which sense the sensor turns and where it begins ({choice.sentence})"
+                )
+            return choice
+    return ClockChoice(clock, "stated", f"point times: by {clock}, as stated")
+
+
+def _samples(sequence: Sequence) -> list[Scan]:
+    """Some scans with points, from the first on; the first alone where it has times."""
+    scans: list[Scan] = []
+    last = len(sequence) - 1
+    for index in sorted({*range(min(10, last + 1)), *np.linspace(0, last, _SAMPLES).astype(int).tolist()}):
+        if len(scans) > 1 and index < 10:
+            continue
+        try:
+            scan = sequence.scan(index)
+        except InputError:
+            continue
+        if len(scan):
+            scans.append(scan)
+        if scans and scans[0].times is not None:
+            break
+    return scans

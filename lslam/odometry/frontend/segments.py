@@ -1,0 +1,165 @@
+"""A run that never stops: where the local map holds no more, the scans begin another, a segment of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.state import State
+from lslam.odometry.base import Deskewing, Odometry
+from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
+from lslam.registration.robust import UsualAgreement
+
+Floats = NDArray[np.float64]
+# Begins an empty map: the tracker of a scan that is expected at a pose (4, 4).
+Begin = Callable[[Floats], Tracker]
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """A scan with its result; sweep, middle : of the tracker, as of this scan.
+
+    is_two_sided : later scans told the motion within the sweep as well
+    """
+
+    loaded: Loaded
+    result: ScanResult
+    sweep: MotionPrior
+    middle: tuple[int, Floats]
+    is_two_sided: bool = False
+
+    def moved(self, T: Floats) -> Tracked:
+        """In the world that `T` (4, 4) leads to."""
+        instant_ns, middle = self.middle
+        sweep = replace(self.sweep, poses=T @ self.sweep.poses)
+        return replace(self, result=self.result.moved(T), sweep=sweep, middle=(instant_ns, T @ middle))
+
+    def at(self, pose: Floats) -> Tracked:
+        """With the scan at another pose (4, 4)."""
+        return self.moved(pose @ se3.inverse(self.result.T_world_lidar))
+
+
+class SegmentTracker:
+    """Tracks the scans of a run, each segment of them in a local map of its own.
+
+    A scan that is not registered is a bad one, or the map ends before it. Both hypotheses are followed: a second tracker begins
+    an empty map with the scan. Where the first registers a scan again, and as many of its points agree with the old map as with
+    the new one, the map holds, and the scans since were bad ones. Where they do not, or where the second registers more scans in
+    a row than initialise a map, the scans since are a new segment. Scans that agree far less than those before do not count.
+
+    begin : None for a method that has one map only; initial_scans : that initialise a map
+    """
+
+    def __init__(self, tracker: Tracker, begin: Begin | None = None, initial_scans: int = 5) -> None:
+        self._tracker, self._begin, self.initial_scans = tracker, begin, initial_scans
+        self._segment = 0
+        # What scans agreed with their maps: by less than a share of that, scans of nothing agree as well.
+        self._usual = UsualAgreement(RegistrationConfig().min_agreement)
+        # The hypothesis of a new map, and the scans since, as each of the two has them.
+        self._other: Tracker | None = None
+        self._open: list[tuple[Tracked, Tracked]] = []
+
+    @property
+    def odometry(self) -> Odometry:
+        """The method with the map of the present segment."""
+        return self._tracker.odometry
+
+    @property
+    def middle(self) -> tuple[int, Floats]:
+        """Instant, ns, and pose of the middle of the newest sweep."""
+        return self._tracker.middle
+
+    @property
+    def has_middles(self) -> bool:
+        """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
+        return isinstance(self.odometry, Deskewing) and isinstance(self._tracker.motion, ConstantVelocity)
+
+    @property
+    def begin(self) -> Begin | None:
+        """Begins an empty map; None for a method that has one map only."""
+        return self._begin
+
+    @property
+    def present(self) -> Tracker:
+        """The tracker of the present segment."""
+        return self._tracker
+
+    def decide(self, loaded: Loaded, result: ScanResult) -> list[Tracked]:
+        """The scans that are decided with the next one, in order: none while two hypotheses are open.
+
+        result : of the present tracker
+        """
+        first = self._tracked(self._tracker, loaded, result, self._segment)
+        other = None if self._other is None else self._tried(self._other, loaded)
+        is_held = first.result.status == "ok"
+        if is_held:
+            self._usual.observe(_share(first.result))
+        is_new = other is not None and other.result.status == "ok" and not self._usual.is_collapse(_share(other.result))
+        if other is not None and is_new:
+            self._open.append((first, other))
+            if is_held and not _is_less(first.result, other.result):
+                return self.finish()
+            return self._new_segment() if is_held or len(self._open) > self.initial_scans else []
+        decided = self.finish()
+        if is_held or self._begin is None or loaded.scan is None:
+            return [*decided, first]
+        self._other = self._begin(first.result.T_world_lidar)
+        other = self._tried(self._other, loaded)
+        self._open = [(first, other)]
+        return decided if other.result.status == "ok" else [*decided, *self.finish()]
+
+    def finish(self) -> list[Tracked]:
+        """The scans that are open, as the first hypothesis has them."""
+        bridged = [first for first, _ in self._open]
+        self._other, self._open = None, []
+        return bridged
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing waits for the next scan, so that `state` is complete."""
+        return self._other is None and self._tracker.is_settled
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        return {**self._tracker.state(), "segment": self._segment, "usual": self._usual.usual}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        self._tracker.restore(state)
+        self._segment, self._usual.usual = int(state["segment"]), float(state["usual"])
+        self._other, self._open = None, []
+
+    def _new_segment(self) -> list[Tracked]:
+        assert self._other is not None
+        registered = [other for _, other in self._open]
+        # The motion model is known to others by its first object.
+        motion = self._tracker.motion
+        motion.restore(self._other.motion.state())
+        self._other.motion = motion
+        self._tracker, self._other, self._open = self._other, None, []
+        self._segment += 1
+        return registered
+
+    def _tried(self, other: Tracker, loaded: Loaded) -> Tracked:
+        return self._tracked(other, loaded, other.track(loaded), self._segment + 1)
+
+    @staticmethod
+    def _tracked(tracker: Tracker, loaded: Loaded, result: ScanResult, segment: int) -> Tracked:
+        return Tracked(loaded, replace(result, segment=segment), tracker.sweep, tracker.middle)
+
+
+def _is_less(result: ScanResult, other: ScanResult) -> bool:
+    """Whether so many fewer of a scan's points agree with a map than with the other that it may lie in the wrong place."""
+    return _share(result) < UsualAgreement.LESS * _share(other)
+
+
+def _share(result: ScanResult) -> float:
+    return result.inliers / max(result.source_points, 1)

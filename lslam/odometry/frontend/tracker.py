@@ -1,0 +1,292 @@
+"""Predict, register, correct: the loop between motion prior and odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import ImuDiagnostics
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import LEVER_M, Scan, Span
+from lslam.core.types.scan_result import ScanResult, Status
+from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.state import State
+from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.frontend import joint
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
+from lslam.odometry.sanity import fault, plausible
+from lslam.odometry.stationary import StationaryDetector
+from lslam.registration.solver import RegistrationResult
+
+# Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
+# between the prior and the first.
+SAME = 0.3
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """One scan as the background thread leaves it; `error` : why it is unreadable, and `status` : what its result has then."""
+
+    index: int
+    stamp_ns: int
+    scan: Scan | None = None
+    prepared: Any = None
+    error: str = ""
+    read_s: float = 0.0
+    prepare_s: float = 0.0
+    status: Status = "skipped"
+
+
+class Tracker:
+    """Poses of scans, one after the other.
+
+    sweep : motion of the sensor within the last scan, as used by its registration
+    middle : instant, ns, and pose of the middle of the last sweep, where registration is most accurate
+    """
+
+    # A change of the motion within the sweep that moves no point by more is not worth a second registration.
+    REFINE_M = 0.01
+
+    def __init__(
+        self, odometry: Odometry, stationary: StationaryDetector | None = None, motion: MotionModel | None = None
+    ) -> None:
+        self.odometry, self.stationary = odometry, stationary
+        self.motion: MotionModel = ConstantVelocity() if motion is None else motion
+        self.sweep = MotionPrior.at_once(np.eye(4))
+        self.middle = (0, np.eye(4))
+        # The newest accepted result.
+        self._last: ScanResult | None = None
+        # The first scan, until a second one tells how fast it was taken.
+        self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
+
+    def track(self, loaded: Loaded) -> ScanResult:
+        """Pose of the next scan."""
+        scan, odometry, motion, clock = loaded.scan, self.odometry, self.motion, StageClock()
+        standing = self._standing(scan, clock)
+        if standing is not None:
+            self._keep(standing)
+            return replace(standing, stages=clock.seconds)
+        span = Span() if scan is None else scan.span
+        with clock.stage("imu"):
+            prior = expected = motion.sweep(loaded.stamp_ns, span)
+        steady = None if motion.coasting is None else motion.coasting.predict(loaded.stamp_ns)
+        trial = None
+        if scan is None:
+            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
+        elif isinstance(odometry, Deskewing):
+            if motion.coasting is not None and motion.is_compared(loaded.stamp_ns, span):
+                # For comparison alone: the map and the motion model are not updated.
+                without = motion.coasting.sweep(scan.stamp_ns, span)
+                trial = odometry.register(scan, loaded.prepared, without)
+                trial, _ = self._refined(odometry, scan, loaded.prepared, without, trial, motion.coasting)
+            is_first_open = self._first is not None or not motion.is_known
+            # While the motion is unknown the clouds of several LiDARs do not fit each other: one of them tells it.
+            alone = scan.of_leading() if is_first_open else None
+            cloud, prepared = (scan, loaded.prepared) if alone is None else (alone, odometry.prepare(alone))
+            located = odometry.register(cloud, prepared, prior)
+            located, prior = self._refined(odometry, cloud, prepared, prior, located, motion, clock)
+            if is_first_open and located.is_accepted and scan.span.seconds > 0:
+                if self._first is None:
+                    self._first = (scan, loaded.prepared, located.T_world_lidar)
+                else:
+                    prior = expected = self._begin_again(odometry, *self._first, scan, located)
+                    located = odometry.register(scan, loaded.prepared, prior)
+                    prior = located.sweep or prior
+            located, prior = self._fused(odometry, scan, loaded.prepared, located, prior, expected, clock)
+            result = odometry.update(scan, prior, located)
+        else:
+            result = plausible(odometry.register(scan, loaded.prepared, prior), prior.pose, self._last)
+        self._correct(result, prior, clock)
+        if self.stationary is not None and scan is not None:
+            with clock.stage("standing"):
+                self.stationary.observe(scan, result)
+        self._keep(result)
+        return self._recorded(result, expected, steady, trial, clock)
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing waits for the next scan, so that `state` is complete."""
+        return self._first is None
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; of a method that is not `Resumable`, only what is around it."""
+        return {
+            "odometry": self.odometry.state() if isinstance(self.odometry, Resumable) else None,
+            "motion": self.motion.state(),
+            "stationary": None if self.stationary is None else self.stationary.state(),
+            "middle": self.middle,
+            "last": self._last,
+        }
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        if isinstance(self.odometry, Resumable) and state["odometry"] is not None:
+            self.odometry.restore(state["odometry"])
+        self.motion.restore(state["motion"])
+        if self.stationary is not None:
+            self.stationary.restore(state["stationary"])
+        self.middle, self._last = state["middle"], state["last"]
+
+    def _standing(self, scan: Scan | None, clock: StageClock) -> ScanResult | None:
+        """The result of a scan taken while the sensor stood; None where it has moved."""
+        if scan is None or self.stationary is None:
+            return None
+        with clock.stage("standing"):
+            result = self.stationary.result_of(scan)
+        if result is not None:
+            self.motion.correct(result.stamp_ns, result.T_world_lidar)
+            self.sweep = MotionPrior.at_once(result.T_world_lidar)
+        return result
+
+    def _keep(self, result: ScanResult) -> None:
+        if self.motion.is_known:
+            self._first = None
+        if result.status == "ok":
+            self._last = result
+
+    def _fused(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, located: RegistrationResult, prior: MotionPrior,
+        expected: MotionPrior, clock: StageClock,
+    ) -> tuple[RegistrationResult, MotionPrior]:  # fmt: skip
+        """The registration fused with the IMU, or one near the prediction `expected`, and the motion within the sweep."""
+        fused = self._checked(odometry, scan.stamp_ns, located, prior, expected, clock)
+        if fused.is_accepted or not self.motion.is_inertial or not odometry.is_searching:
+            return fused, prior
+        near = self._near(odometry, scan, prepared, expected, located, fused, clock)
+        return near, expected if near.sweep is None else near.sweep
+
+    def _checked(
+        self, odometry: Deskewing, stamp_ns: int, located: RegistrationResult, prior: MotionPrior,
+        expected: MotionPrior | None, clock: StageClock,
+    ) -> RegistrationResult:  # fmt: skip
+        """The registration fused with the IMU; rejected where no vehicle gets to its pose from the last one."""
+        with clock.stage("imu"):
+            fused = joint.fuse(odometry, self.motion, stamp_ns, located, prior)
+        if expected is None or not fused.is_accepted:
+            return fused
+        reason = fault(fused.T_world_lidar, stamp_ns, self._last)
+        return fused.rejected(reason, expected.pose.copy(), None) if reason else fused
+
+    def _correct(self, result: ScanResult, prior: MotionPrior, clock: StageClock) -> None:
+        """Update the motion model and the motion within the sweep."""
+        pose, is_ok = result.T_world_lidar, result.status == "ok"
+        is_blind = is_ok and not isinstance(self.odometry, Deskewing)
+        with clock.stage("imu"):
+            self.sweep = self.motion.refine(prior, result.stamp_ns, pose) if is_blind else prior
+            self.motion.correct(result.stamp_ns, pose, prior, is_ok)
+            joint.settle(self.odometry, self.motion)
+        middle, instant_ns = middle_of(prior, result.stamp_ns, pose)
+        self.middle = (instant_ns, middle)
+
+    def _recorded(
+        self, result: ScanResult, expected: MotionPrior, steady: NDArray[np.float64] | None,
+        trial: RegistrationResult | None, clock: StageClock,
+    ) -> ScanResult:  # fmt: skip
+        """The result beside its predictions, and beside what registration from constant velocity took.
+
+        The map's update is no part of either.
+        """
+        pose, is_ok = result.T_world_lidar, result.status == "ok"
+        own = {
+            name: seconds
+            for name, seconds in clock.seconds.items()
+            if name != "imu" or self.motion.coasting is not None
+        }
+        imu = ImuDiagnostics(
+            self.motion.imu_state(), self.motion.gravity_at(pose) if is_ok else None,
+            None if steady is None else _matrix_norm(steady, pose),
+        )  # fmt: skip
+        stages = {**result.stages, **own}
+        if trial is not None and trial.is_accepted and result.status != "bridged":
+            taken = sum(seconds for name, seconds in stages.items() if name not in ("update", "standing"))
+            saved_s = sum(trial.stages.values()) - taken
+            imu = replace(imu, steady_iterations=trial.iterations, saved_s=saved_s)
+        return replace(result, prior_norm=_matrix_norm(expected.pose, pose), imu=imu, stages=stages)
+
+    def _refined(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, located: RegistrationResult,
+        motion: MotionModel | None = None, clock: StageClock | None = None,
+    ) -> tuple[RegistrationResult, MotionPrior]:  # fmt: skip
+        """Registered again with the motion within the sweep that follows from the pose; also the motion of the final deskewing.
+
+        motion : refines the prior by the registered pose; None: no second registration
+        clock : measures the time of `motion`
+        """
+        if located.sweep is not None:
+            return located, located.sweep
+        if motion is None or not motion.is_known or not located.ok or scan.span.seconds <= 0:
+            return located, prior
+        with (clock or StageClock()).stage("imu"):
+            better = motion.refine(prior, scan.stamp_ns, located.T_world_lidar)
+        if _distance(prior, better) <= self.REFINE_M:
+            return located, prior
+        return _both(located, odometry.register(scan, prepared, better)), better
+
+    def _near(
+        self, odometry: Deskewing, scan: Scan, prepared: Any, expected: MotionPrior, located: RegistrationResult,
+        rejected: RegistrationResult, clock: StageClock,
+    ) -> RegistrationResult:  # fmt: skip
+        """Register again near the IMU's prediction, after a registration that failed or that the IMU rejected.
+
+        With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
+        accepted against the IMU.
+        """
+        near = odometry.register(scan, prepared, expected, is_near=True)
+        fused = self._checked(odometry, scan.stamp_ns, near, expected, None, clock)
+        if fused.is_accepted:
+            return _both(located, fused)
+        apart, off = (_apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
+        chosen = located if near.ok and apart < SAME * off else rejected
+        # Where nothing is found near by, the first registration enters with the points as they are seen from there.
+        base = near
+        if not near.ok:
+            own = replace(located, points=near.points, sweep=near.sweep)
+            base = replace(own, iterations=near.iterations, stages=near.stages)
+        moved = base.moved(chosen.T_world_lidar, chosen.covariance)
+        is_rejected = base.ok and not chosen.is_accepted
+        moved = replace(moved, is_rejected=is_rejected, reason=chosen.reason, converged=chosen.converged)
+        return _both(located, moved)
+
+    def _begin_again(
+        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], second: Scan,
+        located: RegistrationResult,
+    ) -> MotionPrior:  # fmt: skip
+        """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
+
+        The prior of the second scan, whose registration told the speed.
+        """
+        self.motion.correct(second.stamp_ns, located.T_world_lidar)
+        again = self.motion.sweep(second.stamp_ns, second.span)
+        prior = self.motion.rewind(first.stamp_ns, pose, first.span)
+        odometry.restart()
+        odometry.update(first, prior, odometry.register(first, prepared, prior))
+        return again
+
+
+def _both(first: RegistrationResult, second: RegistrationResult) -> RegistrationResult:
+    """The second registration of a scan, with the iterations and times of both."""
+    stages = {name: first.stages.get(name, 0.0) + second.stages.get(name, 0.0) for name in first.stages | second.stages}
+    return replace(second, iterations=first.iterations + second.iterations, stages=stages)
+
+
+def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float:
+    """Error of the motion prior, (4, 4), against registration: the largest singular value of inv(prior) pose - I.
+
+    Girolimetto, equation 5.1.
+    """
+    return float(np.linalg.norm(se3.relative(prior, pose) - np.eye(4), 2))
+
+
+def _distance(before: MotionPrior, after: MotionPrior) -> float:
+    """How far the motion from a sweep's start to its end differs, m, at a lever arm of `LEVER_M`."""
+    return _apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
+
+
+def _apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """How far two poses (4, 4) are apart, m, at a lever arm of `LEVER_M`."""
+    change = se3.relative(a, b)
+    return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))

@@ -1,0 +1,223 @@
+"""Windows of scans, tracked again along the course that they tell where constant velocity displaces their points."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Iterator
+from copy import deepcopy
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import se3
+from lslam.core.types.state import State
+from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.frontend.look_back import first_pose
+from lslam.odometry.frontend.segments import SegmentTracker, Tracked
+from lslam.odometry.frontend.tracker import Loaded
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity
+from lslam.odometry.inertial.course import NEIGHBOURS, Course
+from lslam.odometry.integrity.monitor import IntegrityMonitor
+
+Floats = NDArray[np.float64]
+
+# Scans: two seconds, which are held in memory.
+WINDOW = 20
+
+
+class WindowTracker:
+    """Tracks scans window by window where their method follows a course and their sweeps take time, and others as they come.
+
+    A window is tracked with constant velocity first. Where its points are displaced by more than their noise, it is tracked
+    again from where it began, along the course through the middles of its sweeps, as long as more points agree. A run goes on
+    from where a window began.
+
+    The first scans of a run are a window whatever the method: with it the pose of the first is known, as in `first_pose`.
+
+    monitor : sees the scans that are decided; noise_m : of a point
+    """
+
+    def __init__(self, tracker: SegmentTracker, monitor: IntegrityMonitor | None, noise_m: float) -> None:
+        self._tracker, self._monitor, self._noise_m = tracker, monitor, noise_m
+        self.is_windowed = (
+            tracker.odometry.follows_course
+            and isinstance(tracker.odometry, Resumable)
+            and isinstance(tracker.present.motion, ConstantVelocity)
+        )
+        # Of the open window, None: the end of the recording.
+        self._scans: list[Loaded | None] = []
+        self._decided: list[Tracked] = []
+        self._start: State = {}
+        # Instants, ns, and poses of the last middles before the window.
+        self._before: list[tuple[int, Floats]] = []
+        # The tracker's world in that of the first pose as later scans tell it; None until they do.
+        self._world: Floats | None = None if self._is_looking_back else np.eye(4)
+
+    @property
+    def middle(self) -> tuple[int, Floats]:
+        """Instant, ns, and pose of the middle of the newest sweep."""
+        instant_ns, pose = self._tracker.middle
+        return instant_ns, pose if self._world is None else self._world @ pose
+
+    @property
+    def _is_looking_back(self) -> bool:
+        """Whether the first scans can be registered again on a map of later ones."""
+        tracker = self._tracker
+        return tracker.begin is not None and tracker.initial_scans > 1 and isinstance(tracker.odometry, Resumable)
+
+    @property
+    def odometry(self) -> Odometry:
+        """The method with the map of the present segment."""
+        return self._tracker.odometry
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether `state` is complete."""
+        return bool(self._scans) or self._tracker.is_settled
+
+    def decided(self, ahead: Iterable[Loaded | None]) -> Iterator[list[Tracked]]:
+        """With each of the scans to come, None at the end, those that are decided: one, none, or all of a window."""
+        for loaded in ahead:
+            if not self._scans and not self._is_begin(loaded):
+                yield self._moved(self._track(loaded))
+                continue
+            if not self._scans:
+                self._start = deepcopy(self._tracker.state())
+            self._scans.append(loaded)
+            self._decided += self._track(loaded)
+            is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
+            yield self._close() if is_full or loaded is None else []
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        state = self._start if self._scans else self._tracker.state()
+        monitor = None if self._monitor is None else self._monitor.state()
+        return {**state, "before": self._before, "world": self._world, "monitor": monitor}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        self._tracker.restore(state)
+        self._before, self._world = list(state["before"]), state["world"]
+        if self._monitor is not None:
+            self._monitor.restore(state["monitor"])
+
+    def _is_begin(self, loaded: Loaded | None) -> bool:
+        """Whether a window begins with the scan."""
+        scan = None if loaded is None else loaded.scan
+        if scan is None or not self._tracker.is_settled:
+            return False
+        return self._world is None or (self.is_windowed and scan.span.seconds > 0)
+
+    def _track(self, loaded: Loaded | None) -> list[Tracked]:
+        # Scans that are still open at the end of the recording have their word there.
+        if loaded is None:
+            return self._tracker.finish()
+        return self._tracker.decide(loaded, self._tracker.present.track(loaded))
+
+    def _close(self) -> list[Tracked]:
+        """The scans of the window, the first of a run where the later ones put it."""
+        is_bent = self.is_windowed and self._follow_course()
+        out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
+        self._before = self._middles()[-NEIGHBOURS:]
+        if self._world is None:
+            out = self._look_back(out)
+        self._scans, self._decided = [], []
+        return self._moved(out)
+
+    def _follow_course(self) -> bool:
+        """Track the window along its course where it bends and more points agree along it in most scans; whether it does."""
+        is_bent, is_better, passes = self._is_bent(), True, 0
+        # The first course is told by scans that constant velocity deskewed.
+        while is_bent and is_better:
+            before, passes = self._inliers(), passes + 1
+            self._track_again(self._course())
+            is_whole = self._is_whole() and (self._tracker.is_settled or self._scans[-1] is None)
+            is_better = is_whole and _is_more(self._inliers(), before)
+            is_bent = is_better or (is_whole and passes > 1)
+            if not is_bent:
+                self._track_again(None)
+        self._set_course(None)
+        return is_bent
+
+    def _look_back(self, decided: list[Tracked]) -> list[Tracked]:
+        """The first scan on the map of the later ones, in the tracker's world, which turns with its pose."""
+        begin, first, began = self._tracker.begin, decided[0], time.perf_counter()
+        assert begin is not None
+
+        def create() -> Deskewing:
+            odometry = begin(np.eye(4)).odometry
+            assert isinstance(odometry, Deskewing)
+            return odometry
+
+        pose = first_pose(decided, self._tracker.initial_scans, create)
+        self._world = se3.normalise(first.result.T_world_lidar @ se3.inverse(pose))
+        stages = _sum(first.result.stages, {"register": time.perf_counter() - began})
+        return [replace(first, result=replace(first.result, stages=stages)).at(pose), *decided[1:]]
+
+    def _moved(self, decided: list[Tracked]) -> list[Tracked]:
+        """In the world of the first pose."""
+        world = self._world
+        return decided if world is None else [tracked.moved(world) for tracked in decided]
+
+    def _inliers(self) -> list[int]:
+        return [tracked.result.inliers for tracked in self._decided]
+
+    def _middles(self) -> list[tuple[int, Floats]]:
+        """Instants and poses of the middles of registered sweeps, up to the end of the window."""
+        now = [t.middle for t in self._decided if t.result.status == "ok" and not t.result.is_repeated]
+        return [*self._before, *now]
+
+    def _course(self) -> Course:
+        instants, poses = zip(*self._middles(), strict=True)
+        return Course(np.array(instants, np.int64), np.stack(poses))
+
+    def _track_again(self, course: Course | None) -> None:
+        earlier = [tracked.result for tracked in self._decided]
+        self._tracker.restore(deepcopy(self._start))
+        self._set_course(course)
+        self._decided = [tracked for loaded in self._scans for tracked in self._track(loaded)]
+        for k, (tracked, before) in enumerate(zip(self._decided, earlier, strict=False)):
+            now = tracked.result
+            work = replace(now, stages=_sum(now.stages, before.stages), iterations=now.iterations + before.iterations)
+            self._decided[k] = replace(tracked, result=work)
+
+    def _set_course(self, course: Course | None) -> None:
+        motion = self._tracker.present.motion
+        assert isinstance(motion, ConstantVelocity)
+        motion.course = course
+
+    def _is_whole(self) -> bool:
+        return len({tracked.result.segment for tracked in self._decided}) == 1
+
+    def _is_bent(self) -> bool:
+        """Whether the window's course, in one segment, displaces the points of most sweeps by more than their noise."""
+        if not self._is_whole() or len(self._middles()) < 2 * NEIGHBOURS:
+            return False
+        course = self._course()
+        squares = [square for t in self._decided if (square := _displacement2(t, course)) is not None]
+        return len(squares) > 0 and float(np.median(squares)) > self._noise_m**2
+
+
+def _displacement2(tracked: Tracked, course: Course) -> float | None:
+    """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is unknown."""
+    poses = course.at(tracked.result.stamp_ns, tracked.sweep.times)
+    if poses is None:
+        return None
+    middle, source = len(poses) // 2, tracked.loaded.prepared.source
+    within, course_within = (se3.relative(sweep[middle], sweep) for sweep in (tracked.sweep.poses, poses))
+    change = (se3.relative(within, course_within) - np.eye(4))[:, :3]
+    points = np.column_stack([source, np.ones(len(source))])
+    moments = np.einsum("na,nb->ab", points, points) / max(len(points), 1)
+    return float(np.einsum("kia,ab,kib->k", change, moments, change).mean())
+
+
+def _is_more(ours: list[int], others: list[int]) -> bool:
+    """Whether more scans have more inliers than have less, at two sigma: points of one scan agree or do not together."""
+    won, lost = (sum(sign * (a - b) > 0 for a, b in zip(ours, others, strict=True)) for sign in (1, -1))
+    return won - lost > 2 * math.sqrt(won + lost)
+
+
+def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:
+    return {name: a.get(name, 0.0) + b.get(name, 0.0) for name in a | b}

@@ -1,0 +1,210 @@
+"""Constant velocity: the motion prior of a method that has no IMU, and the motion within a sweep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import se3
+from lslam.core.types.imu import GravityDirection, ImuState
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Span
+from lslam.core.types.state import State, Stateful
+from lslam.odometry.inertial.course import Course, motion_covariance
+from lslam.registration.preprocessing.deskew import knots_over
+from lslam.registration.solver import RegistrationResult
+
+Floats = NDArray[np.float64]
+
+
+class MotionModel(Protocol):
+    """Predicts the pose of a scan and the motion within it, and is corrected by registration.
+
+    Methods with a body here are defaults for a model without a sensor.
+    """
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a velocity yet."""
+        ...
+
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        ...
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The sweep's motion, refined by the registered `pose` (4, 4) at the stamp for `prior`."""
+        ...
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Update with the pose (4, 4) found at `stamp_ns`; `prior` is the motion of its sweep."""
+        ...
+
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
+        ...
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        ...
+
+    @property
+    def coasting(self) -> ConstantVelocity | None:
+        """Constant velocity, where the model takes its place and is compared with it."""
+        return None
+
+    @property
+    def is_inertial(self) -> bool:
+        """Whether an inertial sensor predicted the newest sweep: a denied or lost scan is searched near there."""
+        return False
+
+    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+        """Whether the scan to come is to be registered from `coasting` as well."""
+        return False
+
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
+        """A registration from `prior` fused with the sensor's prediction."""
+        return result
+
+    def gravity_at(self, pose: Floats) -> GravityDirection | None:
+        """Direction of gravity for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where unknown."""
+        return None
+
+    def imu_state(self) -> ImuState | None:
+        """What is known of the sensor's errors as of the last scan; None without one."""
+        return None
+
+
+class ConstantVelocity(Stateful, MotionModel):
+    """Predicts the next pose from the last two, scaled to the time between scans.
+
+    Registration is most accurate at the middle of a sweep: an error of the deskewing velocity has opposite signs at start and
+    end. So velocities are measured from middle to middle.
+
+    A registration error of decimetres is a velocity error of metres per second: the change of velocity is bounded by the
+    largest plausible acceleration.
+
+    pose : (4, 4) expected of the first scan, the identity when None
+    """
+
+    # Bound of extrapolation, in last steps: the speed after a longer pause is unknown.
+    MAX_STRETCH = 5.0
+    # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
+    MAX_ACCELERATION = 20.0
+    STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_seen")
+
+    def __init__(self, pose: Floats | None = None) -> None:
+        self._instant_ns: int | None = None
+        self._pose = np.eye(4) if pose is None else pose
+        self._twist = np.zeros(6)
+        self._step_s = 0.0
+        # Velocity (6,) between the last two poses, m/s and rad/s.
+        self._seen: Floats | None = None
+        # The newest prediction and its stamp, ns: several ask for the same one.
+        self._predicted: tuple[int, Floats] | None = None
+        # Tells the motion of the sweeps that it knows instead.
+        self.course: Course | None = None
+
+    def predict(self, stamp_ns: int) -> Floats:
+        """(4, 4) T_world_lidar expected at `stamp_ns`; that of the first scan before it."""
+        if self._instant_ns is None or self._step_s <= 0:
+            return self._pose.copy()
+        if self._predicted is None or self._predicted[0] != stamp_ns:
+            stretch = min(max((stamp_ns - self._instant_ns) * 1e-9 / self._step_s, 0.0), self.MAX_STRETCH)
+            self._predicted = stamp_ns, se3.normalise(self._pose @ se3.exp(stretch * self._twist))
+        return self._predicted[1].copy()
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a velocity yet."""
+        return self._step_s > 0 or self.course is not None
+
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        knots = knots_over(span)
+        poses = None if self.course is None else self.course.at(stamp_ns, knots)
+        if poses is None:
+            return self.steady(self.predict(stamp_ns), span)
+        sweep = MotionPrior(knots, poses, change=motion_covariance())
+        if self._instant_ns is None:  # the world begins where the first scan is expected
+            sweep = replace(sweep, poses=self._pose @ se3.relative(sweep.pose, poses))
+        return sweep
+
+    def steady(self, pose: Floats, span: Span) -> MotionPrior:
+        """As `sweep`, through the `pose` (4, 4) at the stamp."""
+        if span.seconds <= 0 or self._step_s <= 0:
+            return MotionPrior.at_once(pose)
+        return _steady(pose, self._twist / self._step_s, knots_over(span))
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`.
+
+        Continuing the change of velocity as well was tried: it amplifies jitter more than it follows bends.
+        """
+        if prior.change is not None:
+            return prior
+        middle, instant_ns = middle_of(prior, stamp_ns, pose)
+        step = 0.0 if self._instant_ns is None else (instant_ns - self._instant_ns) * 1e-9
+        if len(prior.times) < 2 or step <= 0:
+            return prior
+        velocity = se3.log(se3.relative(self._pose, middle)) / step
+        return _steady(middle @ se3.exp(-prior.times[len(prior.times) // 2] * velocity), velocity, prior.times)
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
+
+        A pose without a registration (`is_registered`) is used alike.
+        """
+        middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
+        if self._instant_ns is not None:
+            step = (instant_ns - self._instant_ns) * 1e-9
+            if step > 0:
+                self._learn(se3.log(se3.relative(self._pose, middle)) / step, step)
+        self._instant_ns, self._pose = instant_ns, middle.copy()
+        self._predicted = None
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        super().restore(state)
+        self._predicted = None
+
+    def _learn(self, velocity: Floats, step: float) -> None:
+        """Update with the velocity (6,) of a step of so many seconds, with bounded acceleration."""
+        before, self._seen = self._seen, velocity
+        if before is not None and self._step_s > 0:
+            known = self._twist / self._step_s
+            change, again = velocity[:3] - known[:3], velocity[:3] - before[:3]
+            most = self.MAX_ACCELERATION * (step + self._step_s) / 2
+            size = float(np.linalg.norm(change))
+            if size > most and np.linalg.norm(again) > most:
+                velocity = np.concatenate([known[:3] + change * most / size, velocity[3:]])
+        self._twist, self._step_s = velocity * step, step
+
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
+        prior = self.steady(pose, span)
+        self._instant_ns, self._step_s, self._seen = None, 0.0, None
+        self.correct(stamp_ns, pose, prior)
+        return prior
+
+
+def _steady(pose: Floats, velocity: Floats, times: Floats) -> MotionPrior:
+    return MotionPrior(times, se3.normalise(pose @ se3.exp(times[:, None] * velocity)))
+
+
+def middle_of(prior: MotionPrior, stamp_ns: int, pose: Floats) -> tuple[Floats, int]:
+    """Pose and instant of the middle of a sweep that had the `pose` at the stamp and moved as `prior` says."""
+    k = len(prior.times) // 2
+    within = se3.relative(prior.pose, prior.poses[k])
+    return np.asarray(pose @ within), stamp_ns + round(1e9 * float(prior.times[k]))

@@ -1,0 +1,50 @@
+"""The course of the sensor through the middles of sweeps: the motion within a sweep by the scans before and after it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import se3
+
+Floats = NDArray[np.float64]
+
+# Middles on each side of a sweep. From one to the next its influence on a natural spline falls by 3.7.
+NEIGHBOURS = 3
+# Of the motion from begin to end of a sweep.
+MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
+
+
+class Course:
+    """Natural cubic splines through the poses of middles around each sweep.
+
+    instants_ns : (N,); poses : (N, 4, 4). A middle no later than one before it, as of a sliver of a sweep, is left out.
+    """
+
+    def __init__(self, instants_ns: NDArray[np.int64], poses: Floats) -> None:
+        is_later = np.append(True, instants_ns[1:] > np.maximum.accumulate(instants_ns)[:-1])
+        self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
+
+    def at(self, stamp_ns: int, times: Floats) -> Floats | None:
+        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no middle lies within, or there are few."""
+        begin, end = stamp_ns + 1e9 * times[0], stamp_ns + 1e9 * times[-1]
+        k = int(np.argmin(np.abs(self.instants_ns - (begin + end) / 2)))
+        if len(times) < 2 or len(self.instants_ns) < NEIGHBOURS or not begin <= self.instants_ns[k] <= end:
+            return None
+        around = slice(max(k - NEIGHBOURS, 0), k + NEIGHBOURS + 1)
+        nodes = 1e-9 * (self.instants_ns[around] - stamp_ns)
+        twists = se3.log(se3.relative(self.poses[k], self.poses[around]))
+        return se3.normalise(self.poses[k] @ se3.exp(natural_spline(np.asarray(nodes), twists, times)))
+
+
+def motion_covariance() -> Floats:
+    """(6, 6) of the motion from begin to end of a sweep, m2 and rad2."""
+    return np.diag(np.repeat([MOTION_SIGMA_M, MOTION_SIGMA_RAD], 3) ** 2)
+
+
+def natural_spline(nodes: Floats, values: Floats, times: Floats) -> Floats:
+    """(K, C) cubic spline at `times` (K,) through `values` (N, C) at increasing `nodes` (N,), N > 2; beyond them straight."""
+    from scipy.interpolate import CubicSpline
+
+    spline, inside = CubicSpline(nodes, values, bc_type="natural"), np.clip(times, nodes[0], nodes[-1])
+    return np.asarray(spline(inside) + (times - inside)[:, None] * spline(inside, 1))

@@ -1,0 +1,345 @@
+"""The IMU as a motion model: an error-state Kalman filter that predicts scans and sweeps, and is updated by registration."""
+
+from __future__ import annotations
+
+import logging
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.odometry import ImuConfig
+from lslam.core.geometry import se3
+from lslam.core.types.imu import GravityDirection, ImuState, ImuStream
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import LEVER_M, Span
+from lslam.core.types.state import State, Stateful
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
+from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.imu_cleaning import covers, gaps
+from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.integrate import Increments
+from lslam.odometry.inertial.kalman import surprise
+from lslam.odometry.kernels import kalman
+from lslam.odometry.kernels.rotation import apart, vector_between
+from lslam.registration.preprocessing.deskew import knots_over
+from lslam.registration.solver import RegistrationResult
+
+Floats = NDArray[np.float64]
+log = logging.getLogger("lslam")
+
+
+class InertialMotion(Stateful):
+    """Predicts with the IMU where it has samples, and with constant velocity where it has none.
+
+    imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
+    """
+
+    # Scans over which the IMU's median prediction error is tested against constant velocity, and the limits of the test.
+    JUDGED, WORSE, SLACK_M = 30, 2.0, 0.02
+    # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
+    COMPARED = 20
+    # Whether it has states for the device, the rotation of its extrinsics and its clock.
+    HAS_DEVICE: ClassVar[bool] = True
+    STATE: ClassVar[tuple[str, ...]] = (
+        "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
+    )  # fmt: skip
+
+    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
+        self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
+        self.T_imu_lidar = se3.inverse(T_lidar_imu)
+        self.estimate = self._opening = estimate
+        self.coasting = ConstantVelocity()
+        self.refusal = ""
+        self.gap_scans = 0
+        self._scans = 0
+        self._has_gap = False
+        # Whether the IMU predicted the newest sweep.
+        self.is_inertial = False
+        # Whether the newest pose has no registration.
+        self._was_bridged = False
+        self._gaps = gaps(imu, config.gap_s)
+        self._instant_ns: int | None = None
+        self._pose = np.eye(4)
+        # From `weigh` at an instant, ns, for `correct`: the gyroscope, and the variance of the registered position, m2.
+        self._taught: tuple[int, Gyroscope, Floats] | None = None
+        # Until the next `correct`: what the IMU felt since the last scan, and where it expects the LiDAR at a stamp, ns.
+        self._felt: Increments | None = None
+        self._expected: tuple[int, Floats] | None = None
+        self._errors: list[tuple[float, float]] = []
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a velocity: from the start on, unless the IMU is silent there."""
+        return self.coasting.is_known or self.is_inertial
+
+    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+        """Whether the scan to come is one of the sample that shows what constant velocity would have cost.
+
+        Where constant velocity predicts it anyway, over a gap of the IMU, there is nothing to compare.
+        """
+        is_due = self.coasting.is_known and self._scans % self.COMPARED == self.COMPARED - 1
+        return is_due and self._feels(stamp_ns, span)
+
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
+        self.is_inertial = self._feels(stamp_ns, span)
+        if not self.is_inertial:
+            return self.coasting.sweep(stamp_ns, span)
+        anchor_ns = stamp_ns if self._instant_ns is None else self._instant_ns
+        prior = self._prior(self.estimate, anchor_ns, self._pose, stamp_ns, knots_over(span))
+        self._expected = stamp_ns, prior.pose
+        return prior
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`."""
+        middle, instant_ns = middle_of(prior, stamp_ns, pose)
+        end_ns = stamp_ns + round(1e9 * float(prior.times[-1]))
+        is_swept = len(prior.times) > 1
+        if self.refusal or not is_swept or self._instant_ns is None or not self._covers(self._instant_ns, end_ns):
+            return self.coasting.refine(prior, stamp_ns, pose)
+        if self.config.velocity == "integrated":
+            return prior
+        return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
+
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
+        """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
+
+        Where they contradict each other, it stays registration's, or the scan is bridged: `_rejected`. Behind a gap nothing is
+        weighed: the scan before was deskewed without the IMU, and is wrong by more than its covariance says. prior : of
+        the registration, says how the sweep moved
+        """
+        C, is_off = result.covariance, not self.config.weigh or self.config.velocity == "integrated"
+        if C is None or not result.is_accepted or is_off or self._has_gap:
+            return result
+        middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
+        before = self._instant_ns
+        if self.refusal or before is None or instant_ns <= before or not self._covers(before, instant_ns):
+            return result
+        e = self.estimate
+        step = self._since_last(instant_ns)
+        begin, end = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
+        R_felt = begin[:3, :3] @ step.rotations[-1]
+        moved, P = self._felt_motion(step)
+        rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ vector_between(R_felt, end[:3, :3])])
+        gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
+        self._taught = instant_ns, gyroscope, C[:3, :3]
+        if surprise(rest, P + 2 * C) > 1:
+            return self._rejected(stamp_ns, result, rest, P)
+        # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
+        # then add up to the least drift when those of the IMU count as many times.
+        pose, covariance = kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age)
+        return result.moved(pose, covariance)
+
+    def _felt_motion(self, step: Increments) -> tuple[Floats, Floats]:
+        """How far, m, the IMU came over `step` from the newest pose, (3,), and the covariance (6, 6) of that and of its turn.
+
+        All in world axes.
+        """
+        R = (self._pose @ self.T_lidar_imu)[:3, :3]
+        R_felt = R @ step.rotations[-1]
+        moved, felt = self.estimate.displacement(step, R)
+        P = np.zeros((6, 6))
+        P[:3, :3], P[3:, 3:] = felt, R_felt @ self.estimate.gyroscope.turn_covariance(step) @ R_felt.T
+        return moved, P
+
+    def _rejected(
+        self, stamp_ns: int, result: RegistrationResult, rest: Floats, covariance: Floats
+    ) -> RegistrationResult:
+        """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
+
+        Where that is nearer to what the IMU expected, the scan is bridged: it stands where the IMU put it, as surely as
+        `covariance` (6, 6) says, and enters the map there, or the next would have nothing to stand on. Never twice in a row:
+        a registration that insists is right, the IMU may have been hit.
+        """
+        if self._was_bridged or not self.coasting.is_known or self._expected is None:
+            return result
+        steady, (expected_ns, expected) = self.coasting.predict(stamp_ns), self._expected
+        if expected_ns != stamp_ns or _distance(steady, expected) >= _distance(steady, result.T_world_lidar):
+            return result
+        metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
+        reason = f"registration is {metres:.2f} m and {degrees:.1f} deg from what the IMU felt"
+        return result.rejected(reason, expected, covariance)
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
+
+        Where no registration stands behind it (`is_registered`), it teaches nothing; the world begins with the first that has.
+        """
+        if self._instant_ns is None and not is_registered:
+            return
+        middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
+        if not self.refusal:
+            is_behind_gap = self._has_gap
+            self._has_gap = self._instant_ns is not None and not self._covers(self._instant_ns, instant_ns)
+            self.gap_scans += self._has_gap
+            if self._has_gap or is_behind_gap:
+                self._restart(instant_ns, middle)
+            elif self._instant_ns is not None and instant_ns > self._instant_ns:
+                if is_registered:
+                    self._judge(stamp_ns, pose)
+                    self.estimate = self._corrected(instant_ns, middle)
+                else:
+                    self.estimate = self._carried(instant_ns)
+            elif self._instant_ns is None:
+                self.estimate = self._advanced(stamp_ns, instant_ns)
+        self.coasting.correct(instant_ns, middle)
+        self._instant_ns, self._pose = instant_ns, middle.copy()
+        self._was_bridged = not is_registered
+        self._taught = self._felt = self._expected = None
+        self._scans += 1
+
+    def gravity_at(self, pose: Floats) -> GravityDirection | None:
+        """Which way is down for a LiDAR at `pose` (4, 4) in the world, as of the last scan; None where that is not known.
+
+        The filter knows gravity in a world that registration lets drift; a LiDAR that turned with it sees the true one.
+        """
+        if self.refusal or self._has_gap or self._instant_ns is None or self.config.velocity == "integrated":
+            return None
+        direction, sigma = self.estimate.down
+        return GravityDirection(pose[:3, :3].T @ direction, sigma)
+
+    def imu_state(self) -> ImuState | None:
+        """What the filter knows of the IMU as of the last scan; None once it is refused."""
+        return None if self.refusal else self.estimate.summary
+
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed.
+
+        An IMU knows the speed from the start: only one that begins later is ever asked.
+        """
+        prior = self.coasting.rewind(stamp_ns, pose, span)
+        self._pose, self._instant_ns = middle_of(prior, stamp_ns, pose)
+        # What the second scan taught, it teaches again when it is registered on the first as that is now.
+        self.estimate = self._opening
+        self.estimate = self._advanced(stamp_ns, self._instant_ns)
+        self.gap_scans, self._scans, self._has_gap = 0, 1, False
+        return prior
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; not the stream."""
+        return {**super().state(), "errors": np.array(self._errors).reshape(-1, 2)}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        super().restore(state)
+        self._taught = self._felt = self._expected = None
+        self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
+
+    def turn(self, begin_ns: int, end_ns: int) -> Floats | None:
+        """Rotation (3, 3) of the LiDAR from one instant to the other by the gyroscope; None over a gap or when refused."""
+        if self.refusal or not self._covers(begin_ns, end_ns):
+            return None
+        R_lidar_imu = self.T_lidar_imu[:3, :3]
+        rotation = self.estimate.over(self.imu, np.array([begin_ns, end_ns])).rotations[-1]
+        return np.asarray(R_lidar_imu @ rotation @ R_lidar_imu.T)
+
+    def prior_errors(self) -> tuple[float, float] | None:
+        """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""
+        if not self._errors:
+            return None
+        own, steady = np.median(np.array(self._errors), axis=0)
+        return float(own), float(steady)
+
+    def _prior(
+        self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, times: Floats
+    ) -> MotionPrior:
+        wanted = stamp_ns + np.round(1e9 * times).astype(np.int64)
+        k = int(np.searchsorted(wanted, anchor_ns))
+        step = estimate.over(self.imu, np.concatenate([wanted[:k], [anchor_ns], wanted[k:]]))
+        poses = step.poses(k, anchor @ self.T_lidar_imu, estimate.velocity, estimate.gravity, self.T_imu_lidar)
+        return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), is_felt=True)
+
+    def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
+        """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
+        if self.config.velocity == "integrated":
+            return self._carried(instant_ns)
+        a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
+        step = self._since_last(instant_ns)
+        if self._taught is not None and self._taught[0] == instant_ns:
+            _, gyroscope, noise = self._taught
+        else:
+            gyroscope, noise = self.estimate.taught(step, a[:3, :3], b[:3, :3]), None
+        return self.estimate.corrected(self.imu, step, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise)
+
+    def _carried(self, instant_ns: int) -> ImuEstimate:
+        return self.estimate.carried(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
+
+    def _since_last(self, instant_ns: int) -> Increments:
+        """What the IMU felt since the last scan, integrated once for all who ask before the next `correct`."""
+        assert self._instant_ns is not None
+        if self._felt is None or self._felt.instants_ns[-1] != instant_ns:
+            self._felt = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
+        return self._felt
+
+    def _advanced(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
+        """The estimate at the first scan's stamp at the middle of its sweep."""
+        if instant_ns <= stamp_ns or not self._covers(stamp_ns, instant_ns):
+            return self.estimate
+        step = self.estimate.over(self.imu, np.array([stamp_ns, instant_ns]))
+        return self.estimate.carried(step, self.T_lidar_imu[:3, :3])
+
+    def _restart(self, instant_ns: int, middle: Floats) -> None:
+        """After a gap, and a scan later, the velocity is that of registration over it, with a large covariance."""
+        assert self._instant_ns is not None
+        moved = (middle @ self.T_lidar_imu)[:3, 3] - (self._pose @ self.T_lidar_imu)[:3, 3]
+        covariance = self.estimate.covariance.copy()
+        covariance[:3, :] = covariance[:, :3] = 0.0
+        covariance[:3, :3] = np.eye(3)
+        e = self.estimate
+        seconds = max(1e-9 * (instant_ns - self._instant_ns), 1e-3)
+        self.estimate = ImuEstimate(moved / seconds, e.gravity, e.accel_bias, e.gyroscope, covariance)
+
+    def _judge(self, stamp_ns: int, pose: Floats) -> None:
+        """Refuse an IMU that predicts scans clearly worse than constant velocity does."""
+        assert self._instant_ns is not None
+        if not self.coasting.is_known:
+            return
+        if self._expected is not None and self._expected[0] == stamp_ns:
+            mine = self._expected[1]
+        else:
+            mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, np.zeros(1)).pose
+        self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
+        if len(self._errors) < self.JUDGED or self.config.velocity == "integrated":
+            return
+        newest = np.sort(np.array(self._errors[-self.JUDGED :]), axis=0)
+        own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
+        if own > self.WORSE * steady + self.SLACK_M:
+            self.refusal = (
+                f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
+                f"{LEVER_M:.0f} m): check its axes, T_lidar_imu and its stamps"
+            )
+            log.warning("the IMU is refused from here on: %s", self.refusal)
+
+    def _feels(self, stamp_ns: int, span: Span) -> bool:
+        """Whether the IMU, unless rejected, has samples from the newest pose, or the sweep's begin, to the sweep's end."""
+        begin_ns, end_ns = (stamp_ns + round(1e9 * seconds) for seconds in span)
+        if self._instant_ns is not None:
+            begin_ns = min(begin_ns, self._instant_ns)
+        return not self.refusal and self._covers(begin_ns, end_ns)
+
+    def _covers(self, begin_ns: int, end_ns: int) -> bool:
+        """Whether there are samples without a gap from one instant to the other."""
+        return covers(self._gaps, begin_ns, end_ns)
+
+
+def _distance(a: Floats, b: Floats) -> float:
+    return float(apart(a, b, LEVER_M))
+
+
+def warm_up() -> None:
+    """Compile or load what the first scans would otherwise wait for: three of a sensor that stands."""
+    none = np.zeros(3)
+    imu = ImuStream(
+        np.arange(60, dtype=np.int64) * 10_000_000, np.tile([0.0, 0.0, GRAVITY], (60, 1)), np.zeros((60, 3))
+    )
+    estimate = ImuEstimate(none, np.array([0.0, 0.0, -GRAVITY]), none, Gyroscope.of_bias(none, 0.01), 1e-2 * np.eye(9))
+    motion = InertialMotion(imu, np.eye(4), estimate, ImuConfig())
+    for k in range(3):
+        stamp_ns = 100_000_000 * k
+        prior = motion.sweep(stamp_ns, Span(0.0, 0.1))
+        prior = motion.refine(prior, stamp_ns, prior.pose)
+        result = RegistrationResult(prior.pose, covariance=1e-4 * np.eye(6))
+        motion.correct(stamp_ns, motion.fuse(stamp_ns, result, prior).T_world_lidar, prior)

@@ -1,0 +1,190 @@
+"""Calibration of a gyroscope's constant errors by registered rotations, and the covariance of its own rotations.
+
+Two of them are those of the whole device, where they are asked for: how it is mounted, and how late its clock is.
+
+The axes of a consumer device are some per cent askew, and its mounting is known to a degree or two: while the sensor turns,
+that is worth more than its bias wanders, and no noise at all but the same error at every turn.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import so3
+from lslam.odometry.inertial.imu_noise import RATE_NOISE, USUAL, ImuNoise
+from lslam.odometry.inertial.integrate import Increments
+from lslam.odometry.inertial.kalman import OUTLIER, update
+from lslam.odometry.kernels import kalman
+
+Floats = NDArray[np.float64]
+
+# One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
+AXES_SIGMA = 0.025
+# The noise is learnt over so many scans.
+MEMORY = 20
+# Where they are estimated, one sigma: a mounting read off a drawing or by eye, rad; the latency of a driver, s; how an offset
+# of two clocks drifts (some ppm), s per sqrt(s).
+MOUNTING_SIGMA, OFFSET_SIGMA, OFFSET_WALK = np.deg2rad(3.0), 0.03, 1e-5
+# (3, 9) rotation vector of what rotation there is in the rows of the axes, to first order: their antisymmetric part.
+MOUNTING = 0.5 * np.array([
+    [0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0],
+], dtype=float)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Gyroscope:
+    """From readings to rates: axes @ (reading - bias), rad/s.
+
+    bias : (3,) rad/s; axes : (3, 3), the identity for a perfect device
+    covariance : (12, 12) of the bias and of the rows of `axes`; (13, 13) where the offset of the clocks is estimated too
+    rate_variance : (rad/s)^2 per Hz, of what is left
+    noise : of the device, its accelerometer's too
+    offset_s : s to add to the stamps; is_mounted : whether what rotation there is in `axes` is the accelerometer's too
+    """
+
+    bias: Floats
+    axes: Floats = field(default_factory=lambda: np.eye(3))
+    covariance: Floats = field(default_factory=lambda: np.zeros((12, 12)), repr=False)
+    rate_variance: float = RATE_NOISE**2
+    noise: ImuNoise = USUAL
+    offset_s: float = 0.0
+    is_mounted: bool = False
+
+    @classmethod
+    def of_bias(cls, bias: Floats, sigma: float, noise: ImuNoise = USUAL) -> Gyroscope:
+        """The prior of a device: its bias (3,), with `sigma` rad/s."""
+        P = np.diag(np.repeat([sigma**2, AXES_SIGMA**2], [3, 9]))
+        return cls(bias, covariance=P, rate_variance=noise.rate**2, noise=noise)
+
+    def calibrated(self, mounting: bool, offset: bool) -> Gyroscope:
+        """This prior, not certain of its mounting or its clock, where these are to be estimated."""
+        P = self.covariance
+        if mounting:
+            P = P.copy()
+            P[3:12, 3:12] += 4 * (MOUNTING_SIGMA**2 - 0.5 * AXES_SIGMA**2) * (MOUNTING.T @ MOUNTING)
+        if offset:
+            P = np.pad(P, (0, 1))
+            P[12, 12] = OFFSET_SIGMA**2
+        return replace(self, covariance=P, is_mounted=mounting)
+
+    @property
+    def has_offset(self) -> bool:
+        """Whether the offset of the clocks is estimated."""
+        return len(self.covariance) > 12
+
+    @property
+    def offset_ns(self) -> int:
+        """To add to the stamps."""
+        return round(1e9 * self.offset_s)
+
+    @property
+    def rotation(self) -> tuple[Floats, float]:
+        """Rotation vector (3,) of how the device is turned against its given axes, rad, and one sigma of its worst axis."""
+        largest = float(np.linalg.eigvalsh(self.rotation_covariance)[-1])
+        return so3.log(_nearest_rotation(self.axes)), float(np.sqrt(max(largest, 0.0)))
+
+    @property
+    def rotation_covariance(self) -> Floats:
+        """(3, 3) rad2 of that rotation vector, to first order."""
+        return np.asarray(MOUNTING @ self.covariance[3:12, 3:12] @ MOUNTING.T)
+
+    @property
+    def mounting(self) -> Floats | None:
+        """(3, 3) that turns specific forces into the given axes; None where they are taken as they are."""
+        return _nearest_rotation(self.axes) if self.is_mounted else None
+
+    @property
+    def tilt(self) -> tuple[float, float]:
+        """By how much an axis that the device feels lies beside the one that was turned about, rad, and one sigma.
+
+        Of the three, the one for which that is most certain: turns about one axis show as much, whatever the others are.
+        """
+        best = (0.0, np.inf)
+        for k in range(3):
+            off = np.delete(self.axes[:, k], k)
+            across = np.delete(np.arange(3), k)
+            C = self.covariance[np.ix_(3 + 3 * across + k, 3 + 3 * across + k)]
+            angle, sigma = float(np.linalg.norm(off)), float(np.sqrt(np.linalg.eigvalsh(C)[-1]))
+            if angle / max(sigma, 1e-9) > best[0] / max(best[1], 1e-9):
+                best = angle, sigma
+        return best
+
+    def rates(self, readings: Floats) -> Floats:
+        """(..., 3) rad/s from `readings` (..., 3)."""
+        return np.asarray((readings - self.bias) @ self.axes.T)
+
+    def turn_covariance(self, step: Increments) -> Floats:
+        """(3, 3) rad2 of the turn over `step`, in IMU axes at its end."""
+        if self.has_offset:
+            H = self.columns(step)
+            return np.asarray(H @ self.covariance @ H.T + self._variance(step) * step.duration * np.eye(3))
+        return kalman.turn_covariance(
+            self.covariance, self._variance(step), step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration
+        )
+
+    def learnt(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
+        """After registration found the turn over `step` larger by `rest` (3,) rad, itself known to `noise` (3, 3), rad2.
+
+        `rest` and `noise` are in IMU axes at the end of the step.
+        """
+        if self.has_offset:
+            return self._learnt_with_offset(step, rest, noise)
+        x, P, excess = kalman.turned(
+            np.concatenate([self.bias, self.axes.ravel()]), self.covariance, self._variance(step), step.rotations[-1],
+            step.velocity_arms[-1], step.duration, rest, noise, self.noise.gyro_walk, OUTLIER,
+        )  # fmt: skip
+        return self._moved(x, P, excess, step)
+
+    def with_bias(self, bias: Floats, covariance: Floats) -> Gyroscope:
+        """After another estimate, which knows nothing of the rest, found this `bias` (3,), with its `covariance` (3, 3).
+
+        The rest follows by its covariance with the bias, as the states of a filter follow a pose.
+        """
+        P = self.covariance
+        gain = np.linalg.solve(P[:3, :3], P[:3]).T
+        d = gain @ (bias - self.bias)
+        P = P - gain @ (P[:3, :3] - covariance) @ gain.T
+        offset = self.offset_s + float(d[12]) if self.has_offset else self.offset_s
+        return replace(
+            self, bias=bias, axes=self.axes + d[3:12].reshape(3, 3), covariance=0.5 * (P + P.T), offset_s=offset
+        )
+
+    def _variance(self, step: Increments) -> float:
+        """(rad/s)^2 per Hz over `step`."""
+        return self.rate_variance + step.hidden_density[1]
+
+    def columns(self, step: Increments) -> Floats:
+        """(3, 12) by which the turn over `step` grows with bias and axes; the rate is taken for constant.
+
+        (3, 13) where the offset is estimated: moved by it, a stream turns as much less at the end as at the beginning more.
+        """
+        H = kalman.turn_columns(step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration)
+        if not self.has_offset:
+            return H
+        begin, end = self.rates(step.readings)
+        return np.column_stack([H, step.rotations[-1].T @ begin - end])
+
+    def _learnt_with_offset(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
+        """As `kalman.turned`, with one state more."""
+        walk = np.zeros(13)
+        walk[:3], walk[12] = self.noise.gyro_walk**2 * step.duration, OFFSET_WALK**2 * step.duration
+        before = self.covariance + np.diag(walk)
+        own = noise + self._variance(step) * step.duration * np.eye(3)
+        H = self.columns(step)
+        allowed = float(np.trace(H @ before @ H.T + own))
+        x = np.concatenate([self.bias, self.axes.ravel(), [self.offset_s]])
+        x, P = update(x, before, H, rest, own)
+        return self._moved(x, P, min(float(rest @ rest), OUTLIER**2 * allowed) - allowed, step)
+
+    def _moved(self, x: Floats, P: Floats, excess: float, step: Increments) -> Gyroscope:
+        variance = max(self.rate_variance + excess / (3 * step.duration * MEMORY), self.noise.rate**2)
+        offset = float(x[12]) if self.has_offset else self.offset_s
+        return Gyroscope(x[:3], x[3:12].reshape(3, 3), P, variance, self.noise, offset, self.is_mounted)
+
+
+def _nearest_rotation(axes: Floats) -> Floats:
+    u, _, vt = np.linalg.svd(axes)
+    return np.asarray(u @ vt)

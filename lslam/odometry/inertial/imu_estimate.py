@@ -1,0 +1,147 @@
+"""What is known of an IMU besides the poses: velocity, gravity and biases, as Gaussians that every registered scan narrows.
+
+Rotation and translation are two small linear filters: registration gives rotations far better than tilt from accelerations,
+so the rotations along the way are taken as known when forces are integrated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.types.imu import ImuState, ImuStream
+from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.integrate import Increments, integrate
+from lslam.odometry.inertial.kalman import OUTLIER
+from lslam.odometry.kernels import kalman
+from lslam.odometry.kernels.rotation import vector_between
+
+Floats = NDArray[np.float64]
+
+GRAVITY = 9.80665
+# Registration from scan to scan, at the least: m and rad, one sigma.
+PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
+# Random walk of gravity in the world of a registration that drifts, m/s2 per sqrt(s).
+GRAVITY_WALK = 5e-3
+GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
+
+# (3, 3) m2 and rad2, of a registration without covariance.
+PLACE_NOISE, TURN_NOISE = PLACE_SIGMA**2 * np.eye(3), TURN_SIGMA**2 * np.eye(3)
+
+VELOCITY, DOWN, BIAS = slice(0, 3), slice(3, 6), slice(6, 9)
+
+
+@dataclass(frozen=True)
+class ImuEstimate:
+    """Velocity of the IMU and gravity in the world, bias of its forces in IMU axes; SI units.
+
+    covariance : (9, 9) of velocity, gravity and accelerometer bias
+    """
+
+    velocity: Floats
+    gravity: Floats
+    accel_bias: Floats
+    gyroscope: Gyroscope
+    covariance: Floats = field(repr=False)
+
+    @property
+    def down(self) -> tuple[Floats, float]:
+        """Direction of gravity in the world, (3,) unit, and one sigma of the larger of its two tilts, rad."""
+        norm = float(np.linalg.norm(self.gravity))
+        direction = self.gravity / norm
+        across = np.eye(3) - np.outer(direction, direction)
+        values = np.linalg.eigvalsh(across @ self.covariance[DOWN, DOWN] @ across)
+        return direction, float(np.sqrt(max(values[-1], 0.0))) / norm
+
+    @property
+    def summary(self) -> ImuState:
+        """Means and standard deviations, for people; NaN for what is not estimated."""
+        g = self.gyroscope
+        values, variances = np.full(13, np.nan), np.full(13, np.nan)
+        values[:9] = np.concatenate([self.accel_bias, g.bias, self.gravity])
+        diagonal = np.diag(self.covariance)
+        variances[:9] = np.concatenate([diagonal[BIAS], np.diag(g.covariance)[:3], diagonal[DOWN]])
+        if g.is_mounted:
+            values[9:12], variances[9:12] = g.rotation[0], np.diag(g.rotation_covariance)
+        if g.has_offset:
+            values[12], variances[12] = g.offset_s, g.covariance[12, 12]
+        return ImuState(values, np.sqrt(np.maximum(variances, 0.0)))
+
+    def over(self, imu: ImuStream, instants_ns: NDArray[np.int64]) -> Increments:
+        """What the IMU felt between increasing instants, biases taken off."""
+        return self._integrated(imu, instants_ns, self.gyroscope.bias)
+
+    def _integrated(self, imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats) -> Increments:
+        g = self.gyroscope
+        return integrate(imu, instants_ns, gyro_bias, self.accel_bias, g.axes, g.mounting, g.offset_ns)
+
+    def displacement(self, step: Increments, R: Floats) -> tuple[Floats, Floats]:
+        """Mean (3,) and covariance (3, 3) of how far `step` leads, m, world axes; R (3, 3) of the IMU at its beginning."""
+        x, P = _propagate(self, step, R)
+        return x[:3], P[:3, :3]
+
+    def carried(self, step: Increments, R: Floats) -> ImuEstimate:
+        """The estimate at the last instant of `step`, with nothing but the IMU to go by; R (3, 3) of the IMU at the first."""
+        x, P = _propagate(self, step, R)
+        return self._with(x[3:], P[3:, 3:], step)
+
+    def taught(self, step: Increments, R: Floats, R_end: Floats, noise: Floats | None = None) -> Gyroscope:
+        """The gyroscope, now that registration turned the IMU from R to R_end (3, 3) in the course of `step`.
+
+        step : as this estimate finds it `over` the two instants
+        noise : (3, 3) rad2, world axes, of either rotation; None for a registration without covariance
+        """
+        R_felt = R @ step.rotations[-1]
+        if noise is None:
+            noise = TURN_NOISE
+        return self.gyroscope.learnt(step, vector_between(R_felt, R_end), 2 * R_felt.T @ noise @ R_felt)
+
+    def corrected(
+        self, imu: ImuStream, step: Increments, R: Floats, R_end: Floats, moved: Floats,
+        gyroscope: Gyroscope, noise: Floats | None = None,
+    ) -> ImuEstimate:  # fmt: skip
+        """The estimate at the last instant of `step`, updated by the registered motion over it.
+
+        step : as this estimate finds it `over` the two instants
+        R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
+        gyroscope : as the turn has `taught`
+        noise : (3, 3) m2, world axes, of either place; None for a registration without covariance
+        """
+        rest = vector_between(R @ step.rotations[-1], R_end)
+        # The shape of the turn is the gyroscope's, its sum is registration's.
+        axes = self.gyroscope.axes
+        bias = self.gyroscope.bias - kalman.turn_bias(step.rotations[-1], step.velocity_arms[-1], axes, rest)
+        step = self._integrated(imu, step.instants_ns, bias)
+        place = PLACE_NOISE if noise is None else PLACE_NOISE + noise
+        x, P = _propagate(self, step, R)
+        x, P = kalman.placed(x, P, moved, 2 * place, GRAVITY, GRAVITY_SIGMA, OUTLIER)
+        return self._with(x[3:], P[3:, 3:], step, gyroscope)
+
+    def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:
+        # Velocity, gravity and accelerometer bias.
+        P = P + np.diag(np.repeat([0.0, GRAVITY_WALK**2, self.gyroscope.noise.accel_walk**2], 3)) * step.duration
+        known = self.gyroscope if gyroscope is None else gyroscope
+        bias = x[BIAS]
+        before, after = self.gyroscope.mounting, known.mounting
+        if gyroscope is not None and before is not None and after is not None:
+            # The force goes on as it was: the bias had learnt it about the axes before, and may be wrong by as much.
+            felt = np.linalg.solve(step.velocity_arms[-1], step.velocities[-1])
+            change = before.T @ felt - after.T @ felt
+            bias = bias + change
+            P[BIAS, BIAS] += np.outer(change, change)
+        return ImuEstimate(x[VELOCITY], x[DOWN], bias, known, P)
+
+
+def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floats, Floats]:
+    """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias at the end of `step`."""
+    x = np.concatenate([estimate.velocity, estimate.gravity, estimate.accel_bias])
+    velocity_arm, position_arm = step.velocity_arms[-1], step.position_arms[-1]
+    if (mounting := estimate.gyroscope.mounting) is not None:
+        velocity_arm, position_arm = velocity_arm @ mounting, position_arm @ mounting
+    return kalman.propagate(
+        x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], velocity_arm, position_arm, R,
+        math.sqrt(estimate.gyroscope.noise.force**2 + step.hidden_density[0]),
+    )  # fmt: skip

@@ -1,0 +1,275 @@
+"""Initialisation of the IMU: velocity, gravity and biases at the first scan, from the registration of the first seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.odometry import ImuConfig
+from lslam.core.types.imu import ImuStream
+from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
+from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
+from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_noise import ImuNoise
+
+Floats = NDArray[np.float64]
+
+# Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
+ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
+# Given biases: axes up to 2 % askew (a consumer device's data sheet) show as much of gravity as one more: two sigma.
+# A bias that is given was measured over minutes; one second that looks like standing may be a slow turn.
+GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, STANDING_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-4, 2e-3, 0.3
+# A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
+MOST_BIAS_ERROR = 0.03
+# A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second, and how far registration moves it (m).
+STILL_RATE, STILL_FORCE, STILL_MOVE = 0.02, 0.3, 0.05
+# What gravity may be off beyond what a bias explains, m/s2.
+LEVEL_SIGMA = 0.3
+# The speed at the first scan is read off so many seconds: longer, and errors of the force add up.
+SPEED_S = 0.8
+# Gravity is read off so many seconds: shorter, and swings of the sensor take its place.
+GRAVITY_S = 3.0
+# Forces of the wrong sign miss the path so many times farther; of the right one, never farther where anything accelerates.
+WRONG_WAY = 2.0
+
+
+@dataclass(frozen=True)
+class FirstPoses:
+    """The registration of the first seconds without an IMU.
+
+    stamps_ns (N,), poses (N, 4, 4) : at the starts of the scans, the first scan's first
+    instants_ns (M,), middles (M, 4, 4) : in the middle of sweeps, where turns are known best
+    covariances : (M, 6, 6) of the registrations, world axes; None when they say nothing of their quality
+    """
+
+    stamps_ns: NDArray[np.int64]
+    poses: Floats
+    instants_ns: NDArray[np.int64]
+    middles: Floats
+    covariances: Floats | None = None
+
+    def during(self, begin: int, end: int) -> FirstPoses:
+        """The scans from number `begin` to before `end`, and the middles of sweeps between them."""
+        stamps = self.stamps_ns[begin:end]
+        kept = self.instants_ns >= stamps[0]
+        if end < len(self.stamps_ns):
+            kept &= self.instants_ns <= stamps[-1]
+        covariances = None if self.covariances is None else self.covariances[kept]
+        return FirstPoses(stamps, self.poses[begin:end], self.instants_ns[kept], self.middles[kept], covariances)
+
+
+@dataclass(frozen=True)
+class InertialStart:
+    """A usable IMU: its stream on the clock of the scans, the estimate at the first of them, and what was decided.
+
+    problems : what was given and could not be used
+    offset_s : what was added to its stamps; is_checked : whether its turns could be compared with those of the scans
+    """
+
+    imu: ImuStream
+    T_lidar_imu: Floats
+    estimate: ImuEstimate
+    offset_s: float
+    is_checked: bool
+    is_static: bool
+    notes: list[str]
+    problems: list[str]
+
+
+def start(
+    imu: ImuStream,
+    T_lidar_imu: Floats,
+    first: FirstPoses,
+    last_ns: int,
+    config: ImuConfig,
+    least_offset_s: float = LEAST_OFFSET_S,
+) -> InertialStart:
+    """Check the stream against the first poses that registration found, and align it with them.
+
+    last_ns : stamp of the recording's last scan; least_offset_s : differences of the clocks below it are none
+
+    Raises ImuRefusedError with the reason when the stream cannot be of this sensor's motion.
+    """
+    given = config.time_offset_s
+    shift = 0 if given is None else round(1e9 * given)
+    cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(first.stamps_ns[0]), last_ns)
+    notes = list(cleaned.notes)
+    told = told_poses(first, cleaned.imu, config.gap_s)[0]
+    agreement = check_agreement(
+        cleaned.imu, T_lidar_imu, told.instants_ns, told.middles, None if given is None else 0.0, least_offset_s
+    )
+    offset = agreement.offset_s if given is None else given
+    if not agreement.is_judged:
+        notes.append("IMU: the first scans show too few turns to check its axes and its clock")
+    problems: list[str] = []
+    config = _without_wrong_bias(config, agreement.gyro_bias, problems)
+    moved = round(1e9 * agreement.offset_s)
+    usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
+    told, opening = told_poses(first, usable, config.gap_s)
+    _refuse_sign(usable, T_lidar_imu, told, agreement.gyro_bias)
+    guess, is_static = _first_guess(usable, T_lidar_imu, told.stamps_ns, told.poses, config, agreement.gyro_bias)
+    asked = config.estimate_extrinsics, config.estimate_offset
+    guess = replace(guess, gyroscope=guess.gyroscope.calibrated(*asked))
+    estimate = _learnt(usable, T_lidar_imu, guess, told, opening, config)
+    if any(asked):
+        # Once more, with forces about the axes that the turns showed and at their time: what was learnt is no prior.
+        known = replace(estimate.gyroscope, covariance=guess.gyroscope.covariance)
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
+    if config.gyro_bias is not None:
+        bias = np.array(config.gyro_bias)
+        known = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope), ImuNoise.of(config)).calibrated(*asked)
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
+    notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
+    return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
+
+
+def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPoses, FirstPoses]:
+    """The longest time among the first scans that the stream tells of, and how far it does from the very first on.
+
+    Raises ImuRefusedError when it is silent between all of them.
+    """
+    silent = gaps(imu, gap_s)
+    ends = [k + 1 for k, (a, b) in enumerate(pairwise(first.stamps_ns)) if not covers(silent, int(a), int(b))]
+    stretches = list(pairwise([0, *ends, len(first.stamps_ns)]))
+    longest = max(stretches, key=lambda stretch: stretch[1] - stretch[0])
+    if longest == (0, 1) and ends:
+        seconds = 1e-9 * float(first.stamps_ns[-1] - first.stamps_ns[0])
+        raise ImuRefusedError(
+            f"it is silent between all {len(first.stamps_ns)} scans of the first {seconds:.1f} s, which registration found "
+            "without it",
+            "begin where it speaks, with --start",
+        )
+    return first.during(*longest), first.during(*stretches[0])
+
+
+def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, told: FirstPoses, gyro_bias: Floats | None) -> None:
+    """Refuse forces that lead along the scans' path when they point the other way: at rest +g is up (REP 145).
+
+    Where the sensor stood, the path is what registration errs by, and tells nothing of the IMU.
+    """
+    if _farthest(told.poses) < STILL_MOVE:
+        return
+    bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
+    guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
+    as_given, reversed_ = (
+        _path_of_force(
+            replace(imu, accel=sign * imu.accel), told.poses @ T_lidar_imu, told.stamps_ns, guess, GRAVITY_S
+        )[2]
+        for sign in (1.0, -1.0)
+    )
+    if as_given > WRONG_WAY * reversed_:
+        raise ImuRefusedError(
+            "its specific forces fit the path of the scans when they point the other way",
+            "at rest they must be +g up, change the sign of its accelerometer",
+        )
+
+
+def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[str]) -> ImuConfig:
+    """A given bias that the scans contradict is another device's: a preset's, say."""
+    if config.gyro_bias is None or seen is None:
+        return config
+    off = float(np.abs(np.array(config.gyro_bias) - seen).max())
+    if off < MOST_BIAS_ERROR:
+        return config
+    problems.append(
+        f"imu.gyro_bias {config.gyro_bias} and imu.accel_bias are not used, they are estimated: the scans show a rate bias "
+        f"that differs by {off:.3f} rad/s"
+    )
+    return config.model_copy(update={"gyro_bias": None, "accel_bias": None})
+
+
+def _bias_sigma(given: Floats, seen: Gyroscope) -> float:
+    """Sigma of a given bias (3,), rad/s: its difference from the one `seen` with a weak prior."""
+    beyond = np.abs(given - seen.bias) - 3 * np.sqrt(np.diag(seen.covariance)[:3])
+    return max(float(beyond.max()), GIVEN_GYRO_BIAS)
+
+
+def _first_guess(
+    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, config: ImuConfig,
+    mean_bias: Floats | None,
+) -> tuple[ImuEstimate, bool]:  # fmt: skip
+    """Biases as given, or of a standing sensor, or by the mean turn; gravity as the scans' path and the forces need it."""
+    stands, rates = _is_stationary(imu, stamps_ns, poses)
+    gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)
+    if stands:
+        gyro_bias, gyro_sigma = rates, STANDING_GYRO_BIAS
+    accel_bias, accel_sigma = np.zeros(3), ANY_ACCEL_BIAS
+    if config.gyro_bias is not None:
+        gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR
+    if config.accel_bias is not None:
+        accel_bias, accel_sigma = np.array(config.accel_bias), GIVEN_ACCEL_BIAS
+    # At first only the difference of force and gravity is observable: a bias tilts the vertical.
+    R, shared = T_lidar_imu[:3, :3], accel_sigma**2
+    covariance = np.zeros((9, 9))
+    np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))
+    covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
+    gyroscope = Gyroscope.of_bias(gyro_bias, gyro_sigma, ImuNoise.of(config))
+    guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyroscope, covariance)
+    gravity = _path_of_force(imu, poses @ T_lidar_imu, stamps_ns, guess, GRAVITY_S)[1]
+    return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
+
+
+def _is_stationary(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) -> tuple[bool, Floats]:
+    """Whether the first second is one of standing still, and the mean rates (3,) in it."""
+    end_ns = stamps_ns[0] + 1_000_000_000
+    i, j = (int(k) for k in np.searchsorted(imu.stamps_ns, [stamps_ns[0], end_ns]))
+    within = stamps_ns < end_ns
+    if j - i < 5 or within.sum() < 3:
+        return False, np.zeros(3)
+    moved = _farthest(poses[within])
+    varies = float(np.std(imu.gyro[i:j], axis=0).max()), float(np.std(imu.accel[i:j], axis=0).max())
+    return moved < STILL_MOVE and varies[0] < STILL_RATE and varies[1] < STILL_FORCE, imu.gyro[i:j].mean(axis=0)
+
+
+def _farthest(poses: Floats) -> float:
+    """m that any of the poses (N, 4, 4) is from the first."""
+    return float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
+
+
+def _learnt(
+    imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, told: FirstPoses, opening: FirstPoses, config: ImuConfig
+) -> ImuEstimate:
+    """The guess after all the sweeps, with the velocity at the first pose."""
+    T = told.middles @ T_lidar_imu
+    learnt = guess
+    for k in range(len(T) - 1):
+        step, R, R_end = learnt.over(imu, told.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
+        noise = None if told.covariances is None else told.covariances[k + 1, 3:, 3:]
+        gyroscope = learnt.taught(step, R, R_end, noise)
+        learnt = learnt.corrected(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
+    covariance = learnt.covariance.copy()
+    covariance[:3, :] = covariance[:, :3] = 0.0
+    velocity, _, spread = _path_of_force(imu, opening.poses @ T_lidar_imu, opening.stamps_ns, learnt, SPEED_S)
+    sigma = max(spread, 0.1)
+    if config.initial_velocity is not None:
+        i = min(int(np.searchsorted(imu.stamps_ns, opening.stamps_ns[0])), len(imu) - 1)
+        rate = T_lidar_imu[:3, :3] @ learnt.gyroscope.rates(imu.gyro[i])
+        velocity, sigma = np.array(config.initial_velocity) + np.cross(rate, T_lidar_imu[:3, 3]), GIVEN_SPEED
+    covariance[:3, :3] = sigma**2 * np.eye(3)
+    return replace(learnt, velocity=velocity, covariance=covariance)
+
+
+def _path_of_force(
+    imu: ImuStream, T_world_imu: Floats, stamps_ns: NDArray[np.int64], known: ImuEstimate, seconds: float
+) -> tuple[Floats, Floats, float]:
+    """Velocity at the first pose (3,), gravity (3,) and the velocity's sigma that lead along the poses of some seconds.
+
+    Where `known` has a gravity, it is kept and only the velocity is looked for.
+    """
+    count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * seconds))), min(4, len(stamps_ns)))
+    has_gravity = bool(known.gravity.any())
+    if count < 4:
+        step = known.over(imu, stamps_ns[0] + np.array([0, 500_000_000]))
+        return np.zeros(3), known.gravity if has_gravity else -T_world_imu[0, :3, :3] @ step.velocities[-1], ANY_SPEED
+    step = known.over(imu, stamps_ns[:count])
+    _, _, moved = step.motion(0, T_world_imu[0, :3, :3], np.zeros(3), known.gravity)
+    rest = T_world_imu[:count, :3, 3] - T_world_imu[0, :3, 3] - moved
+    t = step.seconds[:, None]
+    A = t if has_gravity else np.hstack([t, 0.5 * t**2])
+    x = np.linalg.lstsq(A, rest, rcond=None)[0]
+    spread = float(np.sqrt(np.mean(np.sum((rest - A @ x) ** 2, axis=1)) / float(np.sum(t**2))))
+    return x[0], known.gravity if has_gravity else x[1], spread

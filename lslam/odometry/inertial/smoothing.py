@@ -1,0 +1,234 @@
+"""A smoother of poses and IMU as a motion model: its newest state predicts the next scan and deskews it (LIO-SAM)."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.odometry import ImuConfig
+from lslam.core.errors import GraphError
+from lslam.core.geometry import noise, se3
+from lslam.core.types.imu import ImuStream, InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Span
+from lslam.core.types.state import State
+from lslam.odometry.inertial.constant_velocity import middle_of
+from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
+from lslam.odometry.inertial.integrate import Increments
+from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA
+from lslam.registration.solver import RegistrationResult
+
+Floats = NDArray[np.float64]
+log = logging.getLogger("lslam")
+
+# Velocity, gravity and accelerometer bias of an `ImuEstimate` among the 18 of an `InertialState`.
+ESTIMATE = np.r_[6:9, 15:18, 9:12]
+
+
+class Smoother(Protocol):
+    """Poses and IMU in one estimate, one step after the other."""
+
+    def begin(self, state: InertialState) -> None:
+        """Forget all steps; `state` is the prior of the first."""
+        ...
+
+    def add(self, step: InertialStep) -> InertialState:
+        """The state at the end of `step`."""
+        ...
+
+    def withdraw(self) -> None:
+        """Undo the newest step."""
+        ...
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here."""
+        ...
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        ...
+
+
+class SmootherMotion(InertialMotion):
+    """Predicts with the newest state of a smoother, which takes each registered pose as a measurement beside the IMU's.
+
+    States are at the middles of the sweeps. The errors of the gyroscope's axes, which the smoother has none of, are calibrated
+    as with any IMU, and taken off its readings, as the bias at the start is.
+    """
+
+    HAS_DEVICE: ClassVar[bool] = False
+
+    def __init__(
+        self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, smoother: Smoother
+    ) -> None:
+        super().__init__(imu, T_lidar_imu, estimate, config)
+        self.smoother = smoother
+        # Taken off the gyroscope's readings, so that what the smoother estimates does not change with the axes.
+        self._usual_bias = estimate.gyroscope.bias
+        # Whether the smoother's newest state is that of the newest sweep, `_instant_ns`.
+        self._is_begun = False
+        # The state that `fuse` added, ns and the state, for `correct`.
+        self._added: tuple[int, InertialState] | None = None
+
+    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
+        """The prior itself: a sweep is deskewed once, by the state before."""
+        return prior if self.is_inertial else super().refine(prior, stamp_ns, pose)
+
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
+        """The pose that the smoother makes of registration and IMU, with its covariance."""
+        self._withdraw()
+        C = result.covariance
+        middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
+        step = self._felt_until(instant_ns)
+        if C is None or not result.is_accepted or step is None:
+            return result
+        T_world_imu = middle @ self.T_lidar_imu
+        there = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
+        begin = (self._pose @ self.T_lidar_imu)[:3, :3]
+        self._taught = instant_ns, self.estimate.taught(step, begin, T_world_imu[:3, :3], C[3:, 3:]), C[:3, :3]
+        try:
+            found = self.smoother.add(self._measured(step, T_world_imu, there))
+        except GraphError as error:
+            self._is_begun = False
+            # The IMU's pose is as sure as the IMU, whatever registration said of its own.
+            lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
+            covariance = noise.transported(self._felt_motion(step)[1], lever)
+            return result.rejected(str(error), prior.pose, covariance)
+        self._added = instant_ns, found
+        within = se3.relative(result.T_world_lidar, middle)
+        pose = se3.normalise(found.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
+        covariance = noise.transported(found.covariance[:6, :6], pose[:3, 3] - found.T_world_imu[:3, 3])
+        return result.moved(pose, covariance)
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+    ) -> None:
+        """As of any IMU; velocity, gravity and biases are the smoother's."""
+        if not is_registered:
+            self._withdraw()
+        added, self._added = self._added, None
+        before = self.estimate
+        step = (
+            None
+            if is_registered
+            else self._felt_until(stamp_ns if prior is None else middle_of(prior, stamp_ns, pose)[1])
+        )
+        super().correct(stamp_ns, pose, prior, is_registered)
+        if self._instant_ns is None or self._has_gap or self.refusal:
+            self._is_begun = False
+            self.estimate = before if self.refusal else self.estimate
+            return
+        if added is not None and added[0] == self._instant_ns:
+            found = added[1]
+        else:
+            carried = None if step is None else self._carried_by_smoother(step)
+            if carried is None:
+                # The first scan, the first behind a gap or a graph without solution, or one that stood: at its pose, by what
+                # the loose estimate knows.
+                self.smoother.begin(self._beginning())
+                self._is_begun = True
+                return
+            found = carried
+        self.estimate = self._as_estimate(found)
+
+    def _carried_by_smoother(self, step: Increments) -> InertialState | None:
+        """The state at the end of `step` by the IMU alone; None where the graph has no solution."""
+        try:
+            return self.smoother.add(self._measured(step))
+        except GraphError as error:
+            log.warning("%s: the graph begins anew", error)
+            return None
+
+    def chain(self, keyframes: Sequence[tuple[int, int]], imu_noise: SmootherNoise) -> InertialChain | None:
+        """The IMU between these keyframes, numbers and stamps in ns, by what is known of it now; None where it was silent."""
+        links = []
+        for (a, begin_ns), (b, end_ns) in pairwise(keyframes):
+            if end_ns > begin_ns and self._covers(begin_ns, end_ns):
+                step = self._measured(self.estimate.over(self.imu, np.array([begin_ns, end_ns])))
+                links.append(InertialLink(a, b, self._at_lidar(step)))
+        if not links:
+            return None
+        R = self.T_lidar_imu[:3, :3]
+        known = self._beginning()
+        return InertialChain(links, R @ known.accel_bias, R @ known.gyro_bias, imu_noise)
+
+    def _at_lidar(self, step: InertialStep) -> InertialStep:
+        """The readings of an IMU in the place and axes of the LiDAR, its biases but turned."""
+        R, lever = self.T_lidar_imu[:3, :3], self.T_imu_lidar[:3, 3]
+        rates = step.rates - self._beginning().gyro_bias
+        middles = np.cumsum(step.seconds) - 0.5 * step.seconds
+        turning = np.gradient(rates, middles, axis=0) if len(rates) > 1 else np.zeros_like(rates)
+        forces = step.accel + np.cross(turning, lever) + np.cross(rates, np.cross(rates, lever))
+        return InertialStep(step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T, hidden=step.hidden)
+
+    def state(self) -> State:
+        """What `restore` needs to go on from here; not the stream."""
+        return {**super().state(), "is_begun": self._is_begun, "smoother": self.smoother.state()}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        super().restore(state)
+        self._is_begun, self._added = state["is_begun"], None
+        self.smoother.restore(state["smoother"])
+
+    def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
+        """As of any IMU; the smoother begins again."""
+        self._is_begun, self._added = False, None
+        return super().rewind(stamp_ns, pose, span)
+
+    def _felt_until(self, instant_ns: int) -> Increments | None:
+        """What the IMU felt since the newest state; None where there is no such state, or the IMU was silent since."""
+        before = self._instant_ns
+        is_felt = self._is_begun and before is not None and instant_ns > before and self._covers(before, instant_ns)
+        return self._since_last(instant_ns) if is_felt and not self.refusal else None
+
+    def _withdraw(self) -> None:
+        if self._added is not None:
+            self.smoother.withdraw()
+            self._added = None
+
+    def _measured(self, step: Increments, T_world_imu: Floats | None = None, C: Floats | None = None) -> InertialStep:
+        """The readings of `step` between their samples, linear there, and the registered pose at its end."""
+        begin_ns, end_ns = int(step.instants_ns[0]), int(step.instants_ns[-1])
+        stamps = self.imu.stamps_ns
+        inner = stamps[np.searchsorted(stamps, begin_ns, side="right") : np.searchsorted(stamps, end_ns)]
+        knots = np.concatenate([[begin_ns], inner, [end_ns]])
+        near = slice(max(int(np.searchsorted(stamps, begin_ns)) - 1, 0), int(np.searchsorted(stamps, end_ns)) + 1)
+        at = 1e-9 * (knots - begin_ns)
+        known = 1e-9 * (stamps[near] - begin_ns)
+
+        def means(readings: Floats) -> Floats:
+            values = np.stack([np.interp(at, known, column) for column in readings[near].T], axis=1)
+            return np.asarray(0.5 * (values[1:] + values[:-1]))
+
+        gyroscope = self.estimate.gyroscope
+        return InertialStep(
+            np.diff(at), means(self.imu.accel), (means(self.imu.gyro) - self._usual_bias) @ gyroscope.axes.T,
+            gyroscope.turn_covariance(step) / step.duration, T_world_imu, C, step.hidden_density[0],
+        )  # fmt: skip
+
+    def _beginning(self) -> InertialState:
+        e = self.estimate
+        P = np.zeros((18, 18))
+        P[:6, :6] = BEGIN_SIGMA**2 * np.eye(6)
+        P[np.ix_(ESTIMATE, ESTIMATE)] = e.covariance
+        axes = e.gyroscope.axes
+        P[12:15, 12:15] = axes @ e.gyroscope.covariance[:3, :3] @ axes.T
+        bias = axes @ (e.gyroscope.bias - self._usual_bias)
+        return InertialState(self._pose @ self.T_lidar_imu, e.velocity, e.accel_bias, bias, e.gravity, P)
+
+    def _as_estimate(self, found: InertialState) -> ImuEstimate:
+        """The state as what predicts; the gyroscope's axes and noise are the calibration's, which follows the bias."""
+        known = self.estimate.gyroscope
+        unturned = np.linalg.inv(known.axes)
+        gyroscope = known.with_bias(
+            self._usual_bias + unturned @ found.gyro_bias, unturned @ found.covariance[12:15, 12:15] @ unturned.T
+        )
+        P = found.covariance[np.ix_(ESTIMATE, ESTIMATE)]
+        return ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P)

@@ -1,0 +1,281 @@
+"""A sliding window of IMU states, estimated jointly from preintegrated increments, scans and a marginalised past.
+
+After Ye, Chen and Liu 2019, section IV; the error states and the noise are those of the filter (`navigation_state`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import se3, so3
+from lslam.core.geometry.normal_equations import Normal
+from lslam.core.kernels import positive
+from lslam.core.types.imu import ImuStream
+from lslam.core.types.scan_result import ScanEquations
+from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.imu_noise import ImuNoise
+from lslam.odometry.inertial.integrate import integrate
+from lslam.odometry.inertial.navigation_state import (
+    GYRO,
+    OWN,
+    REST,
+    NavigationState,
+    cut_noise,
+    process_noise,
+    transition,
+)
+from lslam.odometry.kernels.rotation import vector_between
+
+Floats = NDArray[np.float64]
+
+# Of the filter's error state what all moments have in common: gravity and the gyroscope's axes.
+COMMON = np.r_[9:12, 18:27]
+SHARED, EACH = len(COMMON), len(OWN)
+DOWN, AXES = slice(0, 3), slice(3, 12)
+# m and rad: a step of all poses below ends the iteration; what it leaves is its square.
+STEP = 1e-3
+MOST_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The IMU in the middle of a sweep: pose (4, 4), velocity and accelerometer and gyroscope bias (3,).
+
+    T_imu_scan : (4, 4) from it to the LiDAR at the scan's stamp; equations : what the points say of that; None: nothing
+    """
+
+    instant_ns: int
+    stamp_ns: int
+    T_world_imu: Floats
+    velocity: Floats
+    accel_bias: Floats
+    gyro_bias: Floats
+    T_imu_scan: Floats
+    equations: ScanEquations | None = None
+
+    @property
+    def T_world_lidar(self) -> Floats:
+        """(4, 4) at the scan's stamp."""
+        return np.asarray(self.T_world_imu @ self.T_imu_scan)
+
+    def moved(self, d: Floats) -> Moment:
+        """After an error d (15,)."""
+        T = se3.make(so3.exp(d[3:6]) @ self.T_world_imu[:3, :3], self.T_world_imu[:3, 3] + d[:3])
+        return replace(
+            self, T_world_imu=T, velocity=self.velocity + d[6:9], accel_bias=self.accel_bias + d[9:12],
+            gyro_bias=self.gyro_bias + d[12:15],
+        )  # fmt: skip
+
+    def away(self, other: Moment) -> Floats:
+        """(15,) error by which this is away from another."""
+        return np.concatenate([
+            off_by(other.T_world_imu, self.T_world_imu), self.velocity - other.velocity,
+            self.accel_bias - other.accel_bias, self.gyro_bias - other.gyro_bias,
+        ])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Past:
+    """What all that left the window says of the first moment that is left, and of what all have in common.
+
+    information (27, 27), gradient (27,) : of the common errors, then the moment's, where they are `gravity`, `axes`, `moment`
+    """
+
+    information: Floats
+    gradient: Floats
+    gravity: Floats
+    axes: Floats
+    moment: Moment
+
+
+@dataclass(frozen=True)
+class Window:
+    """The moments, the earliest first; gravity (3,) in the world and axes (3, 3) of the gyroscope, which all have in common.
+
+    rate_variance : (rad/s)^2 per Hz of the gyroscope; noise : of the device
+    """
+
+    moments: tuple[Moment, ...]
+    gravity: Floats
+    axes: Floats
+    rate_variance: float
+    noise: ImuNoise
+    past: Past
+
+    @classmethod
+    def begin(cls, state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan: Floats) -> Window:
+        """A window of one moment, of which all is known that the state's covariance says."""
+        moment = moment_of(state, instant_ns, stamp_ns, T_imu_scan)
+        order = np.concatenate([COMMON, OWN])
+        e = state.estimate
+        information = positive.inverse(state.covariance[np.ix_(order, order)])
+        past = Past(information, np.zeros(len(order)), e.gravity, e.gyroscope.axes, moment)
+        return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, e.gyroscope.noise, past)
+
+    def extended(self, moment: Moment) -> Window:
+        """With one more moment, the newest."""
+        return replace(self, moments=(*self.moments, moment))
+
+    def with_equations(self, found: dict[int, ScanEquations]) -> Window:
+        """With other equations of some scans, by their stamps."""
+        return replace(
+            self, moments=tuple(replace(m, equations=found.get(m.stamp_ns, m.equations)) for m in self.moments)
+        )
+
+    def solved(self, imu: ImuStream) -> tuple[Window, Floats]:
+        """The joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first.
+
+        Where that is not positive definite the estimate stays, and `newest` has no finite covariance.
+        """
+        window, H = self, np.zeros((0, 0))
+        for _ in range(MOST_STEPS):
+            H, g = window.equations(imu)
+            d = -positive.solved(H, g)
+            if not np.isfinite(d).all():
+                break
+            window = window.moved(d)
+            if np.abs(d[SHARED:].reshape(-1, EACH)[:, :6]).max() < STEP:
+                break
+        return window, H
+
+    def moved(self, d: Floats) -> Window:
+        """After an error d (12 + 15 W,)."""
+        each = d[SHARED:].reshape(-1, EACH)
+        return replace(
+            self, gravity=self.gravity + d[DOWN], axes=self.axes + d[AXES].reshape(3, 3),
+            moments=tuple(m.moved(one) for m, one in zip(self.moments, each, strict=True)),
+        )  # fmt: skip
+
+    def equations(self, imu: ImuStream) -> tuple[Floats, Floats]:
+        """Normal equations H, g of past, scans, increments and the length of gravity."""
+        size = SHARED + EACH * len(self.moments)
+        H, g = np.zeros((size, size)), np.zeros(size)
+        self._add_past(H, g)
+        norm = float(np.linalg.norm(self.gravity))
+        along = self.gravity / norm
+        H[DOWN, DOWN] += np.outer(along, along) / GRAVITY_SIGMA**2
+        g[DOWN] += along * (norm - GRAVITY) / GRAVITY_SIGMA**2
+        for k in range(len(self.moments)):
+            self._add_scan(H, g, k)
+            if k > 0:
+                self._add_increments(H, g, k, imu)
+        return H, g
+
+    def _add_past(self, H: Floats, g: Floats) -> None:
+        past = self.past
+        x = np.concatenate([
+            self.gravity - past.gravity, (self.axes - past.axes).ravel(), self.moments[0].away(past.moment)
+        ])  # fmt: skip
+        H[: len(x), : len(x)] += past.information
+        g[: len(x)] += past.gradient + past.information @ x
+
+    def _add_scan(self, H: Floats, g: Floats, k: int) -> None:
+        """The points of a scan: a quadratic of the LiDAR's pose, carried along the lever to the IMU's."""
+        m = self.moments[k]
+        if m.equations is None:
+            return
+        e, T = m.equations, m.T_world_lidar
+        J = np.eye(6)
+        J[:3, 3:] = -so3.hat(T[:3, 3] - m.T_world_imu[:3, 3])
+        own = slice(SHARED + EACH * k, SHARED + EACH * k + 6)
+        H[own, own] += J.T @ e.H @ J
+        g[own] += J.T @ (e.g + e.H @ off_by(e.T_world_lidar, T))
+
+    def _add_increments(self, H: Floats, g: Floats, k: int, imu: ImuStream) -> None:
+        """What the IMU felt between moment k - 1 and moment k, integrated anew with the biases as they are."""
+        a, b = self.moments[k - 1], self.moments[k]
+        rest, J, W = self._increment(a, b, imu)
+        begin = SHARED + EACH * (k - 1)
+        at = np.r_[0:SHARED, begin : begin + 2 * EACH]
+        weighed = J.T @ W
+        H[np.ix_(at, at)] += weighed @ J
+        g[at] += weighed @ rest
+
+    def residual(self, a: Moment, b: Moment, imu: ImuStream) -> tuple[Floats, Floats]:
+        """(15,) by which moment b is away from where the IMU leads from moment a, and (15, 42) its Jacobian.
+
+        The columns are of the common errors and of both moments'. Their rotations are taken for near each other, as those of
+        the manifold are.
+        """
+        return self._increment(a, b, imu)[:2]
+
+    def _increment(self, a: Moment, b: Moment, imu: ImuStream) -> tuple[Floats, Floats, Floats]:
+        """As `residual`, with its information (15, 15)."""
+        step = integrate(imu, np.array([a.instant_ns, b.instant_ns]), a.gyro_bias, a.accel_bias, self.axes)
+        R = a.T_world_imu[:3, :3]
+        R_end, velocities, moved = step.motion(0, R, a.velocity, self.gravity)
+        led = replace(
+            a, T_world_imu=se3.make(R_end[-1], a.T_world_imu[:3, 3] + moved[-1]), velocity=velocities[-1]
+        )  # fmt: skip
+        F = transition(step, R, R_end[-1], Gyroscope(a.gyro_bias, self.axes))
+        nanoseconds = b.instant_ns - a.instant_ns
+        W = certainty(nanoseconds, self.rate_variance, self.noise)
+        if step.hidden is not None:
+            Q = process_noise(1e-9 * nanoseconds, self.rate_variance, self.noise) + cut_noise(step.hidden, F)
+            W = positive.inverse(Q[np.ix_(OWN, OWN)])
+        J = np.concatenate([-F[OWN][:, COMMON], -F[OWN][:, OWN], np.eye(EACH)], axis=1)
+        return b.away(led), J, W
+
+    def without_first(self, imu: ImuStream) -> Window:
+        """The first moment marginalised: what past, points and increments say of it becomes the past of the next.
+
+        The direction of gravity walks from one to the next: the world drifts.
+        """
+        first, second = self.moments[:2]
+        size = SHARED + 2 * EACH
+        H, g = np.zeros((size, size)), np.zeros(size)
+        self._add_past(H, g)
+        self._add_scan(H, g, 0)
+        self._add_increments(H, g, 1, imu)
+        gone = np.zeros(size, bool)
+        gone[SHARED : SHARED + EACH] = True
+        left = Normal(H, g).without(gone)
+        walk = GRAVITY_WALK**2 * 1e-9 * (second.instant_ns - first.instant_ns)
+        information, gradient = loosened(left.H, left.g, DOWN, walk)
+        past = Past(information, gradient, self.gravity, self.axes, second)
+        return replace(self, moments=self.moments[1:], past=past)
+
+    def newest(self, H: Floats, like: NavigationState) -> NavigationState:
+        """The newest moment as a state of the filter, its covariance out of the joint information H."""
+        m = self.moments[-1]
+        which = np.r_[0:SHARED, len(H) - EACH : len(H)]
+        P = np.zeros_like(like.covariance)
+        order = np.concatenate([COMMON, OWN])
+        P[np.ix_(order, order)] = positive.inverse(H)[np.ix_(which, which)]
+        gyroscope = replace(like.estimate.gyroscope, bias=m.gyro_bias, axes=self.axes, covariance=P[GYRO, GYRO])
+        estimate = ImuEstimate(m.velocity, self.gravity, m.accel_bias, gyroscope, P[REST, REST])
+        return NavigationState(se3.normalise(m.T_world_imu), estimate, P)
+
+
+@lru_cache(maxsize=64)
+def certainty(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats:
+    """(15, 15) information of the increments over so long, read only."""
+    W = np.linalg.inv(process_noise(1e-9 * nanoseconds, rate_variance, noise)[np.ix_(OWN, OWN)])
+    W.flags.writeable = False
+    return W
+
+
+def moment_of(state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan: Floats) -> Moment:
+    """A moment where the state is."""
+    e = state.estimate
+    return Moment(
+        instant_ns, stamp_ns, state.T_world_imu, e.velocity, e.accel_bias, e.gyroscope.bias, T_imu_scan
+    )  # fmt: skip
+
+
+def off_by(a: Floats, b: Floats) -> Floats:
+    """(6,) error, world axes, by which the pose b (4, 4) is away from a (4, 4)."""
+    # The copy is one compiled function less.
+    R = np.ascontiguousarray(a[:3, :3])
+    return np.concatenate([b[:3, 3] - a[:3, 3], R @ vector_between(R, b[:3, :3])])
+
+
+def loosened(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
+    """Normal equations after a `part` of what they speak of walked by so much: the Schur complement of where it was."""
+    K = np.linalg.inv(np.eye(part.stop - part.start) / variance + H[part, part])
+    return H - H[:, part] @ K @ H[part], g - H[:, part] @ K @ g[part]

@@ -1,0 +1,239 @@
+"""Alerts from the motion checks of a run: where its poses may be lost, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.geometry import se3
+from lslam.core.types.scan_result import SAME_M, USUAL, MotionCheck
+from lslam.odometry.integrity.directions import MOST_EMPTIED
+from lslam.odometry.integrity.pair_registration import SAME_SIGMAS, is_within
+
+Floats = NDArray[np.float64]
+
+# Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
+IN_A_ROW = 4
+LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
+# One check is enough where it says so much more, and clearly explains more of the points.
+LARGE: Floats = np.array([0.5, 0.5, 0.5, *np.deg2rad([2.0, 2.0, 2.0])])
+MORE = 1.15
+# Five times gravity over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
+MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
+# Checks in a row between standing and moving: one is chance.
+OPEN_IN_A_ROW = 2
+AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
+
+
+@dataclass(frozen=True)
+class Alert:
+    """Scans whose poses may be lost, by their positions in the run, and why."""
+
+    first: int
+    last: int
+    why: str
+
+
+def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
+    """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
+    rules = (_unconfirmed, _inconsistent, _ambiguous, _open, _foreign)
+    of_checks = [alert for rule in rules for alert in rule(checks)]
+    return sorted([*of_checks, *_jumps(positions, stamps_ns)], key=lambda alert: (alert.first, alert.last))
+
+
+def _inconsistent(checks: list[MotionCheck]) -> list[Alert]:
+    """Where checks reject the motion of the poses; axes rejected together make one alert.
+
+    Inconclusive checks do not part conclusive ones.
+    """
+    checks = [check for check in checks if check.is_conclusive]
+    if not checks:
+        return []
+    apart, sigma = (np.stack([getattr(check, name) for check in checks]) for name in ("apart", "sigma"))
+    sigma = np.maximum(sigma, _noise(apart))
+    spans = sorted(span for axis in range(6) for span in _stretches(checks, apart[:, axis], sigma[:, axis], axis))
+    merged: list[tuple[int, int]] = []
+    for begin, end in spans:
+        if merged and begin < merged[-1][1]:
+            merged[-1] = merged[-1][0], max(end, merged[-1][1])
+        else:
+            merged.append((begin, end))
+    return [_alert(checks[begin:end], np.median(apart[begin:end], axis=0)) for begin, end in merged]
+
+
+def _noise(apart: Floats) -> Floats:
+    """(6,) usual difference of successive checks: a constant one is no alert."""
+    if len(apart) < IN_A_ROW:
+        return np.zeros(6)
+    return np.asarray(1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(apart, axis=0)), axis=0))
+
+
+def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
+    """Begin and end of where they say so again and again, or one of them by much, along one axis."""
+    is_better = np.array([check.agreement > MORE * check.claimed_agreement for check in checks])
+    is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * SAME_SIGMAS * sigma)
+    found = []
+    for begin, end in _runs(np.where(np.abs(apart) > LEAST[axis], np.sign(apart), 0)):
+        part = slice(begin, end)
+        mean, count = float(np.mean(apart[part])), end - begin
+        bound = LEAST[axis] + SAME_SIGMAS * float(np.median(sigma[part])) / np.sqrt(count)
+        if is_large[part].any() or (count >= IN_A_ROW and abs(mean) > bound):
+            found.append((begin, end))
+    return found
+
+
+def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
+    """In words, the two axes along which most is missing."""
+    seconds = float(np.median([check.seconds for check in run]))
+    worst = sorted(np.argsort(-np.abs(apart) / LEAST)[:2].tolist())
+    said = " and ".join(
+        f"{apart[axis]:+.2f} m {AXES[axis]}" if axis < 3 else f"{np.rad2deg(apart[axis]):+.2f} deg {AXES[axis]}"
+        for axis in worst
+        if abs(apart[axis]) > LEAST[axis]
+    )
+    each = "each" if len(run) > 1 else "it"
+    why = f"beside the scan {seconds:.1f} s before, {each} moved by {said or 'another way'} more than its pose says"
+    return Alert(run[0].first + 1, run[-1].last, why)
+
+
+def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
+    """Where scans are missing or failed, and a check rejects the motion of the poses before and after."""
+    found = []
+    for check in checks:
+        is_elsewhere = check.claimed_agreement < USUAL * check.usual
+        if check.is_after_break and check.usual > 0 and (check.is_open or is_elsewhere):
+            why = f"nothing in the scans confirms the motion over the {check.seconds:.1f} s before, in which scans failed or miss"
+            found.append(Alert(check.first + 1, check.last, why))
+    return found
+
+
+def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:
+    """Where standing and moving explain the scans about equally well: a group of surfaces moves, or the sensor."""
+    conclusive = [check for check in checks if check.is_conclusive]
+    is_open = [check.rival is not None and _is_rest(check.rival) != _is_rest(check.found) for check in conclusive]
+    return [
+        Alert(
+            conclusive[begin].first + 1,
+            conclusive[end - 1].last,
+            "standing and moving explain the scans about equally well: a group of surfaces around the sensor moves, or it does",
+        )
+        for begin, end in _runs(np.array(is_open, np.float64))
+        if end - begin >= OPEN_IN_A_ROW
+    ]
+
+
+def _open(checks: list[MotionCheck]) -> list[Alert]:
+    """Where the poses begin to move along a direction that the scans leave open; checks one after the other make one alert."""
+    spans: list[tuple[int, int, float, str]] = []
+    reference: MotionCheck | None = None
+    for check in checks:
+        if not check.is_open:
+            reference = check
+            continue
+        if reference is None or min(reference.seconds, check.seconds) <= 0:
+            continue
+        longer = check.seconds / reference.seconds
+        more = (check.claimed - se3.exp(longer * se3.log(reference.claimed)))[:3, 3]
+        axis = int(np.argmax(np.abs(more)))
+        # What a shorter pair does not tell grows with the time.
+        if abs(more[axis]) <= LARGE[axis] * max(longer, 1.0):
+            continue
+        if spans and spans[-1][1] == check.first:
+            spans[-1] = (
+                spans[-1][0],
+                check.last,
+                *max(spans[-1][2:], (more[axis], AXES[axis]), key=lambda m: abs(m[0])),
+            )
+        else:
+            spans.append((check.first, check.last, more[axis], AXES[axis]))
+    return [
+        Alert(
+            first + 1,
+            last,
+            f"the scans leave open whether the sensor began to move by {off:+.2f} m {axis}, as its poses do",
+        )
+        for first, last, off, axis in spans
+    ]
+
+
+def _is_rest(motion: Floats) -> bool:
+    return is_within(motion, SAME_M)
+
+
+def _foreign(checks: list[MotionCheck]) -> list[Alert]:
+    """Where the poses stand and the directions in which the sensor saw something empty: clouds of another frame."""
+    return [
+        Alert(
+            checks[begin].first + 1,
+            checks[end - 1].last,
+            f"the poses stand, yet {100 * max(check.emptied for check in checks[begin:end]):.0f} % of the directions in which "
+            "there were points are empty: the clouds are not in the frame of the sensor, perhaps in that of a world",
+        )
+        for begin, end in _runs(np.array([check.emptied > MOST_EMPTIED for check in checks], np.float64))
+        if end - begin >= IN_A_ROW
+    ]
+
+
+def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
+    """Where poses jump as nothing that carries a sensor does."""
+    steps = np.diff(stamps_ns) * 1e-9
+    if len(steps) < 2 or np.any(steps <= 0):
+        return []
+    change, between = _velocity_changes(positions, steps)
+    # The second of three poses that make a jump is scan k + 1.
+    at = np.flatnonzero(_is_jump(change, between) & ~_is_by_stamps(positions, steps)) + 1
+    return [
+        Alert(
+            int(group[0]),
+            int(group[-1]) + 1,
+            f"the poses jump, by {np.max(change[group - 1] * between[group - 1]):.1f} m from one scan to the next against "
+            "the motion before: a wrong place, or scans out of order",
+        )
+        for group in _groups(at)
+    ]
+
+
+def stamp_faults(positions: Floats, stamps_ns: NDArray[np.int64]) -> tuple[list[int], float]:
+    """Scans whose stamps alone make the poses jump, by their positions in the run, and by how much a step is wrong, s."""
+    steps = np.diff(stamps_ns) * 1e-9
+    if len(steps) < 2 or np.any(steps <= 0):
+        return [], 0.0
+    at = np.flatnonzero(_is_jump(*_velocity_changes(positions, steps)) & _is_by_stamps(positions, steps))
+    if not len(at):
+        return [], 0.0
+    off = np.abs(steps - np.median(steps))
+    return (at + 1).tolist(), float(np.max(np.maximum(off[at], off[at + 1])))
+
+
+def _velocity_changes(positions: Floats, steps: Floats) -> tuple[Floats, Floats]:
+    """(N - 2,) changes of the velocity, m/s, of positions (N, 3), m, and the times in which they happen, s."""
+    velocity = np.diff(positions, axis=0) / steps[:, None]
+    return np.linalg.norm(np.diff(velocity, axis=0), axis=1), (steps[1:] + steps[:-1]) / 2
+
+
+def _is_jump(change: Floats, between: Floats) -> NDArray[np.bool_]:
+    """Whether nothing that carries a sensor changes its velocity so much, m/s, in such a time, s."""
+    return np.asarray((change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M))
+
+
+def _is_by_stamps(positions: Floats, steps: Floats) -> NDArray[np.bool_]:
+    """(N - 2,) whether three poses would not jump had their scans followed each other at the period of the sensor.
+
+    A rotor keeps its period to a thousandth; stamps that a computer gives when packets arrive do not. A wrong place, or scans
+    out of order, stay wrong at any stamps.
+    """
+    return ~_is_jump(*_velocity_changes(positions, np.full(len(steps), np.median(steps))))
+
+
+def _groups(at: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Jumps less than three scans apart are one."""
+    return np.split(at, np.flatnonzero(np.diff(at) > 3) + 1) if len(at) else []
+
+
+def _runs(signs: Floats) -> list[tuple[int, int]]:
+    """Begin and end of the stretches of equal signs, those of 0 left out."""
+    edges = [0, *(np.flatnonzero(np.diff(signs)) + 1).tolist(), len(signs)]
+    return [(a, b) for a, b in pairwise(edges) if b > a and signs[a] != 0]

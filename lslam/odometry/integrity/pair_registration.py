@@ -1,0 +1,168 @@
+"""Registers a scan on an earlier one from several starts, by fixed settings: none of the run's configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.geometry import se3
+from lslam.core.types.scan import LEVER_M
+from lslam.core.types.scan_result import SAME_M, motion_apart
+from lslam.odometry.integrity.directions import directions, filled_directions
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import BREADTH, WIDE
+from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
+from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.residuals import PLANE
+from lslam.registration.robust import Annealing
+from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
+
+Floats = NDArray[np.float64]
+
+SETTINGS = RegistrationConfig(blob_weight=0.0)
+# Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
+# room, and spans several points and several sigma of their noise.
+EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, SETTINGS.coarse_factor * SETTINGS.voxel_size
+# Half of an edge is how far a plane reaches.
+CAPTURE = 0.4
+# Steps that settle a scan which lies within its noise of where it was.
+STEPS_AT_REST = 4
+# Two motions are one also where they differ by less than so many sigma more.
+SAME_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class MotionHypothesis:
+    """A motion at which a scan fits the planes of an earlier one, and which of its points (S,) lie on them.
+
+    in_view : number of points in directions in which the earlier scan saw something
+    """
+
+    result: RegistrationResult
+    on_planes: NDArray[np.bool_]
+    in_view: int
+
+    @property
+    def motion(self) -> Floats:
+        """(4, 4) pose of the later scan in the earlier one."""
+        return self.result.T_world_lidar
+
+    @property
+    def agreement(self) -> float:
+        """Share of the points in view that lie on the planes; of half of all points, where fewer are in view."""
+        return self.result.inliers / max(self.in_view, 0.5 * len(self.on_planes), 1.0)
+
+    @cached_property
+    def sigma(self) -> Floats | None:
+        """(6,) standard deviation, m and rad; None where too few points fit."""
+        return None if self.result.covariance is None else np.sqrt(np.diag(self.result.covariance))
+
+    def own_points(self, other: MotionHypothesis) -> int:
+        """Number of points that this motion explains and the other does not: all that tells them apart."""
+        return int(np.count_nonzero(self.on_planes & ~other.on_planes))
+
+    def is_same(self, other: MotionHypothesis) -> bool:
+        """Whether both are one motion within their sigma."""
+        if other is self or is_near(self.motion, other.motion):
+            return True
+        if self.sigma is None or other.sigma is None:
+            return True
+        bound = np.repeat([SAME_M, SAME_M / LEVER_M], 3) + SAME_SIGMAS * np.hypot(self.sigma, other.sigma)
+        return bool(np.all(np.abs(motion_apart(self.motion, other.motion)) < bound))
+
+
+class PairRegistration:
+    """The planes of the earlier scan, in voxels of three sizes that follow the scene, and the later scan, laid on them."""
+
+    def __init__(self) -> None:
+        # One scan has no fine planes.
+        self._planes = tuple(
+            GaussianMap(
+                LARGEST_M * wider, min_points=SETTINGS.min_points, planarity=SETTINGS.planarity,
+                count_cap=SETTINGS.count_cap, reach=1e4, capacity=1 << 13, breadth=BREADTH,
+            )
+            for wider in (1, *WIDE)
+        )  # fmt: skip
+        self._edge = LARGEST_M
+        self._terms: list[Term] = []
+        self._matches = Correspondences(0)
+        self._view: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._source: Floats = np.zeros((0, 3))
+
+    def begin(self, first: Floats, last: PreparedPoints) -> None:
+        """Take the points (N, 3), m, of the earlier scan, and those of the later one."""
+        self._edge = float(np.clip(EDGE_SHARE * median_range(first), SMALLEST_M, LARGEST_M))
+        for level, wider in zip(self._planes, (1, *WIDE), strict=True):
+            level.clear()
+            level.size = self._edge * wider
+            level.insert(first.astype(np.float32), np.eye(4))
+        sigma = SETTINGS.sigma
+        self._view, self._source = filled_directions(first), last.source
+        # What one start looked up the others need not.
+        self._matches = Correspondences(len(last.source))
+        self._terms = voxel_terms(
+            PLANE, PLANE.points(last, sigma), self._planes, self._matches, sigma, SETTINGS.blob_weight
+        )
+
+    def near(self, start: Floats) -> MotionHypothesis:
+        """The motion that fits near a start (4, 4): planes capture points as far as they reach."""
+        s = SETTINGS
+        widest = max(CAPTURE * self._edge, s.kernel_min)
+        return self._lay(start, Annealing(widest, s.kernel_min, s.kernel_decay, s.max_iterations))
+
+    def far(self, start: Floats) -> MotionHypothesis:
+        """The motion that fits best some metres around a start (4, 4)."""
+        s = SETTINGS
+        return self._lay(start, Annealing(s.coarse_kernel, s.kernel_min, s.coarse_decay, s.start_iterations))
+
+    def at_rest(self) -> MotionHypothesis:
+        """The motion that fits if the sensor stands: its points lie within their noise of where they were."""
+        s = SETTINGS
+        return self._lay(np.eye(4), Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, STEPS_AT_REST))
+
+    def at(self, motion: Floats) -> MotionHypothesis:
+        """How the scan fits at a motion (4, 4)."""
+        s = SETTINGS
+        return self._lay(motion, Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, 1))
+
+    def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
+        result = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
+        away2 = self._matches.away2
+        motion = result_of(result, start, len(away2))
+        cells = directions(se3.apply(motion.T_world_lidar, self._source))
+        on_planes = (away2 >= 0) & (away2 < SETTINGS.kernel_min**2)
+        return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))
+
+
+def best_of(hypotheses: Sequence[MotionHypothesis], more: float) -> tuple[MotionHypothesis, MotionHypothesis | None]:
+    """The motion with the most points, the first one unless another has `more` times as many, and its rival.
+
+    A rival is another motion whose own points are at least half as many as those of the best.
+    """
+    best = max(hypotheses, key=lambda h: h.result.inliers)
+    if best.result.inliers <= more * hypotheses[0].result.inliers:
+        best = hypotheses[0]
+    rivals = [h for h in hypotheses if not h.is_same(best) and 2 * h.own_points(best) >= best.own_points(h)]
+    return best, max(rivals, key=lambda h: h.own_points(best), default=None)
+
+
+def is_near(a: Floats, b: Floats) -> bool:
+    """Whether two motions (4, 4) differ so little that they are one."""
+    return is_within(se3.relative(a, b), SAME_M)
+
+
+def is_within(motion: Floats, metres: float) -> bool:
+    """Whether a motion (4, 4) goes no farther, and turns by no more at `LEVER_M`."""
+    # The distance of a rotation from none is sqrt(8) sin of half its angle.
+    turn = float(np.linalg.norm(motion[:3, :3] - np.eye(3)))
+    return float(np.linalg.norm(motion[:3, 3])) < metres and turn < np.sqrt(8.0) * np.sin(0.5 * metres / LEVER_M)
+
+
+def median_range(points: Floats) -> float:
+    """m, of points (N, 3)."""
+    return float(np.median(np.linalg.norm(points, axis=1))) if len(points) else 0.0

@@ -1,0 +1,154 @@
+"""The edge half of the feature map: voxels of `gaussians` read as lines.
+
+A row of `lines` (C, 8) float64 belongs to a slot of the voxel pool: a point x y z on the line (the mean), its unit direction
+x y z (the largest eigenvector), the variance across it, and the variance of its direction, rad2, or NO_LINE. Rows are
+computed when a point is matched with the voxel, and kept until the voxel changes: most voxels behind the sensor never do.
+A voxel has changed when the sum of its count and second moments has changed: the count alone is constant in a full voxel.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
+from lslam.core.kernels.jit import inline, kernel
+from lslam.core.kernels.linalg import plane_of
+from lslam.core.kernels.linearisation import Pose, Sums, Width
+from lslam.core.kernels.residuals import TILT, add_row, octant_slots
+from lslam.core.kernels.voxel import MASK, OFFSET
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Ints = NDArray[np.int32]
+# Moments, keys and table of a voxel pool, see `gaussians`; rows of lines, and the keys and sums they were computed at.
+LineVoxels = tuple[Floats, Longs, Ints, Floats, Longs, Floats]
+
+NO_LINE = -1.0
+# LOAM's rule: a line when the largest eigenvalue is three times the second one.
+ELONGATION = 3.0
+
+
+@inline
+def line_of(slot: int, size: float, min_points: float, floor: float, moments: Floats, keys: Longs, lines: Floats,
+            line_keys: Longs, line_sums: Floats) -> None:  # fmt: skip
+    """Bring the row of one slot up to date with the moments of its voxel."""
+    s = moments[slot]
+    key = keys[slot]
+    known = s[0] + s[4] + s[7] + s[9]
+    if line_keys[slot] == key and line_sums[slot] == known:
+        return
+    line_keys[slot] = key
+    line_sums[slot] = known
+    row = lines[slot]
+    row[7] = NO_LINE
+    if s[0] < min_points:
+        return
+    w = 1.0 / s[0]
+    mx, my, mz = s[1] * w, s[2] * w, s[3] * w
+    # The smallest eigenvector of -C is the largest of C.
+    l2, l1, l0, ux, uy, uz = plane_of(
+        mx * mx - s[4] * w, mx * my - s[5] * w, mx * mz - s[6] * w,
+        my * my - s[7] * w, my * mz - s[8] * w, mz * mz - s[9] * w,
+    )  # fmt: skip
+    l2, l1, l0 = -l2, -l1, -l0
+    if l2 < ELONGATION * max(l1, floor):
+        return
+    row[0] = mx + ((key >> 42) - OFFSET + 0.5) * size
+    row[1] = my + (((key >> 21) & MASK) - OFFSET + 0.5) * size
+    row[2] = mz + ((key & MASK) - OFFSET + 0.5) * size
+    row[3], row[4], row[5] = ux, uy, uz
+    row[6] = 0.5 * (max(l0, 0.0) + max(l1, 0.0)) + floor
+    row[7] = row[6] / (s[0] * l2)
+
+
+@inline
+def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: float, ux: float, uy: float, uz: float,
+             rx: float, ry: float, rz: float, variance: float, c2: float) -> None:  # fmt: skip
+    """Point to line, equation 2.24 of Girolimetto, squared: (I - u u^T) e has two components across the unit direction u.
+
+    `e` goes from a point of the line to the transformed point, `r` is that point seen from the sensor, world axes.
+    Geman-McClure weight of squared width `c2`; upper triangle of H.
+    """
+    along = ex * ux + ey * uy + ez * uz
+    ex, ey, ez = ex - along * ux, ey - along * uy, ez - along * uz
+    d2 = ex * ex + ey * ey + ez * ez
+    robust = c2 / (c2 + d2)
+    robust *= robust
+    w = robust / variance
+    # Two unit vectors across the line, beginning with the axis that is most nearly across it.
+    ax, ay, az = abs(ux), abs(uy), abs(uz)
+    if ax <= ay and ax <= az:
+        px, py, pz = 0.0, -uz, uy
+    elif ay <= az:
+        px, py, pz = uz, 0.0, -ux
+    else:
+        px, py, pz = -uy, ux, 0.0
+    s = 1.0 / math.sqrt(px * px + py * py + pz * pz)
+    px, py, pz = px * s, py * s, pz * s
+    qx, qy, qz = uy * pz - uz * py, uz * px - ux * pz, ux * py - uy * px
+    add_row(H, g, w, ex * px + ey * py + ez * pz, px, py, pz, ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px)
+    add_row(H, g, w, ex * qx + ey * qy + ez * qz, qx, qy, qz, ry * qz - rz * qy, rz * qx - rx * qz, rx * qy - ry * qx)
+    facts[INFORMATION] += 2.0 * w
+    facts[SQUARED] += robust * d2
+    facts[MATCHED] += 1.0
+    facts[LEVER] += 2.0 * w * (rx * rx + ry * ry + rz * rz)
+    facts[ROBUST] += robust
+    if d2 < c2:
+        facts[INLIERS] += 1.0
+
+
+@kernel
+def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[float, float, float, float],
+                    search: tuple[Longs, Ints, Floats], pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all edge points (S, 3), LiDAR frame, to H, g and facts, see `linearisation`.
+
+    Each takes the line voxel, of the eight around it, whose line passes nearest: residual across the line, variance =
+    that of the voxel across its line + sigma2 + tilt at that distance along it, Geman-McClure weight of width `scale`.
+    settings : voxel size, m; variance of a point, m2; points and floor of a line's variance, m2, see `line_of`
+    search : octant cells and slots; `away2` (S,) takes the squared distance of each matched point to its line: those beyond
+    `gate2` are rejected: they count as matched and have no weight
+    """
+    (source,) = points
+    moments, keys, table, lines, line_keys, line_sums = voxels
+    size, sigma2, min_points, floor = settings
+    cells, slots, away2 = search
+    R, t = pose
+    scale, _, gate2 = width
+    H, _, g, facts = sums
+    inverse = 1.0 / size
+    c2 = scale * scale
+    for i in range(len(source)):
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
+        best = -1
+        best_d = 1e300
+        for k in range(8):
+            s = slots[i, k]
+            if s < 0:
+                continue
+            line_of(s, size, min_points, floor, moments, keys, lines, line_keys, line_sums)
+            p = lines[s]
+            if p[7] < 0.0:
+                continue
+            ex, ey, ez = x - p[0], y - p[1], z - p[2]
+            d = ex * ex + ey * ey + ez * ez
+            if d < best_d:
+                best_d, best = d, s
+        if best < 0:
+            continue
+        p = lines[best]
+        ex, ey, ez = x - p[0], y - p[1], z - p[2]
+        along = ex * p[3] + ey * p[4] + ez * p[5]
+        away2[i] = max(ex * ex + ey * ey + ez * ez - along * along, 0.0)
+        if away2[i] > gate2:
+            facts[MATCHED] += 1.0
+            continue
+        variance = p[6] + sigma2 + TILT * p[7] * along * along
+        add_line(H, g, facts, ex, ey, ez, p[3], p[4], p[5], rx, ry, rz, variance, c2)

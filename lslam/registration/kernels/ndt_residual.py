@@ -1,0 +1,144 @@
+"""The normal distributions transform (Magnusson 2009, chapter 6): a score over the eight voxels around a point."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
+from lslam.core.kernels.gaussians import BLOB, FREE
+from lslam.core.kernels.jit import inline, kernel
+from lslam.core.kernels.linalg import invert_symmetric, plane_of
+from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.residuals import Voxels, add_information, octant_slots
+from lslam.core.kernels.surface_information import add_surface
+from lslam.registration.kernels.discs import disc
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Ints = NDArray[np.int32]
+
+# Eigenvalues below this share of the largest are raised to it (Magnusson, section 6.2.1).
+SMALLEST_SHARE = 0.01
+# A voxel whose second eigenvalue is below this share of the largest holds a line: one ring, or a few neighbouring ones. Across
+# the line such a Gaussian describes where the beams of an earlier scan were, not the surface.
+LINE_SHARE = 0.1
+OUTLIER_RATIO = 0.55
+
+
+@inline
+def mixture(size: float) -> tuple[float, float]:
+    """Weights d1 (positive) and d2 of the score for voxels of `size`, m (Magnusson, equations 6.8)."""
+    c1, c2 = 10.0 * (1.0 - OUTLIER_RATIO), OUTLIER_RATIO / size**3
+    d3 = -math.log(c2)
+    d1 = -math.log(c1 + c2) - d3
+    d2 = -2.0 * math.log((-math.log(c1 * math.exp(-0.5) + c2) - d3) / d1)
+    return -d1, d2
+
+
+@kernel
+def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, used: int, floor: float,
+             extent2: float, shapes: Floats) -> None:  # fmt: skip
+    """Bring shapes (C, 14) up to date: mean, inverse covariance xx..zz, smallest eigenvalue, count when it was computed,
+    unit vector of the smallest eigenvalue.
+
+    The variance within the plane of a plane voxel is `extent2`, m2: that of its points tells where the beams of earlier scans
+    were, not where the surface is. Voxels that hold too few points, a line, or one ring have a smallest eigenvalue of 0.
+    """
+    for slot in range(used):
+        p, q = planes[slot], shapes[slot]
+        if keys[slot] == FREE or (q[10] == refreshed[slot] and q[0] == p[0] and q[1] == p[1] and q[2] == p[2]):
+            continue
+        q[0], q[1], q[2] = p[0], p[1], p[2]
+        q[10] = refreshed[slot]
+        q[9] = 0.0
+        if p[7] < BLOB:
+            continue
+        s = moments[slot]
+        w = 1.0 / s[0]
+        mx, my, mz = s[1] * w, s[2] * w, s[3] * w
+        xx, xy, xz = s[4] * w - mx * mx + floor, s[5] * w - mx * my, s[6] * w - mx * mz
+        yy, yz, zz = s[7] * w - my * my + floor, s[8] * w - my * mz, s[9] * w - mz * mz + floor
+        l0, l1, l2, nx, ny, nz = plane_of(xx, xy, xz, yy, yz, zz)
+        if l1 < LINE_SHARE * l2:
+            continue
+        lift = max(SMALLEST_SHARE * l2 - l0, 0.0)
+        if p[7] >= 0.0:
+            xx, xy, xz, yy, yz, zz = disc(nx, ny, nz, l0, extent2)
+        q[3], q[4], q[5], q[6], q[7], q[8] = invert_symmetric(
+            xx + lift * nx * nx, xy + lift * nx * ny, xz + lift * nx * nz,
+            yy + lift * ny * ny, yz + lift * ny * nz, zz + lift * nz * nz,
+        )  # fmt: skip
+        q[9] = l0 + lift
+        q[11], q[12], q[13] = nx, ny, nz
+
+
+@kernel
+def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose, width: Width,
+                  sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3), LiDAR frame, not matched yet, to the sums, see `linearisation`.
+
+    The cost is the negative score: -d1 u exp(-d2 / (2 u) e^T C^-1 e) over the eight voxels around R s + t, where u =
+    `widening` is 1 except during annealing, when it widens the Gaussians as the kernel is widened. g is the gradient. H is
+    the Gauss-Newton Hessian, J^T C^-1 J times the weight d1 d2 exp(..) of the gradient. Newton's Hessian, which Magnusson
+    uses, also has the curvature of that weight and of the rotation; it is indefinite away from the optimum and then needs
+    correction. The score is robust by itself: the variance of a point and the weight of blobs do not enter. Distances are
+    e^T C^-1 e times the smallest eigenvalue of C, for the nearest voxel. S is the information along the thinnest axis of
+    each voxel alone.
+    """
+    (source,) = points
+    shapes, keys, table = voxels
+    size, _, _, _, _, _ = settings
+    cells, slots, _, _, is_done, away2 = search
+    R, t = pose
+    scale, scale_end, gate2 = width
+    widening = (scale / scale_end) ** 2
+    H, S, g, facts = sums
+    inverse = 1.0 / size
+    unused = np.zeros(6)
+    c2 = scale * scale
+    d1, d2 = mixture(size)
+    for i in range(len(source)):
+        if is_done[i]:
+            continue
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
+        best, best_score = 1e300, 0.0
+        for k in range(8):
+            s = slots[i, k]
+            if s < 0:
+                continue
+            q = shapes[s]
+            if q[9] <= 0.0:
+                continue
+            ex, ey, ez = x - q[0], y - q[1], z - q[2]
+            m2 = (
+                q[3] * ex * ex + q[6] * ey * ey + q[8] * ez * ez
+                + 2.0 * (q[4] * ex * ey + q[5] * ex * ez + q[7] * ey * ez)
+            )  # fmt: skip
+            away = q[9] * m2
+            weight = math.exp(-0.5 * d2 * m2 / widening)
+            if away < best:
+                best, best_score = away, weight
+            if away > gate2:
+                continue
+            w = d1 * d2 * weight
+            add_information(H, g, w, q[3], q[4], q[5], q[6], q[7], q[8], ex, ey, ez, rx, ry, rz)
+            trace = w * (q[3] + q[6] + q[8])
+            add_surface(S, unused, w / q[9], q[11], q[12], q[13], rx, ry, rz)
+            facts[INFORMATION] += trace
+            facts[LEVER] += trace * (rx * rx + ry * ry + rz * rz)
+        if best < 1e300:
+            is_done[i] = True
+            away2[i] = best
+            facts[MATCHED] += 1.0
+            facts[SQUARED] += best_score * best
+            facts[ROBUST] += best_score
+            if best < c2:
+                facts[INLIERS] += 1.0

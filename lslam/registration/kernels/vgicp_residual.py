@@ -1,0 +1,100 @@
+"""Distribution to distribution over voxels (Koide et al. 2021, section IV): all around a point, each by its count."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
+from lslam.core.kernels.jit import kernel
+from lslam.core.kernels.linalg import invert_symmetric, rotate_symmetric
+from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.residuals import add_information, nearest, octant_slots, variance_of
+from lslam.core.kernels.surface_information import add_surface, thin_information
+from lslam.registration.kernels.discs import EXTENT2, disc
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Ints = NDArray[np.int32]
+
+
+@kernel
+def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats, Longs, Ints], settings: Settings,
+                    search: Search, pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+    """Add all source points (S, 3) with covariance (S, 6), LiDAR frame, not matched yet, to the sums, see `linearisation`.
+
+    As `linearise_gicp`, but on all plane voxels of the eight around R s + t, each times the number of points in it,
+    counts (C,). Distances are those to the closest.
+    """
+    source, covariance = points
+    planes, counts, keys, table = voxels
+    size, sigma2, plane_weight, blob_weight, _, _ = settings
+    cells, slots, chosen, asked, is_done, away2 = search
+    R, t = pose
+    scale, _, gate2 = width
+    H, S, g, facts = sums
+    inverse = 1.0 / size
+    unused = np.zeros(6)
+    c2 = scale * scale
+    # A match may lie anywhere in its voxel: what is off sideways in a wide one says nothing.
+    extent2 = max(EXTENT2, size * size)
+    for i in range(len(source)):
+        if is_done[i]:
+            continue
+        a, b, c = source[i, 0], source[i, 1], source[i, 2]
+        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
+            asked[i, 3] = -1.0
+        sxx, sxy, sxz, syy, syz, szz = rotate_symmetric(R, covariance[i])
+        best, _, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
+        if best < 0 and (blob < 0 or blob_weight <= 0.0):
+            continue
+        is_done[i] = True
+        closest, closest_robust = 1e300, 0.0
+        for k in range(8):
+            v = slots[i, k]
+            if v < 0 or (v != blob if best < 0 else planes[v, 7] < 0.0):
+                continue
+            p = planes[v]
+            ex, ey, ez = x - p[0], y - p[1], z - p[2]
+            if best >= 0:
+                off = p[3] * ex + p[4] * ey + p[5] * ez
+                across = variance_of(p, off, ex * ex + ey * ey + ez * ez) + sigma2
+                dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across, extent2)
+                n, thin = plane_weight * counts[v], across + sigma2
+            else:
+                dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
+                n, thin = blob_weight * counts[v], p[6] + sigma2
+            mxx, mxy, mxz, myy, myz, mzz = invert_symmetric(
+                sxx + dxx, sxy + dxy, sxz + dxz, syy + dyy, syz + dyz, szz + dzz
+            )
+            away = thin * (
+                mxx * ex * ex + myy * ey * ey + mzz * ez * ez + 2.0 * (mxy * ex * ey + mxz * ex * ez + myz * ey * ez)
+            )
+            robust = c2 / (c2 + away)
+            robust *= robust
+            if away < closest:
+                closest, closest_robust = away, robust
+            facts[POPULATION] += n
+            if away > gate2:
+                continue
+            w = n * robust
+            add_information(H, g, w, mxx, mxy, mxz, myy, myz, mzz, ex, ey, ez, rx, ry, rz)
+            trace = w * (mxx + myy + mzz)
+            if best >= 0:
+                along = w * thin_information(p, mxx, mxy, mxz, myy, myz, mzz)
+                add_surface(S, unused, along, p[3], p[4], p[5], rx, ry, rz)
+            else:
+                add_information(S, unused, w, mxx, mxy, mxz, myy, myz, mzz, 0.0, 0.0, 0.0, rx, ry, rz)
+            facts[INFORMATION] += trace
+            facts[LEVER] += trace * (rx * rx + ry * ry + rz * rz)
+        away2[i] = closest
+        facts[MATCHED] += 1.0
+        if closest < c2:
+            facts[INLIERS] += 1.0
+        if closest <= gate2:
+            facts[SQUARED] += closest_robust * closest
+            facts[ROBUST] += closest_robust

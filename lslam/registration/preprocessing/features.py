@@ -1,0 +1,220 @@
+"""A scan with rings -> edges and planes (Zhang and Singh 2014; Girolimetto, section 2.4.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import LoamConfig
+from lslam.core.errors import InputError
+from lslam.core.geometry import so3
+from lslam.core.types.scan import Scan
+from lslam.registration.kernels import curvature
+from lslam.registration.preprocessing.ground import Z
+from lslam.registration.preprocessing.prepare import gate_points
+from lslam.registration.preprocessing.up import NEAR_Z
+
+# What a point is allowed to become: an edge, a less planar point, a planar one (which is less planar as well).
+MAY_BE_EDGE, MAY_BE_FLAT, MAY_BE_PLANE = 1, 2, 4
+# Coarser than any spinning LiDAR: neighbours farther apart do not lie on one surface.
+WIDEST_STEP = np.radians(2.0)
+# A beam that turns back more often than this is not given in the order it was fired.
+_MANY_TURNS = 0.1
+# A beam of which less of its way about the axis is progress does not spin: it sweeps to and fro.
+_SPINS = 0.5
+# Neighbours farther apart than this many steps have missing returns between them: one lost return is bridged.
+_GAP_STEPS = 2.5
+# m; grid of the points that are no feature: they only tell what stands where.
+_NEITHER_GRID = 0.2
+# A plane's curvature is within this many standard deviations of noise.
+_PLANE_NOISE = 2.0
+
+
+@dataclass(frozen=True)
+class FeaturePoints:
+    """Points of one kind of feature.
+
+    points : (M, 3) float64, m, LiDAR frame; rings : (M,) uint16, not decreasing
+    times : (M,) float32, s from the scan's stamp, None when the scan has none
+    """
+
+    points: NDArray[np.float64]
+    rings: NDArray[np.uint16]
+    times: NDArray[np.float32] | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Features:
+    """What LOAM sees in a scan.
+
+    edges : the sharpest of each region; less_edges : these and more, what the next scan's edges are matched with
+    planes : the flattest of each region; less_planes : all that is flat, down-sampled along each ring
+    neither : all else, down-sampled likewise: silhouettes, single returns from posts, leaves
+    labels : (N,) int8, of each point of the scan: EDGE 2, LESS_EDGE 1, NEITHER 0, LESS_PLANE -1, PLANE -2
+    """
+
+    edges: FeaturePoints
+    less_edges: FeaturePoints
+    planes: FeaturePoints
+    less_planes: FeaturePoints
+    neither: FeaturePoints
+    labels: NDArray[np.int8]
+
+    @property
+    def cloud(self) -> NDArray[np.float32]:
+        """All of them (N, 3), m, LiDAR frame."""
+        parts = (self.less_planes, self.planes, self.less_edges, self.neither)
+        return np.concatenate([part.points for part in parts], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class RingWalk:
+    """The points of a scan ring after ring, each ring in the order its beam went.
+
+    order : (K,) indices of points of the scan; starts : (max ring + 2,) where each ring starts in it
+    points : (K, 3) float64, m; ranges : (K,) m; steps : (K,) rad to the next point of the ring, inf after the last
+    step : their median, rad
+    """
+
+    order: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    points: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+    steps: NDArray[np.float64]
+    step: float
+
+
+def extract_features(
+    scan: Scan,
+    config: LoamConfig | None = None,
+    gate: PreprocessConfig | None = None,
+    allowed: NDArray[np.uint8] | None = None,
+) -> Features:
+    """Edges and planes of a scan that has rings, by their curvature along the ring (equation 2.21).
+
+    Parameters
+    ----------
+    gate : which points are used at all: range and ego box
+    allowed : (N,) of each point of the scan, a sum of MAY_BE_EDGE, MAY_BE_FLAT and MAY_BE_PLANE; None allows all
+
+    Raises
+    ------
+    InputError : the scan has no rings, or neighbours on a ring are too far apart to lie on one surface
+    """
+    return features_along(scan, walk_rings(scan, gate or PreprocessConfig()), config or LoamConfig(), allowed)
+
+
+def features_along(
+    scan: Scan, walk: RingWalk, config: LoamConfig, allowed: NDArray[np.uint8] | None = None
+) -> Features:
+    """As `extract_features`, of a scan whose rings are walked already."""
+    slope = np.tan(np.radians(config.parallel_deg))
+    curved, bend, breaks = curvature.curvatures(
+        walk.points, walk.ranges, walk.steps, walk.starts,
+        _GAP_STEPS * walk.step, config.occlusion, slope * walk.step, slope,
+    )  # fmt: skip
+    noise = curvature_noise(walk.ranges)
+    both = np.full(len(scan), 7, np.uint8) if allowed is None else np.ascontiguousarray(allowed, np.uint8)
+    labels = curvature.pick(
+        curved, bend, walk.ranges, breaks, both[walk.order], walk.starts, config.regions,
+        (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
+        config.edge_curvature * walk.step, config.planar_curvature * walk.step,
+        config.edge_noise * noise, _PLANE_NOISE * noise,
+    )  # fmt: skip
+    return gather_features(scan, walk, labels, config.grid_step)
+
+
+def curvature_noise(ranges: NDArray[np.float64], side: int = curvature.SIDE) -> float:
+    """Standard deviation, m, of curvature times range that the noise of `ranges` (K,), m, along the rings makes.
+
+    side : neighbours on either side that the curvature takes
+
+    The noise is that of second differences, whose median knows nothing of edges and little of curved surfaces.
+    """
+    thinned = np.abs(ranges[:-2:4] - 2 * ranges[1:-1:4] + ranges[2::4])
+    sigma = 1.4826 * float(np.median(thinned)) / np.sqrt(6) if len(thinned) else 0.0
+    n = 2 * side
+    return sigma * float(np.sqrt(n * n + n)) / (n + 1)
+
+
+def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
+    """The gated points of a scan along each of its rings. Raises InputError as `extract_features`.
+
+    The order of the file is kept where it follows the beam; else rings are walked by azimuth, about the axis of their cones.
+    """
+    if scan.rings is None:
+        raise InputError(
+            f"scan {scan.index} has no rings, which LOAM's features need: see --rings, or use --method loam-livox"
+        )
+    order, starts = curvature.into_rings(scan.rings, gate_points(scan.points, gate))
+    points, ranges, steps, step, turns, progress = curvature.walk(scan.points, order, starts)
+    if step > WIDEST_STEP or turns > _MANY_TURNS or progress < _SPINS:
+        about = scan.points @ so3.level_frame(_spin_axis(points / ranges[:, None], starts)).T.astype(np.float32)
+        progress = curvature.walk(about, order, starts)[-1]
+    if step > WIDEST_STEP or turns > _MANY_TURNS or progress < _SPINS:
+        azimuth = np.arctan2(about[order, 1], about[order, 0])
+        order = order[np.lexsort((azimuth, scan.rings[order]))]
+        points, ranges, steps, step, _, _ = curvature.walk(scan.points, order, starts)
+    if step > WIDEST_STEP and len(order) > len(starts):
+        raise InputError(
+            f"scan {scan.index}: neighbours on a ring are more than {np.degrees(WIDEST_STEP):.0f} deg apart, so they "
+            "lie on no common surface (a pattern that does not repeat, or rings that are none): use --method loam-livox, "
+            "which needs no rings, or another --rings"
+        )
+    return RingWalk(order, starts, points, ranges, steps, min(step, WIDEST_STEP))
+
+
+def _spin_axis(directions: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(3,) unit vector about which rings of directions (K, 3) are circles; z where there is none, or within 45 deg of it.
+
+    A circle about an axis has no extent along it, and errors of elevation are far smaller than the widest step.
+    """
+    sizes = np.diff(starts)
+    means = np.add.reduceat(directions, starts[:-1][sizes > 0], axis=0) / sizes[sizes > 0, None]
+    away = directions - np.repeat(means, sizes[sizes > 0], axis=0)
+    variances, axes = np.linalg.eigh(away.T @ away / max(len(away), 1))
+    are_circles = variances[0] < (WIDEST_STEP / 4) ** 2
+    return axes[:, 0] if are_circles and abs(axes[2, 0]) <= NEAR_Z else Z
+
+
+def gather_features(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_step: float) -> Features:
+    """The features of a scan with rings, as the walk along them is labelled (K,)."""
+    assert scan.rings is not None
+    rings, times = scan.rings[walk.order], None if scan.times is None else scan.times[walk.order]
+
+    def those(mask: NDArray[np.bool_]) -> FeaturePoints:
+        at = np.flatnonzero(mask)
+        return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])
+
+    back = np.zeros(len(scan), np.int8)
+    back[walk.order] = labels
+    return Features(
+        edges=those(labels == curvature.EDGE),
+        less_edges=those(labels > 0),
+        planes=those(labels == curvature.PLANE),
+        less_planes=_thinned(walk, labels < 0, rings, times, grid_step),
+        neither=_thinned(walk, labels == curvature.NEITHER, rings, times, _NEITHER_GRID),
+        labels=back,
+    )
+
+
+def _thinned(
+    walk: RingWalk,
+    mask: NDArray[np.bool_],
+    rings: NDArray[np.uint16],
+    times: NDArray[np.float32] | None,
+    grid_step: float,
+) -> FeaturePoints:
+    at = np.flatnonzero(mask)
+    if grid_step == 0:
+        return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])
+    centroids, first, mean_times = curvature.thin(
+        walk.points, at, rings, np.zeros(0, np.float32) if times is None else times, grid_step
+    )
+    return FeaturePoints(centroids, rings[first], None if times is None else mean_times)

@@ -1,0 +1,120 @@
+"""Points that lie on the ground, found by height alone: no rings, no mounting height, on slopes and under a tilted sensor.
+
+First the dominant plane: of all planes through three of the lowest points of a grid, the one with most lowest points
+near it and fewest below (RANSAC, Fischler and Bolles 1981). It levels the scan, so the tilt of a drone is no slope. The grid
+is level where `up` is vertical, which a sensor that hangs or lies has elsewhere than along its z. Then the
+slope filter of Vosselman (2000): a point is no ground when another one lies so much lower that the ground between them
+would be steeper than `slope`. Mirrors and puddles put points under the ground: what no such slope joins to the plane
+under the sensor is not asked for its opinion.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.geometry import so3
+from lslam.core.kernels import ground
+
+Floats = NDArray[np.float64]
+
+# m; cells of the grid, and the farthest that ground is looked for.
+CELL = 0.5
+REACH = 150.0
+TRIPLES = 200
+# Planes steeper than 40 deg against the expected horizontal are walls or roofs.
+UPRIGHT = float(np.cos(np.deg2rad(40.0)))
+Z = np.array([0.0, 0.0, 1.0])
+
+
+def up_of(config: PreprocessConfig) -> Floats:
+    """(3,) unit vector up in the LiDAR frame as configured; z where nothing is."""
+    return Z if config.up is None else np.array(config.up) / np.linalg.norm(config.up)
+
+
+def world_up_of(config: PreprocessConfig, T_world_lidar: Floats) -> Floats:
+    """(3,) unit vector up in the world by the first pose (4, 4); z where nothing is configured."""
+    return Z if config.up is None else np.asarray(T_world_lidar[:3, :3] @ up_of(config))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The ground under one scan's points: (3, 3) rotation that levels them, cells in half a side of the grid, and heights, m."""
+
+    R: Floats
+    half: int
+    top: Floats
+
+    def above(self, points: NDArray[np.float32], height: float) -> NDArray[np.int64]:
+        """Indices of those of the scan's points (N, 3), m, that lie higher above it than `height`, m, increasing."""
+        return ground.above(points, self.R, CELL, self.half, self.top, height)
+
+
+def above_ground(
+    points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z
+) -> NDArray[np.int64]:  # fmt: skip
+    """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground (`ground_of`), increasing."""
+    return ground_of(points, slope, tolerance, up).above(points, tolerance)
+
+
+def ground_of(points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z) -> Ground:
+    """The ground under the points (N, 3), m, LiDAR frame, of a scan.
+
+    slope : steepest ground, m per m, against the dominant plane; tolerance : height that still counts as ground, m
+    up : (3,) unit vector, about which the dominant plane's normal is looked for
+    Without a plane to be found the slope is that against the horizontal of `up`.
+    """
+    if len(points) < 3:
+        return Ground(np.eye(3), 1, np.full((2, 2), ground.EMPTY))
+    farthest = float(np.sqrt(np.einsum("ij,ij->i", points, points).max()))
+    half = int(np.ceil(min(farthest, REACH) / CELL)) + 1
+    R, floor = levelling(points, tolerance, half, up)
+    index = ground.lowest(points, R, CELL, half)
+    low = points[index[index >= 0]].astype(np.float64) @ R.T
+    is_under = low[:, 2] < floor - tolerance - slope * np.hypot(low[:, 0], low[:, 1])
+    height = np.full(len(index), ground.EMPTY)
+    height[index >= 0] = np.where(is_under, ground.EMPTY, low[:, 2])
+    return Ground(R, half, ground.envelope(height.reshape(2 * half, 2 * half), slope * CELL, tolerance))
+
+
+def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floats = Z) -> tuple[Floats, float]:
+    """(3, 3) rotation that makes the dominant plane of the lowest points horizontal, and its height then, m.
+
+    Without such a plane the frame levelled by `up` (3,), and minus infinity.
+    """
+    if np.array_equal(up, Z):
+        return _levelling(points, tolerance, half)
+    turn = so3.level_frame(up)
+    R, height = _levelling(np.ascontiguousarray(points @ turn.T.astype(np.float32)), tolerance, half)
+    return R @ turn, height
+
+
+def _levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:
+    """`levelling` of points whose z is about up."""
+    index = ground.lowest(points, np.eye(3), CELL, half)
+    low = points[index[index >= 0]].astype(np.float64)
+    if len(low) < 3:
+        return np.eye(3), -np.inf
+    triples = np.random.default_rng(0).integers(0, len(low), (TRIPLES, 3))
+    plane = ground.best_plane(low, triples, tolerance, UPRIGHT)
+    if not plane.any():
+        return np.eye(3), -np.inf
+    near = low[np.abs(low @ plane[:3] + plane[3]) <= tolerance]
+    _, _, axes = np.linalg.svd(near - near.mean(0), full_matrices=False)
+    normal = axes[2] * (1.0 if axes[2, 2] > 0 else -1.0)
+    if normal[2] < UPRIGHT:
+        normal = plane[:3]
+    axis = np.cross(normal, [0.0, 0.0, 1.0])
+    sine = float(np.linalg.norm(axis))
+    R = np.eye(3) if sine < 1e-9 else so3.exp(axis / sine * np.arctan2(sine, normal[2]))
+    return R, float((near @ R[2]).mean())
+
+
+def warm_up() -> None:
+    """Compile or load the kernels, with a small floor."""
+    floor = np.zeros((400, 3), np.float32)
+    floor[:, 0], floor[:, 1] = np.divmod(np.arange(400, dtype=np.float32), 20)
+    above_ground(floor, 0.3, 0.2)

@@ -1,0 +1,185 @@
+"""A raw scan -> the points that feed the local map and the fewer points that are registered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.errors import InputError
+from lslam.core.kernels import voxel
+from lslam.registration.preprocessing.ground import above_ground, up_of
+from lslam.registration.preprocessing.weather_filter import on_surfaces
+
+# A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
+COARSEST_SOURCE = 3.0
+
+NO_TIMES = np.zeros(0, np.float32)
+
+
+@dataclass(frozen=True)
+class PreparedPoints:
+    """What registration needs of one scan, LiDAR frame.
+
+    map_points : (M, 3) float32, m, one centroid per small voxel
+    source : (S, 3) float64, m; scatter : (S, 6) float64, m2, covariance xx xy xz yy yz zz of the points behind each
+    used : points that passed the range gate
+    map_times (M,), source_times (S,) : float32, s from the scan's stamp, mean over the points behind each; None when the scan
+        has no times
+    covariance : (S, 6) float64, m2, likewise, of the surface round each source point; None where no method asked for it
+    gaps : (S,) float64, m, how far from each source point the next ring lies on a surface that faces the sensor; None likewise
+    """
+
+    map_points: NDArray[np.float32]
+    source: NDArray[np.float64]
+    scatter: NDArray[np.float64]
+    used: int
+    map_times: NDArray[np.float32] | None = None
+    source_times: NDArray[np.float32] | None = None
+    covariance: NDArray[np.float64] | None = None
+    gaps: NDArray[np.float64] | None = None
+
+
+def prepare_points(
+    points: NDArray[Any], config: PreprocessConfig, index: int = 0, times: NDArray[np.float32] | None = None
+) -> PreparedPoints:
+    """Gate and down-sample points (N, 3), m, in the LiDAR frame. `index` seeds the random share, scan by scan.
+
+    `times` (N,), s from the scan's stamp, are averaged along, so that the centroids can be deskewed instead of the points.
+
+    The weather filter removes drops from the map points, and from source points made of these (`weather_filter.on_surfaces`).
+    Centroids, not first points: the average of the points of a cell is nearer to the surface than any one of them.
+    Further columns are ignored. Raises InputError for arrays of another shape.
+    """
+    times_of = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)
+    kept, kept_times = _gated(as_cloud(points), times_of, config)
+    map_points, map_times, counts = voxel.means(kept, kept_times, config.map_leaf)
+    if config.least_line > 0:
+        solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
+        if len(solid) < len(map_points):
+            map_points, map_times = voxel.take(map_points, solid), map_times[solid] if len(map_times) else map_times
+    source, source_times, scatter = _source_points(kept, kept_times, map_points, map_times, config, index)
+    return PreparedPoints(
+        map_points,
+        source.astype(np.float64),
+        scatter.astype(np.float64),
+        len(kept),
+        None if times is None else map_times,
+        None if times is None else source_times,
+    )
+
+
+def thin(points: PreparedPoints, step: int) -> PreparedPoints:
+    """Every `step`-th source point."""
+    return subset(points, slice(None, None, step))
+
+
+def subset(points: PreparedPoints, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> PreparedPoints:
+    """Some of the source points, or all in another order, with what goes with each; the map points stay."""
+    times, covariance, gaps = points.source_times, points.covariance, points.gaps
+    return replace(
+        points,
+        source=np.ascontiguousarray(points.source[which]),
+        scatter=np.ascontiguousarray(points.scatter[which]),
+        source_times=None if times is None else times[which],
+        covariance=None if covariance is None else np.ascontiguousarray(covariance[which]),
+        gaps=None if gaps is None else np.ascontiguousarray(gaps[which]),
+    )
+
+
+def clean_points(points: NDArray[Any], config: PreprocessConfig) -> NDArray[np.float32]:
+    """The points (N, 3), m, LiDAR frame, that a method may use: (M, 3), in their order.
+
+    Further columns are ignored. Raises InputError for arrays of another shape.
+    """
+    cloud = as_cloud(points)
+    return cloud[gate_points(cloud, config)]
+
+
+def as_cloud(points: NDArray[Any]) -> NDArray[np.float32]:
+    """The first three columns as (N, 3) float32. Raises InputError for arrays of another shape."""
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] < 3:
+        raise InputError(f"points of a scan have shape {array.shape}: (N, 3) is needed, x y z in metres")
+    return np.ascontiguousarray(array[:, :3], np.float32)
+
+
+def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArray[np.int64]:
+    """Indices of the points (N, 3), m, that are finite, non-zero, within range and outside the ego box.
+
+    With `remove_ground` and `denoise` also neither on the ground nor, among the rest, an outlier. Every method's points
+    pass here.
+    """
+    kept = voxel.gate(points, *_gate_of(config))
+    if config.remove_ground:
+        kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance, up_of(config))]
+    if config.denoise:
+        from lslam.registration.preprocessing.weather_filter import dense_points
+
+        kept = kept[dense_points(points[kept], config.denoise_neighbours, config.denoise_deviations)]
+    return kept
+
+
+def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, NDArray[np.float64]]:
+    """Range gate and ego box as the kernels take them."""
+    box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
+    return config.range_min, config.range_max, config.range_shape == "cylinder", box
+
+
+def _gated(
+    cloud: NDArray[np.float32], times: NDArray[np.float32], config: PreprocessConfig
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The points that `gate_points` keeps, and their times: in one pass where only the gate asks."""
+    if not (config.remove_ground or config.denoise):
+        return voxel.gated(cloud, times, *_gate_of(config))
+    chosen = gate_points(cloud, config)
+    return voxel.take(cloud, chosen), times[chosen] if len(times) else times
+
+
+Down = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+
+
+def _source_points(
+    kept: NDArray[np.float32], kept_times: NDArray[np.float32], map_points: NDArray[np.float32],
+    map_times: NDArray[np.float32], config: PreprocessConfig, index: int,
+) -> Down:  # fmt: skip
+    if config.downsample == "target":
+        return _target_count(map_points, map_times, config)
+    if config.downsample == "grid":
+        return voxel.centroids(map_points, map_times, config.source_voxel)[:3]
+    if config.downsample == "first":
+        chosen = voxel.first_points(kept, config.source_voxel)
+    elif config.downsample == "random":
+        rng = np.random.default_rng((config.seed, index))
+        chosen = np.sort(rng.permutation(len(kept))[: round(config.random_share * len(kept))])
+    else:
+        chosen = np.arange(len(kept))
+    times = kept_times[chosen] if len(kept_times) else kept_times
+    return kept[chosen], times, np.zeros((len(chosen), 6), np.float32)
+
+
+def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32], config: PreprocessConfig) -> Down:
+    """Centroids of a grid whose size gives a count between the limits, where the scan has so many points.
+
+    Surfaces fill a grid with the inverse square of its size. The search starts afresh for each scan, so that a scan's
+    points depend on this scan alone.
+    """
+    low, high = config.source_points_min, config.source_points_max
+    size = config.source_voxel
+    down = voxel.centroids(map_points, map_times, size)[:3]
+    for _ in range(3):
+        found = len(down[0])
+        if found > high:
+            wanted = min(size * (found / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE)
+        elif found < low and len(map_points) > found:
+            wanted = max(size * (found / (0.5 * (low + high))) ** 0.5, config.map_leaf)
+        else:
+            break
+        if wanted == size:
+            break
+        size = wanted
+        down = voxel.centroids(map_points, map_times, size)[:3]
+    return down

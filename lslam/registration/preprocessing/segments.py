@@ -1,0 +1,110 @@
+"""LeGO-LOAM's front half: what of a scan is ground, what belongs to something large enough, and features of both.
+
+Shan and Englot 2018, "LeGO-LOAM: Lightweight and ground-optimized lidar odometry and mapping on variable terrain".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import LoamConfig
+from lslam.core.types.scan import Scan
+from lslam.registration.kernels import range_image
+from lslam.registration.preprocessing.features import (
+    MAY_BE_EDGE,
+    MAY_BE_FLAT,
+    MAY_BE_PLANE,
+    Features,
+    RingWalk,
+    features_along,
+    walk_rings,
+)
+from lslam.registration.preprocessing.ground import CELL, REACH, levelling, up_of
+
+# m; a ring's next neighbour on the ground is at least so far off, so that noise does not tilt the line between them.
+_BASELINE = 0.3
+# m; noise of height, and what a kerb may rise at once.
+_TOLERANCE = 0.1
+# m; points of one pixel that are so far apart are not the same thing.
+_SAME = 0.3
+
+# The floor is looked for up to so many times the range of the lowest rings, an eighth of all, in one of so many points.
+_FLOOR_REACH = 3.0
+_LOWEST = 8
+_FLOOR_SHARE = 4
+
+
+@dataclass(frozen=True)
+class Segments:
+    """What LeGO-LOAM keeps of a scan.
+
+    ground : (N,) bool, of each point of the scan; labels : (N,) int32, 1, 2, ... of its clusters off the ground, 0 for the
+    ground, for clusters that are too small, and for points outside the range gate
+    """
+
+    ground: NDArray[np.bool_]
+    labels: NDArray[np.int32]
+
+    @property
+    def count(self) -> int:
+        """Number of clusters."""
+        return int(self.labels.max(initial=0))
+
+
+def lego_features(
+    scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None
+) -> tuple[Features, Segments]:
+    """Features as LeGO-LOAM takes them: edges off the ground, planes on it, less planar points of both, clutter left out.
+
+    Raises InputError as `extract_features` does.
+    """
+    config = config or LoamConfig()
+    gate = gate or PreprocessConfig()
+    walk = walk_rings(scan, gate)
+    segments = _segment(scan, walk, config, up_of(gate))
+    allowed = np.uint8(MAY_BE_EDGE | MAY_BE_FLAT) * (segments.labels > 0)
+    allowed += np.uint8(MAY_BE_PLANE | MAY_BE_FLAT) * segments.ground
+    return features_along(scan, walk, config, allowed), segments
+
+
+def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: NDArray[np.float64]) -> Segments:
+    slopes = range_image.row_slopes(walk.points, walk.starts) * (1.0 if vertical[2] >= 0 else -1.0)
+    known = np.flatnonzero(np.isfinite(slopes))
+    row = np.zeros(len(slopes), np.int64)
+    upwards = known[np.argsort(slopes[known], kind="stable")]
+    if not len(upwards):
+        return Segments(np.zeros(len(scan), bool), np.zeros(len(scan), np.int32))
+    row[upwards] = np.arange(len(known))
+    elevation = np.arctan(np.sort(slopes[known]))
+    columns = max(round(2 * np.pi / walk.step), 1)
+    pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(known), columns)
+    up, floor = _floor(walk, upwards[: max(1, len(upwards) // _LOWEST)], vertical)
+    ground = range_image.find_ground(
+        walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE
+    )
+    labels = range_image.cluster(
+        walk.ranges, nearest, ground, columns, elevation, np.radians(config.segment_angle_deg),
+        (config.segment_points, config.small_segment_points, config.small_segment_rings),
+    )  # fmt: skip
+    return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
+
+
+def _floor(
+    walk: RingWalk, lowest: NDArray[np.int64], vertical: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:  # fmt: skip
+    """The upward direction (3,) and the height of the dominant plane along it, m.
+
+    It is looked for where the vehicle stands or the drone hovers: within a few times the range at which the `lowest` rings
+    meet it. Without a plane the sensor counts as level and the floor lies where those rings end.
+    """
+    first = np.concatenate([np.arange(walk.starts[k], walk.starts[k + 1]) for k in lowest])
+    reach = min(_FLOOR_REACH * float(np.median(walk.ranges[first])), REACH)
+    near = np.flatnonzero(walk.ranges < reach)[::_FLOOR_SHARE]
+    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(reach / CELL) + 1, vertical)
+    if floor == -np.inf:
+        floor = float(np.median(walk.points[first] @ vertical))
+    return np.ascontiguousarray(R[2]), floor
