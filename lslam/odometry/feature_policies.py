@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from lslam.core.config.odometry import RecoveryConfig
@@ -16,13 +17,16 @@ class CoarseStart:
     """The less planar points on coarse planes catch a scan from metres off, and the features go on from there."""
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts at the start, where its result stands, and on results that fail or correct their prior by much."""
+        """Acts on results that fail or correct their prior by much, and at the start, where its own stands unless it is worse."""
         is_starting = attempt.history.starting > 0
         if not is_starting and result.ok and attempt.is_small(result):
             return result
         coarse: RegistrationResult = attempt.target.captured(attempt)
-        is_better = coarse.ok and (not result.ok or coarse.inliers > result.inliers)
-        return coarse if is_starting or is_better else result
+        if not (result.ok and coarse.ok):
+            return coarse if coarse.ok else result
+        fewer = result.inliers - coarse.inliers
+        # Two sigma of what is counted.
+        return coarse if fewer < (2 * math.sqrt(result.inliers + coarse.inliers) if is_starting else 0) else result
 
 
 class LessPlanar:

@@ -1,0 +1,56 @@
+"""Where the coarse planes begin a drive: of two places the larger consensus counts, once it is larger than chance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lslam.core.config.odometry import RegistrationConfig
+from lslam.odometry.feature_policies import CoarseStart
+from lslam.registration.attempt import Attempt
+from lslam.registration.history import History
+from lslam.registration.solver import RegistrationResult
+
+FINE, COARSE = (RegistrationResult(np.eye(4), matched=2000, pose_source=name) for name in ("fine", "coarse"))
+
+
+def chosen(fine: int, coarse: int, *, starting: int = 5, prior_m: float = 0.0, failed: str = "") -> str:
+    """Which of two results with so many inliers a policy takes."""
+    config = RegistrationConfig()
+    history = History(config)
+    history.starting = starting
+    other = replace(COARSE, inliers=coarse, ok=failed != "coarse")
+    target: Any = SimpleNamespace(captured=lambda attempt: other)
+    attempt = Attempt(target, None, np.eye(4), config, history)
+    result = replace(FINE, inliers=fine, ok=failed != "fine", prior_error=(prior_m, 0.0))
+    return CoarseStart().recover(attempt, result).pose_source
+
+
+@pytest.mark.parametrize(
+    ("fine", "coarse", "wanted"),
+    [
+        # Five scans from a standing start in a street, then 3.3 m ahead: half of the features agree there.
+        (1272, 684, "fine"),
+        # The second step of a cold start at 23 m/s: the road moves with the sensor, and agrees a little better there.
+        (151, 134, "coarse"),
+        (684, 1272, "coarse"), (500, 500, "coarse"),
+    ],
+)  # fmt: skip
+def test_at_the_start_a_consensus_that_is_larger_by_two_sigma_stands(fine: int, coarse: int, wanted: str) -> None:
+    assert chosen(fine, coarse) == wanted
+
+
+@pytest.mark.parametrize(("fine", "coarse", "wanted"), [(151, 134, "fine"), (134, 151, "coarse")])
+def test_later_the_larger_consensus_counts(fine: int, coarse: int, wanted: str) -> None:
+    assert chosen(fine, coarse, starting=0, prior_m=5.0) == wanted
+    assert chosen(fine, coarse, starting=0) == "fine", "a small correction of the prior is not looked at"
+
+
+@pytest.mark.parametrize("starting", [0, 5])
+def test_what_failed_is_not_chosen(starting: int) -> None:
+    assert chosen(10, 900, starting=starting, prior_m=5.0, failed="coarse") == "fine"
+    assert chosen(900, 10, starting=starting, prior_m=5.0, failed="fine") == "coarse"
