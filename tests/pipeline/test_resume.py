@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stops import die_at, interrupted
 from stub_sequences import Stub, noise, sample, with_points
 
 import lslam
@@ -30,7 +31,6 @@ from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.maps import clean
 from lslam.odometry.frontend import checkpoints
 from lslam.odometry.frontend.checkpoints import CheckpointSchedule
-from lslam.pipeline.watch import Watch
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
 
@@ -97,26 +97,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
 @pytest.fixture
 def at_every_scan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CheckpointSchedule, "is_due", True)
-
-
-def interrupted(stage: str, after: int) -> Watch:
-    """Asks to stop after so many scans of a stage."""
-    left, now = [after], [""]
-
-    def step() -> None:
-        left[0] -= now[0] == stage
-
-    return Watch(lambda name, total: now.__setitem__(0, name), step, lambda outcome: None, lambda: left[0] <= 0)
-
-
-def die_at(scan: int) -> Callable[[int], None]:
-    """Something that ends the run at once when a scan is read, as the second signal does."""
-
-    def on_read(index: int) -> None:
-        if index == scan:
-            raise KeyboardInterrupt
-
-    return on_read
 
 
 VARIANTS: list[tuple[Callable[[], Stub], tuple[str, ...]]] = [
