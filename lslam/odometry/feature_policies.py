@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 from lslam.core.config.odometry import RecoveryConfig
@@ -10,6 +9,7 @@ from lslam.odometry.feature_solver import remap_solution
 from lslam.odometry.feature_target import MIN_FEATURES
 from lslam.registration.attempt import Attempt, Policy
 from lslam.registration.policies import AtRest
+from lslam.registration.robust import is_more
 from lslam.registration.solver import RegistrationResult
 
 
@@ -24,9 +24,8 @@ class CoarseStart:
         coarse: RegistrationResult = attempt.target.captured(attempt)
         if not (result.ok and coarse.ok):
             return coarse if coarse.ok else result
-        fewer = result.inliers - coarse.inliers
-        # Two sigma of what is counted.
-        return coarse if fewer < (2 * math.sqrt(result.inliers + coarse.inliers) if is_starting else 0) else result
+        is_worse = is_more(result.inliers, coarse.inliers) if is_starting else result.inliers >= coarse.inliers
+        return result if is_worse else coarse
 
 
 class LessPlanar:

@@ -19,7 +19,7 @@ from lslam.registration.history import History
 from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.preprocessing.ground import Z
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import Annealing, is_more
 from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.start_search import MUCH, START_STEP, start_offsets
 
@@ -195,8 +195,8 @@ class FeatureTarget(Target):
         tried = [on_coarse(T_prior @ T, 2 * START_STEP) for T in offsets]
         agree = [edges_at(one) for one in tried]
         most, usual = max(agree, default=0), max(edges_at(result), 0)
-        is_more = most > MUCH * usual and most - usual > 2 * np.sqrt(most + usual)
-        return tried[int(np.argmax(agree))] if is_more else result
+        is_clear = most > MUCH * usual and is_more(most, usual)
+        return tried[int(np.argmax(agree))] if is_clear else result
 
     def _planes(self) -> FeatureMap:
         """The feature map, or one made of the last scan alone."""

@@ -92,3 +92,8 @@ class UsualAgreement(Stateful):
     def relax(self) -> None:
         """Expect less after a bad scan, so that a place that has changed for good is accepted after a few."""
         self.usual *= self.RELAXING
+
+
+def is_more(count: int, other: int) -> bool:
+    """Whether one count is larger than another by more than two sigma of both, as those of independent events."""
+    return count - other > 2 * math.sqrt(count + other)

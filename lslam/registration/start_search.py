@@ -19,7 +19,7 @@ from lslam.registration.optimiser import Correspondences, Limits, optimise
 from lslam.registration.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thin
 from lslam.registration.residuals import MEANS
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import Annealing, is_more
 from lslam.registration.solver import RegistrationResult, solve, voxel_terms
 
 Floats = NDArray[np.float64]
@@ -213,7 +213,7 @@ def is_much_more(ours: Flags, others: Flags, margin: float = MUCH) -> bool:
     McNemar's test of paired shares at two sigma, on the points that agree at one of the poses only.
     """
     won, lost = np.count_nonzero(ours & ~others), np.count_nonzero(others & ~ours)
-    return bool(np.count_nonzero(ours) > margin * np.count_nonzero(others) and won - lost > 2 * np.sqrt(won + lost))
+    return bool(np.count_nonzero(ours) > margin * np.count_nonzero(others) and is_more(int(won), int(lost)))
 
 
 def distinct(results: list[RegistrationResult], known: Floats) -> list[RegistrationResult]:

@@ -33,8 +33,8 @@ def first_pose(decided: list[Tracked], initial_scans: int, create: Callable[[], 
         assert scan is not None
         target.update(scan, priors[k], empty.register(scan, prepared, priors[k]))
     assert first.loaded.scan is not None
-    found = target.register(first.loaded.scan, first.loaded.prepared, priors[0], is_near=True)
-    return found.T_world_lidar if found.is_accepted and len(found.degenerate) == 0 else first.result.T_world_lidar
+    result = target.register(first.loaded.scan, first.loaded.prepared, priors[0], is_near=True)
+    return result.T_world_lidar if result.is_accepted and len(result.degenerate) == 0 else first.result.T_world_lidar
 
 
 def _priors(decided: list[Tracked]) -> list[MotionPrior]:
@@ -43,10 +43,10 @@ def _priors(decided: list[Tracked]) -> list[MotionPrior]:
     A scan that was taken before the speed was known moved as the first one that knows it.
     """
     sweeps = [tracked.sweep for tracked in decided]
-    known = next((sweep for sweep in sweeps if len(sweep.times) > 1), sweeps[0])
+    usual = next((sweep for sweep in sweeps if len(sweep.times) > 1), sweeps[0])
     out = []
     for tracked in decided:
-        sweep = tracked.sweep if len(tracked.sweep.times) > 1 else known
+        sweep = tracked.sweep if len(tracked.sweep.times) > 1 else usual
         change = tracked.result.T_world_lidar @ se3.inverse(sweep.pose)
         out.append(replace(sweep, poses=change @ sweep.poses, covariance=None, link=None))
     return out

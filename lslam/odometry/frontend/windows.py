@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Iterator
 from copy import deepcopy
@@ -20,6 +19,7 @@ from lslam.odometry.frontend.tracker import Loaded
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import NEIGHBOURS, Course
 from lslam.odometry.integrity.monitor import IntegrityMonitor
+from lslam.registration.robust import is_more
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class WindowTracker:
         # Instants, ns, and poses of the last middles before the window.
         self._before: list[tuple[int, Floats]] = []
         # The tracker's world in that of the first pose as later scans tell it; None until they do.
-        self._world: Floats | None = None if self._is_looking_back else np.eye(4)
+        self._world: Floats | None = None if self._can_look_back else np.eye(4)
 
     @property
     def middle(self) -> tuple[int, Floats]:
@@ -62,7 +62,7 @@ class WindowTracker:
         return instant_ns, pose if self._world is None else self._world @ pose
 
     @property
-    def _is_looking_back(self) -> bool:
+    def _can_look_back(self) -> bool:
         """Whether the first scans can be registered again on a map of later ones."""
         tracker = self._tracker
         return tracker.begin is not None and tracker.initial_scans > 1 and isinstance(tracker.odometry, Resumable)
@@ -216,7 +216,7 @@ def _displacement2(tracked: Tracked, course: Course) -> float | None:
 def _is_more(ours: list[int], others: list[int]) -> bool:
     """Whether more scans have more inliers than have less, at two sigma: points of one scan agree or do not together."""
     won, lost = (sum(sign * (a - b) > 0 for a, b in zip(ours, others, strict=True)) for sign in (1, -1))
-    return won - lost > 2 * math.sqrt(won + lost)
+    return is_more(won, lost)
 
 
 def _sum(a: dict[str, float], b: dict[str, float]) -> dict[str, float]:

@@ -85,6 +85,7 @@ def tilt_error_deg(run: tuple[Tracked, ...], seed: int, scan: int) -> float:
     return float(np.degrees(np.linalg.norm(np.mean(wrong, axis=0))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["icp", "loam"])
 def test_the_first_scan_is_turned_less_against_later_ones(method: str) -> None:
     """Median of five seeds; without it the first pose is the worst of all."""
