@@ -49,11 +49,11 @@ POINTS = "lio_sam.features=points"
 
 
 @cache
-def walk() -> Stub:
+def walk(seed: int = 100) -> Stub:
     lidar = replace(LIDARS["vlp16"], columns=900)
     receiver = GnssModel(rate_hz=10.0, white=0.02, slow=0.0)
     drive = simulate(
-        "walk", lidar=lidar, seed=100, count=COUNT, imu="icm20948", gnss=receiver, motion_compensated=False
+        "walk", lidar=lidar, seed=seed, count=COUNT, imu="icm20948", gnss=receiver, motion_compensated=False
     )
     return Stub(
         [drive.scan(i) for i in range(COUNT)], drive.ground_truth, drive.calibration, motion_compensated=False,
@@ -86,11 +86,13 @@ def test_a_walk_is_followed_as_closely_as_by_the_same_features_on_a_loose_imu_an
 def test_all_points_may_take_the_place_of_features() -> None:
     assert isinstance(create_odometry(config_of(TIGHT)), LioSam)
     assert isinstance(create_odometry(config_of(TIGHT, POINTS)), LioSamOfPoints)
-    tight, results = ate(walk(), TIGHT, POINTS)
-    loose, _ = ate(walk(), "imu.use=true")
-    assert all(result.status == "ok" for result in results)
-    # 2.6 and 2.1 mm, of which half a millimetre is chance.
-    assert tight < 1.4 * loose
+    ratios = []
+    for seed in (100, 101, 102):
+        tight, results = ate(walk(seed), TIGHT, POINTS)
+        assert all(result.status == "ok" for result in results)
+        ratios.append(tight / ate(walk(seed), "imu.use=true")[0])
+    # Of seeds 0 to 2 at most 0.61; of one walk half a millimetre in two is chance.
+    assert np.median(ratios) < 1.2
 
 
 def test_a_gap_of_the_imu_is_bridged_by_constant_velocity_and_reported() -> None:

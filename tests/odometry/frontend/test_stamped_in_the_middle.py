@@ -28,21 +28,21 @@ COUNT = 30
 
 
 @cache
-def drive() -> SimulatedDrive:
+def drive(seed: int = 0) -> SimulatedDrive:
     """A walk, looking about at up to 110 deg/s, rays fired on the way."""
     lidar = dataclasses.replace(LIDARS["vlp16"], columns=900)
-    return simulate("walk", lidar=lidar, count=COUNT, imu="icm20948", motion_compensated=False)
+    return simulate("walk", lidar=lidar, count=COUNT, imu="icm20948", motion_compensated=False, seed=seed)
 
 
 @cache
-def scans() -> Stub:
-    walk = drive()
+def scans(seed: int = 0) -> Stub:
+    walk = drive(seed)
     loaded = [walk.scan(i) for i in range(COUNT)]
     return Stub(loaded, None, walk.calibration, motion_compensated=False, imu=walk.imu)  # type: ignore[arg-type]
 
 
-def walked(in_the_middle: bool) -> Sequence:
-    fresh = dataclasses.replace(scans(), problems=[], reads=[], notes=[])
+def walked(in_the_middle: bool, seed: int = 0) -> Sequence:
+    fresh = dataclasses.replace(scans(seed), problems=[], reads=[], notes=[])
     return StampedInTheMiddle(fresh) if in_the_middle else fresh
 
 
@@ -53,24 +53,28 @@ def poses_of(sequence: Sequence, method: str, use_imu: bool) -> Floats:
     return np.stack([r.T_world_lidar for r in results])
 
 
-def turn_error_deg(poses: Floats, sequence: Sequence) -> float:
+def turn_error_deg(poses: Floats, sequence: Sequence, seed: int = 0) -> float:
     """Root mean square error of the turns from scan to scan, against the truth at the sequence's stamps.
 
     Half a sweep of looking about is 1 deg or more of each turn; positions hardly tell stamps apart at a walking pace.
     """
-    true = drive().vehicle.poses(sequence.stamps_ns * 1e-9)
+    true = drive(seed).vehicle.poses(sequence.stamps_ns * 1e-9)
     wrong = se3.relative(se3.relative(true[:-1], true[1:]), se3.relative(poses[:-1], poses[1:]))
     return float(np.degrees(np.sqrt(np.mean(so3.angle(wrong[:, :3, :3]) ** 2))))
 
 
 @pytest.mark.parametrize(("method", "use_imu"), [("icp", False), ("icp", True), ("loam", False)])
 def test_poses_are_as_good_wherever_the_stamp_lies(method: str, use_imu: bool) -> None:
-    start, middle = walked(False), walked(True)
-    early, late = poses_of(start, method, use_imu), poses_of(middle, method, use_imu)
-    # Over seeds 0 to 4 0.21 to 1.28 of the error of those stamped at the start (icp), 0.87 and 0.51 at most (with IMU, loam),
-    assert turn_error_deg(late, middle) < 1.5 * turn_error_deg(early, start)
-    # and the sentinel, that they do not belong to the starts, at least 3.9 times the error.
-    assert turn_error_deg(late, start) > 2 * turn_error_deg(late, middle)
+    ratios = []
+    for seed in range(3):
+        start, middle = walked(False, seed), walked(True, seed)
+        early, late = poses_of(start, method, use_imu), poses_of(middle, method, use_imu)
+        own = turn_error_deg(late, middle, seed)
+        ratios.append(own / turn_error_deg(early, start, seed))
+        # The sentinel, that they do not belong to the starts: at least 4.0 times the error over seeds 0 to 4.
+        assert turn_error_deg(late, start, seed) > 2 * own
+    # Over seeds 0 to 4 from 0.21 to 1.28, median 0.68 (icp); at most 0.87 with the IMU, 0.51 of loam.
+    assert np.median(ratios) < 1.25
 
 
 @pytest.mark.parametrize("method", ["icp", "loam"])
