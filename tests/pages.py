@@ -74,5 +74,5 @@ def page(name: str) -> Page:
 
 def every_page() -> list[Page]:
     """The pages at the top and in docs/."""
-    paths = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]
+    paths = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]
     return [page(path.relative_to(ROOT).as_posix()) for path in sorted(paths)]

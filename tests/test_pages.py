@@ -41,8 +41,9 @@ def test_anchors_are_alike_on_every_host(shown: Page) -> None:
 
 
 def test_the_site_has_every_page() -> None:
-    listed = re.findall(r"^  - [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
-    assert sorted(listed) == sorted(path.name for path in (ROOT / "docs").glob("*.md"))
+    listed = re.findall(r"^ +- [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    docs = ROOT / "docs"
+    assert sorted(listed) == sorted(path.relative_to(docs).as_posix() for path in docs.rglob("*.md"))
 
 
 def test_the_api_page_names_what_exists() -> None:
@@ -58,7 +59,7 @@ def test_code_cites_only_pages_that_are_here() -> None:
     wrong = []
     for path in [*PACKAGE.rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
         text = path.read_text(encoding="utf-8")
-        cited = re.findall(r"\bdocs/\w+\.md\b|\b[A-Z]+\.md\b", text)
+        cited = re.findall(r"\bdocs/[\w/]+\.md\b|\b[A-Z]+\.md\b", text)
         wrong += [f"{path.relative_to(ROOT)}: {name}" for name in cited if not (ROOT / name).is_file()]
         # Pages in capitals that nobody outside of the project's making has.
         wrong += [
