@@ -14,7 +14,8 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import tables  # noqa: E402
 
-DOCUMENTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/results.md")}
+PAGES = ("README.md", "docs/results.md", "docs/notes.md")
+DOCUMENTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
 BLOCK = re.compile(r"<!-- table (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
 BLOCKS = [(name, *match) for name, text in DOCUMENTS.items() for match in BLOCK.findall(text)]
 
