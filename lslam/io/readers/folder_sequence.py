@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError, input_errors
 from lslam.core.printable import printable
 from lslam.core.types.scan import Scan, Span
+from lslam.core.types.sequence import readable
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.point_cloud import PointCloud
-from lslam.io.formats.point_files import read_points
-from lslam.io.formats.point_records import KITTI, PointRecord
+from lslam.io.formats.point_files import check_size, read_array, read_bytes, read_points, record_of
+from lslam.io.formats.point_records import KITTI, PointRecord, name_columns, parse_record
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.io.formats.state_files import DAMAGE, HEADERS
 from lslam.io.readers.ground_truth import Voice, load_poses
@@ -25,13 +26,13 @@ from lslam.io.readers.listing import check_stamps
 from lslam.io.readers.point_clock import PointClock, open_clock, read_samples
 from lslam.io.readers.point_times import Sample, azimuth_times
 from lslam.io.readers.point_units import in_metres, settle_unit
-from lslam.io.readers.scan_records import scan_record
 from lslam.io.readers.scan_stamps import rows_of_scans
 from lslam.io.readers.sequence_on_disk import SequenceOnDisk
 from lslam.io.readers.sidecars import compensation_note, load_streams, per_point_folder, read_info, stated_times
 
 Matrix = NDArray[np.float64]
 _PER_POINT: dict[str, Any] = {"t": np.float32, "ring": np.uint16}
+_LOOKED_AT = 3
 
 
 @dataclass(kw_only=True)
@@ -161,3 +162,36 @@ def _read_per_point(
         if values.shape != (count,):
             raise InputError(f"{path}: {name} has shape {values.shape} for a scan of {count} points")
     return held.get("t"), held.get("ring")
+
+
+def scan_record(files: list[Path], info: SequenceInfo, voice: Voice) -> PointRecord | None:
+    """The record of `.bin` files and plain arrays, None where fields have names. Raises InputError when none or several fit."""
+    suffix = files[0].suffix.lower()
+    if suffix not in (".bin", ".npy"):
+        return None
+    some = np.unique(np.linspace(0, len(files) - 1, min(len(files), _LOOKED_AT)).astype(int)).tolist()
+    read = read_bytes if suffix == ".bin" else read_array
+    raw = {files[k]: data for k, data in readable(some, lambda k: read(files[k]))}
+    tables = [table for table in raw.values() if not table.dtype.names]
+    if suffix == ".npy" and not tables:
+        return None
+    if info.bin_record is not None:
+        record = parse_record(info.bin_record)
+        misfits = [path for path, data in raw.items() if suffix == ".bin" and len(data) % record.size]
+        if 2 * len(misfits) > len(raw):
+            check_size(misfits[0], raw[misfits[0]], record)
+        voice.notes.append(f"points of {len(record.names)} columns, {record}, as stated")
+        return record
+    if suffix == ".bin":
+        record, reason = record_of(raw)
+        sentence = f"points of {record.size} bytes, {record}, by their values: {reason}"
+    else:
+        if len({table.shape[1] for table in tables}) > 1 or tables[0].shape[1] < 4:
+            return None
+        names = name_columns(tables)
+        record = PointRecord(names, (tables[0].dtype.str,) * len(names))
+        sentence = f"points of {len(names)} columns, {' '.join(names)}, by their values"
+    if record.names != KITTI.names or (suffix == ".bin" and record != KITTI):
+        unread = record.unread()
+        voice.notes.append(sentence + (f"; {unread}, nothing says what they are" if unread else ""))
+    return record
