@@ -27,7 +27,7 @@ from lslam.io.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.io.formats.time_columns import read_stamps
 from lslam.io.formats.trajectory_files import read_times, read_trajectory
-from lslam.io.readers.name_stamps import stamps_in_names
+from lslam.io.readers.scan_stamps import stamps_in_names
 from lslam.osm.bounds import Bounds
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.overpass import kept_reply

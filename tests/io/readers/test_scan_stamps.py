@@ -12,7 +12,7 @@ from sequence_builders import scans
 from lslam.core.errors import InputError
 from lslam.io.formats.point_files import read_points
 from lslam.io.readers import open_sequence
-from lslam.io.readers.name_stamps import stamps_in_names
+from lslam.io.readers.scan_stamps import stamps_in_names
 
 START_NS = 1_670_403_902_035_281_229
 STAMPS = START_NS + np.arange(25) * 100_000_000 + np.random.default_rng(1).integers(0, 2_000_000, 25)
