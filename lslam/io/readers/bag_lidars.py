@@ -1,22 +1,37 @@
-"""Which LiDARs share a topic of a bag: they are told apart by the frame of their messages, and by Livox's `lidar_id`."""
+"""LiDARs of a bag: which share a topic, which publish a revolution in several messages, and where sensors sit."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.errors import UsageError
-from lslam.io.formats.bag_files import BagTopic
-from lslam.io.readers.bag_halves import Halves
+from lslam.core.errors import InputError, UsageError
+from lslam.core.types.scan import NO_RING, is_measured
+from lslam.io.formats.bag_files import Bag, BagTopic, read_header
+from lslam.io.formats.point_cloud import PointCloud
+from lslam.io.formats.pointcloud2 import decode_livox, decode_pointcloud2
 from lslam.io.readers.ground_truth import Voice
 
 ALL = "all"
 UNNAMED = "unnamed"
+Stamps = NDArray[np.int64]
+
+_MOST = 40  # parts of a revolution; more messages of one stamp come from a clock that stands still
+_STAMPS_LOOKED_AT = 40  # stamps; of more of them so many are looked at before the recording is read
+_BINS = 90  # of azimuth
+_FULL = 5 / 6  # of all directions, by 12 deg: the sensor turns, and what it sees again is another revolution
+_SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at their seams
+
+# Further messages of a scan, by the first of them.
+Halves = Mapping[int, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -89,3 +104,127 @@ def _wished(topic: BagTopic, counts: Counter[str], wanted: str) -> list[str]:
             f"--lidar-frame {wanted}: no message of {topic.name} is of {strange[0]!r}; choose among:\n{flags}"
         )
     return list(dict.fromkeys(chosen))
+
+
+def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
+    """The points of message `k`, and ns from its header's stamp to the base of their times.
+
+    Raises InputError when it is damaged.
+    """
+    where = Path(f"{bag.path}, {topic.name}, message {k}")
+    data = bag.message(topic, k)
+    if not topic.type.endswith("CustomMsg"):
+        return decode_pointcloud2(bag.decode(topic, data), where), 0
+    header = read_header(topic, data)
+    cloud, timebase = decode_livox(data, header.end, topic.encoding == "ros1", header.order, where)
+    shift = timebase - header.stamp_ns
+    return cloud, shift if abs(shift) < 10**9 else 0
+
+
+def put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[PointCloud, int, tuple[int, ...]]:
+    """The cloud of messages of one stamp, ns from it to the base of their times, and which messages add to the first.
+
+    Raises InputError when one is damaged.
+    """
+    cloud, shift = read_cloud(bag, topic, group[0])
+    parts = []
+    for k in group[1:]:
+        more, base = read_cloud(bag, topic, k)
+        whole = join(cloud, more, base - shift)
+        if whole is not None and len(more):
+            cloud = whole
+            parts.append(k)
+    return cloud, shift, tuple(parts)
+
+
+def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, frames: list[str], voice: Voice) -> Halves:
+    """Which of `messages` (N,), by their stamps (N,) and frames, are further parts of a scan; said in `voice`.
+
+    On many stamps not all are looked at: what is no part of a scan after all is left out when the scan is read.
+    """
+    by_stamp: dict[tuple[int, str], list[int]] = {}
+    for message, stamp, frame in zip(messages.tolist(), stamps.tolist(), frames, strict=True):
+        by_stamp.setdefault((stamp, frame), []).append(message)
+    groups = [tuple(group) for (stamp, _), group in by_stamp.items() if stamp and 1 < len(group) <= _MOST]
+    if not groups:
+        return {}
+    parts: dict[int, tuple[int, ...]] = {}
+    for n in np.unique(
+        np.linspace(0, len(groups) - 1, min(len(groups), _STAMPS_LOOKED_AT)).round().astype(int)
+    ).tolist():
+        parts[n] = ()
+        with suppress(InputError):
+            parts[n] = put_together(bag, topic, groups[n])[2]
+    if not any(parts.values()):
+        return {}
+    halves = {group[0]: others for n, group in enumerate(groups) if (others := parts.get(n, group[1:]))}
+    sample = "" if len(parts) == len(groups) else f", as {sum(map(bool, parts.values()))} of {len(parts)} looked at are"
+    voice.notes.append(
+        f"{topic.name}: {len(halves)} scans come in several messages of one stamp, which see other directions, rings or times: "
+        f"put together{sample}"
+    )
+    return halves
+
+
+def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
+    """Both as one cloud in the order they were measured, where they are parts of one scan; None where they are not.
+
+    later_ns : of the base of b's times, which are ns then
+    """
+    if not len(a) or not len(b):
+        return a if len(a) else b
+    if later_ns:
+        a, b = _moved(a, 0), _moved(b, later_ns)
+    is_alike = (a.times is None) == (b.times is None) and (a.rings is None) == (b.rings is None)
+    if not is_alike or not _is_complement(a.select(is_measured(a.points)), b.select(is_measured(b.points))):
+        return None
+    first, last = a, b
+    if a.times is not None and b.times is not None and _when(b.times)[1] < _when(a.times)[1]:
+        first, last = b, a
+    of_last = {clock.name: clock.values for clock in last.clocks}
+    clocks = (
+        replace(clock, values=np.concatenate([clock.values, of_last[clock.name]]))
+        for clock in first.clocks
+        if clock.name in of_last
+    )
+    columns = {name: (getattr(first, name), getattr(last, name)) for name in ("points", "intensity", "rings")}
+    joined: dict[str, Any] = {
+        name: None if x is None or y is None else np.concatenate([x, y]) for name, (x, y) in columns.items()
+    }
+    return replace(first, clocks=tuple(clocks), **joined)
+
+
+def _moved(cloud: PointCloud, later_ns: int) -> PointCloud:
+    """The cloud with times in ns that count from an earlier base."""
+    clocks = (replace(clock, values=clock.values.astype(np.int64) + later_ns) for clock in cloud.clocks)
+    return replace(cloud, clocks=tuple(clocks))
+
+
+def _is_complement(a: PointCloud, b: PointCloud) -> bool:
+    """Whether b sees other azimuths, other rings, or, of a sensor that does not turn, at another time."""
+    of_a, of_b = _azimuths(a), _azimuths(b)
+    if np.minimum(of_a, of_b).sum() <= _SHARED * min(of_a.sum(), of_b.sum()):
+        return True
+    if a.rings is not None and b.rings is not None:
+        own = b.rings[b.rings != NO_RING]
+        if len(own) and not np.isin(own, a.rings).any():
+            return True
+    is_turning = max(float(of.reshape(-1, 3).any(axis=1).mean()) for of in (of_a, of_b)) > _FULL
+    if is_turning or a.times is None or b.times is None:
+        return False
+    (a0, _, a1), (b0, _, b1) = _when(a.times), _when(b.times)
+    shorter = min(a1 - a0, b1 - b0)
+    return shorter > 0 and min(a1, b1) - max(a0, b0) <= _SHARED * shorter
+
+
+def _azimuths(cloud: PointCloud) -> NDArray[np.int64]:
+    """(90,) points of each 4 deg."""
+    return np.histogram(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0])), _BINS, (-180, 180))[0]
+
+
+def _when(times: NDArray[Any]) -> tuple[float, float, float]:
+    """Beginning, middle and end of times, in their unit, strays left out; zeros where there are none."""
+    values = times.astype(np.float64)
+    values = values[np.isfinite(values)]
+    begin, middle, end = np.percentile(values, (1, 50, 99)) if len(values) else (0.0, 0.0, 0.0)
+    return float(begin), float(middle), float(end)

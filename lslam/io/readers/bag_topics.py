@@ -19,8 +19,7 @@ from lslam.io.formats.packet_makers import is_packets, maker_by_name, not_decode
 from lslam.io.formats.packet_messages import packet_topics
 from lslam.io.formats.pointcloud2 import livox_id
 from lslam.io.formats.stamp_texts import seconds_text
-from lslam.io.readers.bag_halves import find_halves
-from lslam.io.readers.bag_lidars import ScanIndex, choose_lidars, name_lidars
+from lslam.io.readers.bag_lidars import ScanIndex, choose_lidars, find_halves, name_lidars
 from lslam.io.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, runs, say_jitter, stands_still
 from lslam.io.readers.ground_truth import Voice
 
