@@ -23,8 +23,7 @@ from lslam.io.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.io.formats.packet_messages import is_decoded
 from lslam.io.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
-from lslam.io.readers.bag_lidars import UNNAMED, Halves, ScanIndex, choose_lidars, put_together
-from lslam.io.readers.bag_links import Links, places_of
+from lslam.io.readers.bag_lidars import UNNAMED, Halves, Links, ScanIndex, choose_lidars, places_of, put_together
 from lslam.io.readers.bag_packets import open_packets
 from lslam.io.readers.bag_topics import (
     GNSS,
