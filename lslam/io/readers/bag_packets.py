@@ -19,8 +19,7 @@ from lslam.io.formats.ouster_packets import OusterSensor, parse_metadata, read_m
 from lslam.io.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
 from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.pcap_ouster import open_with_metadata
-from lslam.io.readers.pcap_revolutions import Integers, Opened, metadata_beside
-from lslam.io.readers.pcap_velodyne import open_velodyne
+from lslam.io.readers.pcap_revolutions import Integers, Opened, metadata_beside, open_velodyne
 
 # The frame of the points that `lslam.io.formats.ouster_packets` makes, as its driver calls it.
 _OUSTER_FRAME = "os_sensor"
