@@ -18,8 +18,7 @@ from lslam.io.formats.bag_streams import read_text
 from lslam.io.formats.ouster_packets import OusterSensor, parse_metadata, read_metadata
 from lslam.io.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
 from lslam.io.readers.ground_truth import Voice
-from lslam.io.readers.pcap_ouster import open_with_metadata
-from lslam.io.readers.pcap_revolutions import Integers, Opened, metadata_beside, open_velodyne
+from lslam.io.readers.pcap_revolutions import Integers, Opened, metadata_beside, open_velodyne, open_with_metadata
 
 # The frame of the points that `lslam.io.formats.ouster_packets` makes, as its driver calls it.
 _OUSTER_FRAME = "os_sensor"

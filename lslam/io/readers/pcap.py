@@ -19,8 +19,7 @@ from lslam.io.formats.pcap_files import Datagrams, read_datagrams
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import list_scans
-from lslam.io.readers.pcap_ouster import open_ouster
-from lslam.io.readers.pcap_revolutions import Opened, Revolutions, open_velodyne, read_scan
+from lslam.io.readers.pcap_revolutions import Opened, Revolutions, open_ouster, open_velodyne, read_scan
 from lslam.io.readers.sequence_on_disk import SequenceOnDisk
 from lslam.io.readers.sidecars import calibration_over, compensation_note, load_streams, read_info, stated_times
 
