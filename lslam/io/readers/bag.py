@@ -39,8 +39,14 @@ from lslam.io.readers.clocks import ahead_of
 from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import measured_rate
 from lslam.io.readers.pcap_revolutions import Opened, Revolutions, read_scan
-from lslam.io.readers.point_clock import open_clock, read_samples
-from lslam.io.readers.point_stamps import onto_recording, point_stamps, points_off, step_against
+from lslam.io.readers.point_clock import (
+    onto_recording,
+    open_clock,
+    point_stamps,
+    points_off,
+    read_samples,
+    step_against,
+)
 from lslam.io.readers.point_times import Sample
 from lslam.io.readers.point_units import in_metres, settle_unit
 from lslam.io.readers.sequence_on_disk import SequenceOnDisk

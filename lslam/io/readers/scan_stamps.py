@@ -19,7 +19,7 @@ from lslam.io.formats.text_tables import read_rows
 from lslam.io.readers.clocks import Clock, agree, onto, say_jitter, stands_still
 from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import check_stamps, file_numbers, filled_stamps, load_stamps, rows_of
-from lslam.io.readers.point_stamps import PointStamps, point_stamps
+from lslam.io.readers.point_clock import PointStamps, point_stamps
 
 Stamps = NDArray[np.int64]
 _STEP = 1.5  # median intervals, from which on a gap is held against other clocks
