@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from osm_builders import square_at
 
-from lslam.io.formats.osm_rings import footprints_from_rings, join_rings
+from lslam.io.formats.osm_buildings import footprints_from_rings, join_rings
 
 
 @given(st.permutations(range(8)), st.lists(st.booleans(), min_size=8, max_size=8), st.integers(1, 7))
