@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,28 @@ from lslam.core.printable import shown
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.text_tables import TextTable, looks_like_header
-from lslam.io.formats.time_columns import find_clock, unread_columns
-from lslam.io.formats.trajectory_columns import named_columns, placed_columns
+from lslam.io.formats.time_columns import SECOND_NS, find_clock, is_index, tokens_of, unit_of_fraction, unread_columns
 
 Floats = NDArray[np.float64]
 # A path that strays so far from a line, in parts of its length, has bends, in which a body turns.
 BENT = 0.01
+Prefix = tuple[str, ...]
+_POSITIONS = ("position", "positions", "pos", "translation", "trans", "point", "p", "t", "xyz")
+_ROTATIONS = ("orientation", "ori", "rotation", "quaternion", "quat", "rot", "q")
+# Words before a bare x, y or z that leave it a position.
+_BODIES = frozenset((
+    "field", "pose", "poses", "gt", "est", "ref", "true", "truth", "ground", "groundtruth", "reference", "utm", "enu", "world",
+    "map", "odom", "lidar", "base", "imu", "body", "cam", "camera", "local", "global", "prism", "leica", "rtk", "gps", "gnss",
+))  # fmt: skip
+_EARTH = {
+    **dict.fromkeys(("east", "easting", "e"), "x"), **dict.fromkeys(("north", "northing", "n"), "y"),
+    **dict.fromkeys(("up", "u", "height", "h", "altitude", "alt"), "z"),
+}  # fmt: skip
+_WAY_OUT = "name the columns t, x, y, z, qx, qy, qz, qw"
+# Share of a table's quaternions that must have length 1, and how far from it they may be.
+_MOST, _UNIT = 0.95, 0.05
+# Where x, y, z and w stand in a quaternion, by the place of w.
+_XYZW = {"last": [0, 1, 2, 3], "first": [1, 2, 3, 0]}
 
 
 def fits_csv(first: str) -> bool:
@@ -139,3 +156,160 @@ def poses_of(values: Floats, table: TextTable) -> tuple[Floats, bool, list[str]]
         if spread_m[1] > BENT * max(spread_m[0], np.sqrt(len(p))):
             return alone, False, ["the quaternion is the same everywhere on a path that bends: positions alone"]
     return se3.make(so3.from_quaternion(q), p), True, []
+
+
+class PoseColumns(NamedTuple):
+    """columns : of x, y, z and, where there are rotations, qx, qy, qz, qw; leading : the number of columns before, by place
+
+    notes : what was chosen
+    """
+
+    columns: list[int]
+    leading: int
+    notes: list[str]
+
+
+def named_columns(table: TextTable) -> PoseColumns | None:
+    """The columns by their names; None when none of them is a position.
+
+    Raises InputError when an axis is missing, or when several bodies have positions.
+    """
+    path, names = table.path, table.names
+    positions: dict[Prefix, dict[str, int]] = {}
+    rotations: dict[Prefix, dict[str, int]] = {}
+    for k, name in enumerate(names):
+        kind = _kind(tokens_of(name))
+        if kind is not None:
+            is_rotation, prefix, axis = kind
+            (rotations if is_rotation else positions).setdefault(prefix, {}).setdefault(axis, k)
+    # Beside degrees a height is no position.
+    positions = {prefix: axes for prefix, axes in positions.items() if [*axes] != ["z"] or "on Earth" not in prefix}
+    if not positions:
+        return None
+    bodies = {prefix: axes for prefix, axes in positions.items() if len(axes) == 3} or positions
+    # A body without a name goes first.
+    prefix = () if () in bodies else next(iter(bodies))
+    position = bodies.pop(prefix)
+    others = [", ".join(names[k] for k in axes.values()) for axes in bodies.values()]
+    chosen = ", ".join(names[k] for k in position.values())
+    if others and prefix != ():
+        raise InputError(
+            f"{path} has positions of {len(bodies) + 1} bodies: {chosen}; {'; '.join(others[:3])}: keep the columns of "
+            f"one, or {_WAY_OUT}"
+        )
+    if len(rotations) > 1 and prefix not in rotations:
+        raise InputError(f"{path} has rotations of {len(rotations)} bodies beside one position: {_WAY_OUT}")
+    rotation = rotations.get(prefix, next(iter(rotations.values()), {}))
+    missing = [axis for axis in "xyz" if axis not in position]
+    missing += [f"q{axis}" for axis in "xyzw" if rotation and axis not in rotation]
+    if missing:
+        raise InputError(f"{path}: no column for {', '.join(missing)} in the header {', '.join(names)}; {_WAY_OUT}")
+    notes = [f"the position is {chosen}"] if others else []
+    columns = [position[axis] for axis in "xyz"] + [rotation[axis] for axis in "xyzw" if rotation]
+    return PoseColumns(columns, 0, notes)
+
+
+def _kind(words: list[str]) -> tuple[bool, Prefix, str] | None:
+    """Whether a name is of a rotation or else of a position, the words before, and the axis; None when it is of neither.
+
+    `field.pose.pose.position.x`, `p_RS_R_x [m]`, `q_RS_w []`, `pose.orientation.w`, `tx`, `qw`, `gt_x`, `easting`.
+    """
+    if len(words) > 1 and words[-1] == "m":
+        words = words[:-1]
+    if not words:
+        return None
+    *before, last = words
+    if last in _EARTH and _BODIES.union(_POSITIONS).issuperset(before):
+        # A body of its own: beside x, y, z a column `n` is a count.
+        return False, (*before, "on Earth"), _EARTH[last]
+    if len(last) > 1:
+        before, last = [*before, last[:-1]], last[-1]
+    if last not in "xyzw":
+        return None
+    if before[:2] in (["p", "rs"], ["q", "rs"]):  # EuRoC
+        return before[0] == "q", (), last
+    if before and before[-1] in _ROTATIONS:
+        return True, tuple(before[:-1]), last
+    if last == "w":
+        return None
+    if before and before[-1] in _POSITIONS:
+        return False, tuple(before[:-1]), last
+    return (False, tuple(before), last) if _BODIES.issuperset(before) else None
+
+
+def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
+    """The columns of a table without names: times, a position and, if there is one, a quaternion.
+
+    scalar : place of the quaternion's w, `first` or `last`, or empty where nothing says it
+    Raises InputError when no layout fits, or several do.
+    """
+    width = len(table.rows[0].cells)
+    values = np.stack([table.numbers(k) for k in range(width)], axis=1)
+    leading = _leading_times(values)
+    fits = [n for n in leading if width >= n + 7 and _are_unit(values[:, n + 3 : n + 7])]
+    if len(fits) > 1:
+        raise table.error(0, f"{width} columns may be read in {len(fits)} ways: {_WAY_OUT} in a first line")
+    if not fits and width - 3 in leading:
+        return PoseColumns([width - 3, width - 2, width - 1], width - 3, [])
+    if not fits and width != 8:
+        raise table.error(
+            0,
+            f"{width} columns are no trajectory format lslam knows (12 or 16 numbers: KITTI; 8: TUM; 4: time and "
+            f"position; commas: EuRoC or named columns); {_WAY_OUT} in a first line, or --format forces a format",
+        )
+    n = fits[0] if fits else 1
+    by_motion = _scalar_by_motion(values[:, n : n + 3], values[:, n + 3 : n + 7])
+    order = (by_motion or scalar) if table.separator is not None or not scalar else scalar
+    if not order:
+        raise table.error(
+            0,
+            f"a table without a header: {_WAY_OUT} (t,x,y,z,qx,qy,qz,qw), or use --format euroc for integer nanoseconds",
+        )
+    notes = []
+    if scalar and order != scalar:
+        notes.append(
+            f"quaternions are read with w {order}, which fits the motion; --format euroc or tum decides otherwise"
+        )
+    elif by_motion not in ("", order):
+        notes.append(
+            f"quaternions are read with w {order}, the order of TUM, though w {by_motion} fits the motion better: --format "
+            "euroc, or names of the columns, decide otherwise"
+        )
+    if width > n + 7:
+        notes.append(f"{width} columns, of which those from column {n + 8} on are left out")
+    return PoseColumns([n, n + 1, n + 2, *(n + 3 + k for k in _XYZW[order])], n, notes)
+
+
+def _leading_times(values: Floats) -> list[int]:
+    """How many of the first columns of a table (N, K) may be the time: one, two or three."""
+    if values.shape[1] < 4:
+        return []
+    a, b, c = values[np.isfinite(values[:, :3]).all(axis=1), :3].T
+    is_numbered = is_index(a, bool(len(b)) and b.min() >= SECOND_NS)
+    rises = len(b) > 1 and bool(np.all(np.diff(b) > 0))
+    pairs = [unit_of_fraction(whole, rest) is not None for whole, rest in ((a, b), (b, c))]
+    may_be = [True, (is_numbered and rises) or pairs[0], is_numbered and pairs[1]]
+    return [n for n, is_time in enumerate(may_be, start=1) if is_time]
+
+
+def _are_unit(q: Floats) -> bool:
+    """Whether quaternions (N, 4) have length 1, or are zeros everywhere, lost poses aside."""
+    length = np.linalg.norm(q[np.isfinite(q).all(axis=1)], axis=1)
+    if not len(length):
+        return False
+    return float(np.mean(np.abs(length - 1) < _UNIT)) >= _MOST or not length.any()
+
+
+def _scalar_by_motion(positions: Floats, q: Floats) -> str:
+    """`first` or `last`, where w stands by the motion: a vehicle keeps to one direction of its body; empty when unclear."""
+    good = np.isfinite(q).all(axis=1) & np.isfinite(positions).all(axis=1)
+    q, steps = q[good], np.diff(positions[good], axis=0)
+    path_m = np.linalg.norm(steps, axis=1).sum()
+    if path_m < 1.0 or not np.abs(np.linalg.norm(q, axis=1) - 1).max(initial=0.0) < _UNIT:
+        return ""
+    kept = {}
+    for place, columns in _XYZW.items():
+        R = so3.from_quaternion(q[:-1][:, columns])
+        kept[place] = float(np.linalg.norm(np.einsum("nji,nj->ni", R, steps).sum(axis=0)) / path_m)
+    other, best = sorted(kept, key=kept.__getitem__)
+    return best if kept[best] > 0.9 and kept[other] < kept[best] - 0.1 else ""
