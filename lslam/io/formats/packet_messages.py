@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from lslam.io.formats.ouster_packets import IMU_SIZE
 # velodyne_msgs: a header, and packets of a stamp and 1206 bytes. Ouster's, whatever their package: the bytes alone.
 SCANS, PACKET = "VelodyneScan", "PacketMsg"
 _PACKET_BYTES = 8 + velodyne_packets.SIZE  # of velodyne_msgs/VelodynePacket
+# First bytes of data packets, by the makers' manuals and drivers.
+_FIRST_BYTES = {b"\xee\xff": "Hesai", b"\x55\xaa\x05": "RoboSense", b"\xa5\xff\x00\x5a": "RoboSense"}
+_WORDS = {"Hesai": r"hesai|pandar", "RoboSense": r"rslidar|robosense", "Velodyne": "velodyne", "Ouster": "ouster"}
 
 
 def is_decoded(topic: BagTopic) -> bool:
@@ -64,3 +68,31 @@ def is_imu(bag: Bag, topic: BagTopic) -> bool:
         except InputError:
             continue
     return False
+
+
+def maker_by_bytes(data: bytes, size: int) -> str:
+    """The maker of a packet of `size` bytes that begins so, of those not decoded; empty where it may be anybody's."""
+    if data.startswith(b"\xff\xee") and size != 1206:  # as Velodyne's, but for their size
+        return "Hesai"
+    return next((maker for head, maker in _FIRST_BYTES.items() if data.startswith(head)), "")
+
+
+def maker_by_name(*names: str) -> str:
+    """The maker by the names of a topic and its type; empty where they do not tell."""
+    text = " ".join(names).lower()
+    return next((maker for maker, words in _WORDS.items() if re.search(words, text)), "")
+
+
+def is_packets(kind: str) -> bool:
+    """Whether messages of this type hold raw packets, by its name."""
+    return re.search(r"packet|(velodyne|pandar|rslidar)scan|udpframe", kind.rsplit("/", 1)[-1].lower()) is not None
+
+
+def not_decoded(maker: str, where: str = "") -> str:
+    """What a recording holds and the way out, after `holds`; `where` says topic, type and number."""
+    whose = f"a {maker} LiDAR" if maker else "a LiDAR"
+    driver = f"{maker}'s own driver" if maker else "the sensor's driver"
+    return (
+        f"raw packets of {whose}{where} and no clouds; Velodyne's (in bags VelodyneScan) and Ouster's (PacketMsg) are decoded, "
+        f"of these {driver} makes PointCloud2: play the recording into it and record its clouds, or export them as PCD or PLY"
+    )

@@ -15,8 +15,7 @@ from lslam.core.errors import InputError, LslamError, UsageError
 from lslam.io.formats.bag_files import Bag, BagTopic, Header, read_header
 from lslam.io.formats.bag_listing import missing_parts
 from lslam.io.formats.bag_streams import Stream, read_fixes, read_imu
-from lslam.io.formats.packet_makers import is_packets, maker_by_name, not_decoded
-from lslam.io.formats.packet_messages import packet_topics
+from lslam.io.formats.packet_messages import is_packets, maker_by_name, not_decoded, packet_topics
 from lslam.io.formats.pointcloud2 import livox_id
 from lslam.io.formats.stamp_texts import seconds_text
 from lslam.io.readers.bag_lidars import ScanIndex, choose_lidars, find_halves, name_lidars

@@ -14,7 +14,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration
 from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_listing import CAPTURES
-from lslam.io.formats.packet_makers import maker_by_bytes, not_decoded
+from lslam.io.formats.packet_messages import maker_by_bytes, not_decoded
 from lslam.io.formats.pcap_files import Datagrams, read_datagrams
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.readers.ground_truth import Voice
