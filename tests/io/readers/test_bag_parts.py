@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from lslam.core.errors import InputError, UsageError
 from lslam.core.types.sequence import Sequence
-from lslam.io.formats import bag_unpacking
+from lslam.io.formats import bag_files
 from lslam.io.formats.bag_chunks import zstd
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
@@ -240,8 +240,8 @@ def test_of_a_compressed_file_that_was_cut_off_the_beginning_is_read(tmp_path: P
 
 
 def test_what_unpacks_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bag_unpacking, "_LEAST", 1 << 20)
-    monkeypatch.setattr(bag_unpacking, "_MOST", 10)
+    monkeypatch.setattr(bag_files, "_LEAST", 1 << 20)
+    monkeypatch.setattr(bag_files, "_MOST", 10)
     path = tmp_path / "a.mcap.zstd"
     path.write_bytes(zstd().compress(bytes(1 << 24)))
     with pytest.raises(InputError, match="unpacks to more than 10 times its size"):
