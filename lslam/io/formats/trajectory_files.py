@@ -13,16 +13,22 @@ numbers agree with tools that do the same.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from lslam.core.errors import InputError, UsageError, nearest
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.text_tables import read_table
 from lslam.io.formats.time_columns import read_times
 from lslam.io.formats.trajectory_csv import write_euroc
-from lslam.io.formats.trajectory_formats import FORMATS
 from lslam.io.formats.trajectory_lines import find_times, write_kitti, write_tum
 from lslam.io.remote import as_path
+
+if TYPE_CHECKING:
+    from lslam.io.formats.text_tables import TextTable
 
 __all__ = ["find_times", "read_times", "read_trajectory", "write_euroc", "write_kitti", "write_tum"]
 
@@ -56,3 +62,51 @@ def read_trajectory(path: str | Path, format: str | None = None, times: str | Pa
         raise InputError(f"{path} has a header but no poses")
     kind = FORMATS[format] if format else next(kind for kind in FORMATS.values() if kind.fits(table.first))
     return kind.read(table, None if times is None else Path(times))
+
+
+@dataclass(frozen=True)
+class TrajectoryFormat:
+    """One format; its functions are imported when they are asked for.
+
+    module : with `fits_NAME(first line)`, `read_NAME(table, times)` and `write_NAME(path, trajectory)`
+    frame : the body whose poses it holds by convention, empty where the file says
+    has_stamps : whether a file holds them; is_written : whether there is `write_NAME`
+    """
+
+    name: str
+    module: str
+    frame: str = ""
+    has_stamps: bool = True
+    is_written: bool = True
+
+    @property
+    def fits(self) -> Callable[[str], bool]:
+        """Whether a file whose first line of data is this one may be of the format."""
+        return self._function("fits")
+
+    @property
+    def read(self) -> Callable[[TextTable, Path | None], Trajectory]:
+        """The trajectory of a table; the last argument names a file of stamps."""
+        return self._function("read")
+
+    @property
+    def write(self) -> Callable[[Path, Trajectory], None]:
+        """Write a file, atomically."""
+        return self._function("write")
+
+    def _function(self, verb: str) -> Callable[..., Any]:
+        found: Callable[..., Any] = getattr(import_module(self.module), f"{verb}_{self.name}")
+        return found
+
+
+# Asked in this order whether they fit.
+FORMATS = {
+    one.name: one
+    for one in (
+        TrajectoryFormat("kitti", "lslam.io.formats.trajectory_lines", frame="cam0", has_stamps=False),
+        TrajectoryFormat("tum", "lslam.io.formats.trajectory_lines"),
+        TrajectoryFormat("euroc", "lslam.io.formats.trajectory_csv", frame="imu"),
+        TrajectoryFormat("csv", "lslam.io.formats.trajectory_csv", is_written=False),
+    )
+}
+WRITTEN = tuple(name for name, one in FORMATS.items() if one.is_written)

@@ -17,6 +17,8 @@ from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.stamp_texts import seconds_text, seconds_to_ns
 from lslam.io.formats.trajectory_files import (
+    FORMATS,
+    WRITTEN,
     find_times,
     read_times,
     read_trajectory,
@@ -24,7 +26,6 @@ from lslam.io.formats.trajectory_files import (
     write_kitti,
     write_tum,
 )
-from lslam.io.formats.trajectory_formats import FORMATS, WRITTEN
 
 START = 1_317_042_272_349_659_964
 
