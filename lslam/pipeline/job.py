@@ -23,7 +23,7 @@ from lslam.core.types.sequence import Sequence, select
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.frames import main_axis
 from lslam.io.readers import open_sequence
-from lslam.io.readers.raw_drive import with_streams
+from lslam.io.readers.kitti_raw import with_streams
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints

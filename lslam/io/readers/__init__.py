@@ -93,7 +93,7 @@ def open_sequence(
     )  # fmt: skip
     with _readable(name_or_path):
         sequence = _open(folder, overrides)
-    from lslam.io.readers.raw_drive import with_streams
+    from lslam.io.readers.kitti_raw import with_streams
 
     given = [f"--{key.replace('_', '-')}" for key, name in topics.items() if name is not None]
     if given and sequence.kind != "bag":

@@ -15,7 +15,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
-from lslam.io.readers.raw_drive import with_gnss, with_imu
+from lslam.io.readers.kitti_raw import with_gnss, with_imu
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 

@@ -17,7 +17,7 @@ from lslam.core.types.imu import ImuStream
 from lslam.io.formats.stamped_csv import write_imu_csv
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
-from lslam.io.readers.raw_drive import with_gnss, with_imu
+from lslam.io.readers.kitti_raw import with_gnss, with_imu
 
 DRIVE = "2011_09_30_drive_0027"
 
