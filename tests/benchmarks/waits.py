@@ -23,7 +23,7 @@ from lslam.core.config.backend import OsmConfig
 from lslam.io.readers import open_sequence
 from lslam.maps.merge import MapMerger
 from lslam.osm.bounds import Bounds
-from lslam.osm.buffer import OsmBuffer
+from lslam.osm.source import OsmBuffer
 
 
 def help_ms(tries: int = 10) -> float:

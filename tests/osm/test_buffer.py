@@ -20,8 +20,8 @@ from lslam.core.errors import InputError
 from lslam.core.types.building import Building
 from lslam.io.formats.osm_buildings import buildings_of
 from lslam.osm.bounds import Bounds
-from lslam.osm.buffer import OsmBuffer
 from lslam.osm.overpass import fetch_buildings, from_overpass
+from lslam.osm.source import OsmBuffer
 from lslam.osm.walls import OsmMap
 
 ORIGIN = np.array([49.0112, 8.4229, 112.8])
@@ -107,7 +107,7 @@ def test_a_slow_server_does_not_block_the_caller(monkeypatch: pytest.MonkeyPatch
                 waits.append(timeout)
             return super().get(block, timeout)
 
-    monkeypatch.setattr("lslam.osm.buffer.queue", SimpleNamespace(SimpleQueue=Watched, Empty=queue.Empty))
+    monkeypatch.setattr("lslam.osm.source.queue", SimpleNamespace(SimpleQueue=Watched, Empty=queue.Empty))
     server = Server()
     with OsmBuffer(server, ORIGIN, OsmConfig()) as buffer:
         for position in DRIVE:

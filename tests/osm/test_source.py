@@ -17,8 +17,7 @@ from lslam.core.geometry import geodesy, se2
 from lslam.core.types.gnss import GnssStream
 from lslam.osm import source
 from lslam.osm.bounds import Bounds
-from lslam.osm.buffer import OsmBuffer
-from lslam.osm.source import OsmFile, OsmServer, open_osm
+from lslam.osm.source import OsmBuffer, OsmFile, OsmServer, open_osm
 
 ORIGIN = np.array([49.0, 8.4, 115.0])
 
