@@ -14,10 +14,9 @@ from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.types.warned import hearing
 from lslam.io.remote import as_path
-from lslam.pipeline.deliver import in_folder, raise_outcome, write_results
 from lslam.pipeline.job import announce, prepare
 from lslam.pipeline.odometry_pass import estimate_poses
-from lslam.pipeline.stages import finalise_poses, score
+from lslam.pipeline.stages import finalise_poses, in_folder, raise_outcome, score, write_results
 from lslam.pipeline.watch import RunOutcome, Watch
 
 if TYPE_CHECKING:

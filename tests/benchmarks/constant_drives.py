@@ -34,9 +34,9 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
 from lslam.odometry.frontend.point_times import with_point_times
-from lslam.pipeline.deliver import in_folder
 from lslam.pipeline.job import prepare
 from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.stages import in_folder
 from lslam.pipeline.watch import Watch
 from lslam.simulation.scenarios import simulate
 

@@ -20,7 +20,7 @@ START, FOLDER, KERNELS, ODOMETRY, LOOPS, GRAPH, OSM, FILES, MAP, MAP_END, REPORT
 # What begins a stage: module -> name (of a class, behind a dot: of its method) -> stage.
 MARKS = {
     "lslam.pipeline.run": {"run": FOLDER},
-    "lslam.pipeline.deliver": {
+    "lslam.pipeline.stages": {
         "write_back_end": FILES, "make_map": MAP, "make_report": REPORT, "RunFolder.drop_checkpoint": END,
     },
     "lslam.pipeline.odometry_pass": {"_warm_up": KERNELS, "estimate": ODOMETRY},

@@ -20,7 +20,7 @@ from lslam.core.errors import InterruptedRunError
 from lslam.core.types.sequence import StatedTimes
 from lslam.core.types.warned import MOST_ALIKE, hearing, warnings_so_far
 from lslam.odometry.frontend.checkpoints import CheckpointSchedule
-from lslam.pipeline import deliver
+from lslam.pipeline import stages
 from lslam.pipeline.doctor.inspect import inspect
 from lslam.pipeline.watch import Watch
 
@@ -184,7 +184,7 @@ def test_a_failed_run_lists_its_warnings(tmp_path: Path, monkeypatch: pytest.Mon
     def broken(*_: object) -> None:
         raise MemoryError("no room")
 
-    monkeypatch.setattr(deliver, "make_map", broken)
+    monkeypatch.setattr(stages, "make_map", broken)
     with pytest.raises(MemoryError):
         lslam.run(replace(sample(4), motion_compensated=None), config_of(), out=tmp_path / "out")
     facts = manifest(tmp_path / "out")
