@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import logging
 import os
@@ -12,10 +13,12 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from lslam.core.errors import InputError, OutputError, OutputExistsError, cause
+from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError, cause
+from lslam.core.kernels.cache import cache_folder
 from lslam.core.machine import lock
 from lslam.core.printable import file_safe
 from lslam.io.formats.atomic import atomic_write
+from lslam.io.remote import RemotePath
 
 log = logging.getLogger("lslam")
 
@@ -38,6 +41,7 @@ OURS = (
     "trajectory_odometry.tum", "loops.csv", "control.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
     "timing.csv", "scans.csv", "imu_states.csv", "localization.csv", "sessions.csv", "report.html",
 )  # fmt: skip
+UPLOADED_FROM = "spool"
 
 
 class RunFolder:
@@ -322,3 +326,50 @@ def default_folder(sequence: str, method: str, now: float | None = None) -> Path
         folder = folder.with_name(f"{name}-{method}-{stamp}-{number}")
         number += 1
     return folder
+
+
+def spool_of(place: RemotePath) -> Path:
+    """Where the run folder of `place` is filled, the same for every attempt on this machine. Raises OutputError."""
+    folder = cache_folder(UPLOADED_FROM)
+    if folder is None:
+        raise OutputError(f"{place} needs a folder to be filled in: name a folder of your own in XDG_CACHE_HOME")
+    return folder / f"{place.name}-{hashlib.sha256(str(place).encode()).hexdigest()[:12]}"
+
+
+def check_place(place: RemotePath, may_replace: bool) -> None:
+    """Raise OutputExistsError for a run that is not to be replaced, and for objects that no run has put there."""
+    inside = {path.name for path in place.glob("*")}
+    if place.is_file() or inside - {*OURS, KEYFRAMES, REPLIES}:
+        raise OutputExistsError(f"output folder {place} is not a run of lslam; --overwrite replaces runs only")
+    # Without a manifest it is what an upload left that was broken off.
+    if MANIFEST in inside and not may_replace:
+        raise OutputExistsError(
+            f"output folder {place} exists; --resume keeps a run that is finished, --overwrite replaces it, or name another "
+            "with --out"
+        )
+
+
+def upload(folder: Path, place: RemotePath) -> None:
+    """The run in `folder` to `place`, where there is a manifest only as long as all of it is there; then drop `folder`.
+
+    Raises StorageError saying where the results are meanwhile.
+    """
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_result(path.relative_to(folder))]
+    names = [path.relative_to(folder).as_posix() for path in files]
+    try:
+        (place / MANIFEST).unlink(missing_ok=True)
+        for name, path in zip(names, files, strict=True):
+            if name != MANIFEST:
+                (place / name).upload(path)
+        for name, _ in place.files():
+            if name not in names:  # of the run that is replaced
+                (place / name).unlink(missing_ok=True)
+        (place / MANIFEST).upload(folder / MANIFEST)
+    except LslamError as error:
+        raise type(error)(f"{error}; the results are in {folder}, and --resume uploads them") from None
+    log.info("uploaded %d files, %.1f MB, to %s", len(files), sum(p.stat().st_size for p in files) / 1e6, place)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_result(path: Path) -> bool:
+    return path.name != LOCK and path.suffix != ".part" and path.parts[0] != CHECKPOINT

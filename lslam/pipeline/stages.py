@@ -39,8 +39,7 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import build_map, map_checkpoints
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
-from lslam.pipeline.run_folder import KEYFRAMES, RunFolder
-from lslam.pipeline.storage import check_place, spool_of, upload
+from lslam.pipeline.run_folder import KEYFRAMES, RunFolder, check_place, spool_of, upload
 
 if TYPE_CHECKING:
     from lslam.pipeline.rebuild import EarlierRun

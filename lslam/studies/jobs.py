@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lslam.io.remote import RemotePath
-from lslam.pipeline.storage import spool_of
+from lslam.pipeline.run_folder import spool_of
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, is_reusable, read_state, write_state
 from lslam.studies.runner import StudyProgress, Task, WorkerPool, run_tasks

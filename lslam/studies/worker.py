@@ -31,8 +31,7 @@ from lslam.core.stopping import current, is_interrupt
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence, SequenceView
 from lslam.io.remote import RemotePath
-from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST
-from lslam.pipeline.storage import spool_of
+from lslam.pipeline.run_folder import KEYFRAMES, LOG, MANIFEST, spool_of
 from lslam.studies.grid import Job
 from lslam.studies.results_csv import State, write_state
 

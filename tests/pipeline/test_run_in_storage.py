@@ -14,7 +14,7 @@ from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError, OutputExistsError, RunFinishedError, StorageError
 from lslam.io.remote import RemotePath
 from lslam.pipeline.run import run
-from lslam.pipeline.storage import spool_of
+from lslam.pipeline.run_folder import spool_of
 from lslam.pipeline.watch import Watch
 
 CONFIG = Config.model_validate({"report": {"html": False}, "map": {"voxel": 1.0}})
@@ -26,7 +26,7 @@ TIMED = {
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RemotePath]:
     """A run folder to be, and a cache of the test's own beside the kernels'."""
-    monkeypatch.setattr("lslam.pipeline.storage.cache_folder", lambda name: tmp_path / name)
+    monkeypatch.setattr("lslam.pipeline.run_folder.cache_folder", lambda name: tmp_path / name)
     with counted() as root:
         yield root / "results" / "drive7"
 

@@ -13,7 +13,7 @@ from stub_sequences import SAMPLE
 from lslam.core.config.study import BatchConfig, parse_batch
 from lslam.core.types.study import StudyRow
 from lslam.io.remote import RemotePath
-from lslam.pipeline.storage import spool_of
+from lslam.pipeline.run_folder import spool_of
 from lslam.studies.batch import expand_batch, expand_lines, listed_line
 from lslam.studies.cluster import connected
 from lslam.studies.expanded_study import make_runs
@@ -24,7 +24,7 @@ from lslam.studies.results_csv import read_state, read_study_csv
 
 @pytest.fixture
 def bucket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[RemotePath]:
-    monkeypatch.setattr("lslam.pipeline.storage.cache_folder", lambda name: tmp_path / name)
+    monkeypatch.setattr("lslam.pipeline.run_folder.cache_folder", lambda name: tmp_path / name)
     with counted() as root:
         for name in ("drive7", "drive8"):
             for part in ("sequences", "poses"):
