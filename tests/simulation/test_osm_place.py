@@ -21,8 +21,7 @@ from lslam.io.formats.osm_files import read_osm, write_osm
 from lslam.osm.overpass import from_overpass
 from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
-from lslam.simulation.osm_place import buildings_near, read_extract
-from lslam.simulation.osm_streets import DRIVABLE, WALKABLE, find_route, highways
+from lslam.simulation.osm_place import DRIVABLE, WALKABLE, buildings_near, find_route, highways, read_extract
 from lslam.simulation.record import record
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
