@@ -28,6 +28,7 @@ from lslam.simulation.routes import (
     TIGHTEST,
     Route,
     Visit,
+    WayPoints,
     given_route,
     own_route,
     speed_profile,
@@ -37,7 +38,6 @@ from lslam.simulation.scenario_files import INDOORS, Scenario
 from lslam.simulation.scene_mesh import RayScene, Surface
 from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
-from lslam.simulation.waypoints import WayPoints
 
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
 SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.ROOF)

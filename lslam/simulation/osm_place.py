@@ -22,10 +22,9 @@ from lslam.io.formats.osm_data import OsmData
 from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.simulation.moving import Mover
 from lslam.simulation.osm_city import OsmCity, build_osm_city
-from lslam.simulation.routes import TIGHTEST, Route, beside, given_route
+from lslam.simulation.routes import TIGHTEST, Route, WayPoints, beside, given_route
 from lslam.simulation.scenario_files import Scenario
 from lslam.simulation.terrain import Terrain
-from lslam.simulation.waypoints import WayPoints
 
 log = logging.getLogger("lslam")
 

@@ -27,11 +27,10 @@ from lslam.simulation.lidar import Roof, trace
 from lslam.simulation.lidar_models import LidarModel, LidarMount, lidar_named
 from lslam.simulation.moving import Mover, moving_meshes
 from lslam.simulation.osm_place import read_extract
-from lslam.simulation.routes import FIRST_VISIT, Visit
+from lslam.simulation.routes import FIRST_VISIT, Visit, WayPoints, read_way_points
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.scene_mesh import RayScene
 from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
-from lslam.simulation.waypoints import WayPoints, read_way_points
 
 FASTEST = 40.0  # m/s
 LONGEST_STAND = 600.0  # s

@@ -35,8 +35,8 @@ from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
 from lslam.simulation.osm_perturb import read_perturbation
 from lslam.simulation.record import read_mark
+from lslam.simulation.routes import read_way_points
 from lslam.simulation.scenario_files import scenario_named
-from lslam.simulation.waypoints import read_way_points
 from lslam.studies import results_csv
 from lslam.studies.results_csv import read_study_csv, write_study_csv
 

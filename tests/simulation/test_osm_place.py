@@ -23,10 +23,10 @@ from lslam.simulation.built_scenario import whole_map
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_place import DRIVABLE, WALKABLE, buildings_near, find_route, highways, read_extract
 from lslam.simulation.record import record
+from lslam.simulation.routes import WayPoints
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.simulation.scene_mesh import Surface
-from lslam.simulation.waypoints import WayPoints
 
 WALLS = MultiPolygon([footprint_polygon(f) for b in houses() for f in b.footprints])
 

@@ -11,9 +11,9 @@ from lslam.core.errors import ConfigError, UsageError
 from lslam.simulation.flight import HOVER, VIOLENT
 from lslam.simulation.imu import GRAVITY, specific_force
 from lslam.simulation.kinematics import Kinematics
+from lslam.simulation.routes import WayPoints
 from lslam.simulation.scenario_files import scenario_named
 from lslam.simulation.scenarios import SimulatedDrive, simulate
-from lslam.simulation.waypoints import WayPoints
 
 SEEDS = (0, 2)
 

@@ -13,8 +13,8 @@ from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.trajectory_files import write_kitti, write_tum
+from lslam.simulation.routes import read_way_points
 from lslam.simulation.scenarios import simulate
-from lslam.simulation.waypoints import read_way_points
 
 SQUARE = np.array([[0.0, 0.0], [120.0, 0.0], [120.0, 90.0], [0.0, 90.0]])
 
