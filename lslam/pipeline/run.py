@@ -1,4 +1,4 @@
-"""A sequence goes in; a trajectory, a map and an honest report come out: `job` resolves, passes work, `deliver` writes."""
+"""A sequence goes in; a trajectory, a map and an honest report come out: `job` resolves, passes work, `stages` write."""
 
 from __future__ import annotations
 
