@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.core.errors import InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import OutputError, OutputExistsError, UsageError, cause
 from lslam.core.geometry import se3
 from lslam.core.geometry.geodesy import frame_change
 from lslam.core.stopping import asking
@@ -23,9 +23,8 @@ from lslam.maps.changes import ChangedCells, MapChange, changed_cells
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.georeference import to_lat_lon
 from lslam.maps.occupancy import Evidence, OccupancyMapper
-from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.pipeline.map_files import read_json
-from lslam.pipeline.map_pass import scan_poser
+from lslam.pipeline.map_pass import scan_poser, scans_again
 from lslam.pipeline.rebuild import EarlierRun, results_of
 from lslam.pipeline.run_folder import MANIFEST
 from lslam.registration.preprocessing.ground import world_up_of
@@ -98,13 +97,10 @@ def compare_runs(
                 mapper.add(scan.points, T @ scan.T_world_lidar)
 
         results = results_of(run)
-        ahead = read_ahead(sequence, scan_poser(results, run.config), run.config.input.workers)
-        for loaded, _ in zip(ahead, results, strict=False):
-            if should_stop():
-                raise InterruptedRunError(INTERRUPTED)
+        poser, numbers = scan_poser(results, run.config), range(len(results))
+        for _, loaded in scans_again(sequence, poser, numbers, run.config, on_step, should_stop, INTERRUPTED):
             if loaded.prepared is not None:
                 enter(cleaner.add(loaded.prepared))
-            on_step()
         enter(cleaner.finish())
         return mapper.evidence()
 

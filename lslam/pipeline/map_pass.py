@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,7 @@ from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.odometry.base import FeatureSource
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import read_ahead
+from lslam.odometry.frontend.tracker import Loaded
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
 from lslam.registration.preprocessing.features import Features
@@ -78,22 +80,36 @@ def build_map(
         return MapMaker(section, spool, None if checkpoints is None else checkpoints.folder, up)
 
     maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
-    for _ in range(done):
-        on_step()
-    first = maker.first_again(done)
-    ahead = read_ahead(sequence, scan_poser(results, config), config.input.workers, first=first)
-    for k, (loaded, _) in enumerate(zip(ahead, results[first:], strict=False), first):
-        is_last = should_stop()
-        if checkpoints is not None and k >= done:
-            checkpoints.offer(k, maker, is_last)
-        if is_last:
-            raise InterruptedRunError(INTERRUPTED)
+    numbers = range(maker.first_again(done), len(results))
+    poser, offer = scan_poser(results, config), None if checkpoints is None else partial(checkpoints.offer, maker)
+    for k, loaded in scans_again(sequence, poser, numbers, config, on_step, should_stop, INTERRUPTED, done, offer):
         if loaded.prepared is not None:
             maker.add(k, loaded.prepared)
-        if k >= done:
-            on_step()
     with asking(should_stop, INTERRUPTED):
         return maker.finish()
+
+
+def scans_again(
+    sequence: Sequence, prepare: Callable[[Scan], Any], numbers: range, config: Config, on_step: Callable[[], None],
+    should_stop: Callable[[], bool], interrupted: str, done: int = 0, offer: Callable[[int, bool], None] | None = None,
+) -> Iterator[tuple[int, Loaded]]:  # fmt: skip
+    """A second pass over raw scans: their numbers, and what `prepare` made of them while the caller works on earlier ones.
+
+    interrupted : message of the InterruptedRunError that is raised when `should_stop` says so
+    done : so many scans an earlier pass is done with; offer : is called with each further number, and whether it is the last
+    """
+    for _ in range(done):
+        on_step()
+    ahead = read_ahead(sequence, prepare, config.input.workers, first=numbers.start)
+    for k, loaded in zip(numbers, ahead, strict=False):
+        is_last = should_stop()
+        if offer is not None and k >= done:
+            offer(k, is_last)
+        if is_last:
+            raise InterruptedRunError(interrupted)
+        yield k, loaded
+        if k >= done:
+            on_step()
 
 
 def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], PosedScan | None]:
@@ -256,7 +272,7 @@ class MapCheckpoints:
         log.info("%s: going on after %d scans", self._what, latest["scans"])
         return maker, int(latest["scans"])
 
-    def offer(self, scans: int, maker: Maker, is_last: bool = False) -> None:
+    def offer(self, maker: Maker, scans: int, is_last: bool = False) -> None:
         """Write a checkpoint after `scans` scans when one is due, or when it is the last."""
         if scans and (is_last or self._checkpoints.schedule.is_due):
             self._checkpoints.write(scans, lambda: {"poses": self._poses, "scans": scans, "maker": maker.state()})
@@ -329,20 +345,14 @@ def build_feature_map(
         keep = None if checkpoints is None else checkpoints.folder
         return FeatureMaker(config.loam.feature_map_voxel, config.preprocess.range_max, keep)
 
-    maker, first = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
-    for _ in range(first):
-        on_step()
-    ahead = read_ahead(sequence, odometry.prepare, config.input.workers, first=first)
-    for k, (loaded, result) in enumerate(zip(ahead, results[first:], strict=False), first):
-        is_last = should_stop()
-        if checkpoints is not None:
-            checkpoints.offer(k, maker, is_last)
-        if is_last:
-            raise InterruptedRunError(FEATURES_INTERRUPTED)
-        if loaded.scan is not None and result.status == "ok":
+    maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
+    numbers, offer = range(done, len(results)), None if checkpoints is None else partial(checkpoints.offer, maker)
+    for k, loaded in scans_again(
+        sequence, odometry.prepare, numbers, config, on_step, should_stop, FEATURES_INTERRUPTED, done, offer
+    ):
+        if loaded.scan is not None and results[k].status == "ok":
             motion = motion_within(loaded.scan, stamps, poses)
-            maker.add(odometry.features_of(loaded.prepared, motion), result.T_world_lidar)
-        on_step()
+            maker.add(odometry.features_of(loaded.prepared, motion), results[k].T_world_lidar)
     with asking(should_stop, FEATURES_INTERRUPTED):
         return maker.finish()
 

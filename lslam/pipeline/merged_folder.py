@@ -25,10 +25,10 @@ from lslam.evaluation.evaluate import evaluate
 from lslam.io.formats.g2o import write_g2o
 from lslam.io.formats.trajectory_files import write_tum
 from lslam.odometry.frontend.checkpoints import Checkpoints
-from lslam.odometry.frontend.register_scans import read_ahead, to_trajectory
+from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.pipeline.back_end_pass import describe
 from lslam.pipeline.map_files import MapNote, write_map
-from lslam.pipeline.map_pass import BuiltMap, MapMaker, scan_poser
+from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, MapMaker, scan_poser, scans_again
 from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
 from lslam.pipeline.outputs import config_text, write_loops
 from lslam.pipeline.rebuild import EarlierRun, open_scans
@@ -213,14 +213,11 @@ def _map(
     for recording, poses in zip(recordings, results, strict=True):
         if recording is None:
             continue
-        ahead = read_ahead(recording, scan_poser(poses, config), config.input.workers)
-        for _, loaded in zip(poses, ahead, strict=False):
-            if watch.should_stop():
-                raise InterruptedRunError("interrupted while the map was built: nothing of it is written")
+        poser, numbers = scan_poser(poses, config), range(len(poses))
+        for k, loaded in scans_again(recording, poser, numbers, config, watch.on_step, watch.should_stop, INTERRUPTED):
             if loaded.prepared is not None:
-                maker.add(number, loaded.prepared)
-            number += 1
-            watch.on_step()
+                maker.add(number + k, loaded.prepared)
+        number += len(poses)
     return maker.finish()
 
 
