@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, cause
+from lslam.core.types.arrays import Longs
 from lslam.io.remote import RemotePath
 
 BLOCK = 1 << 15
@@ -120,7 +121,7 @@ class Topic:
     name: str
     type: str
     encoding: str
-    stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    stamps_ns: Longs = field(default_factory=lambda: np.zeros(0, np.int64))
     where: Pairs = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
     def __len__(self) -> int:

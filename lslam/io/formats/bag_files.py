@@ -20,11 +20,11 @@ from typing import Any, NamedTuple, TypeVar
 from zlib import error as zlib_error
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, OutputError, UsageError, cause, input_errors
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.printable import shown
+from lslam.core.types.arrays import Longs
 from lslam.io.formats.bag_chunks import LARGEST, Topic, damage, unpack, zstd
 from lslam.io.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, packing_of, suffix_of
 from lslam.io.formats.bag_records import ChunkedBag
@@ -78,7 +78,7 @@ class BagTopic:
         return sum(len(topic) for _, topic in self.parts)
 
     @property
-    def stamps_ns(self) -> NDArray[np.int64]:
+    def stamps_ns(self) -> Longs:
         """(N,) when each message was recorded."""
         return np.asarray(self._rows[0], np.int64)
 
@@ -88,7 +88,7 @@ class BagTopic:
         return *self.parts[part], row
 
     @cached_property
-    def _rows(self) -> NDArray[np.int64]:
+    def _rows(self) -> Longs:
         """(3, N) when each message was recorded, its part and its number there."""
         tables = [(t.stamps_ns, np.full(len(t), n), np.arange(len(t))) for n, (_, t) in enumerate(self.parts)]
         rows = np.concatenate([np.stack(table) for table in tables], axis=1)
@@ -225,7 +225,7 @@ def _copies(files: list[list[Topic]]) -> dict[int, int]:
 def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
     """Whether every message is among the others, by topic and time; where one begins or ends outside, no more is compared."""
 
-    def has_all(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> bool:
+    def has_all(stamps: Longs, wanted: Longs) -> bool:
         is_around = len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1]
         return is_around and bool(np.isin(wanted, stamps).all())
 

@@ -10,13 +10,12 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 
-Floats = NDArray[np.float64]
 Transforms = dict[tuple[str, str], Floats]
 
 # sensor_msgs/Imu behind its header, float64: orientation 4, covariance 9, angular velocity 3, covariance 9, acceleration 3.
@@ -32,11 +31,11 @@ class Stream:
     recorded_ns : (N,) int64, when the messages were recorded
     """
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     values: Floats
     frame: str
     topic: str
-    recorded_ns: NDArray[np.int64]
+    recorded_ns: Longs
 
 
 # What a message says: its stamp, ns, its frame and its numbers; None where it says nothing that can be used.

@@ -6,14 +6,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, LslamError, UsageError, cause, input_errors
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import is_file
 from lslam.io.remote import as_path
 
-Floats = NDArray[np.float64]
 LIDAR_TO_CAMERA = ("Tr", "Tr_velo_to_cam", "Tr_velo_cam")
 _ROW = re.compile(r"-\s*\[(.*)\]\s*$")
 

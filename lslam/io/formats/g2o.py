@@ -10,13 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import noise, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 from lslam.io.formats.atomic import write_text
-
-Floats = NDArray[np.float64]
 
 _UPPER = np.triu_indices(6)
 # From gtsam's order of `noise.to_body` (rotation first) to g2o's, and from rad to the quaternion's vector part.

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, cause
+from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.osm_data import DECIMALS
-
-Floats = NDArray[np.float64]
 
 
 def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, Any]) -> None:
@@ -56,7 +55,7 @@ def write_areas(
     write_text(path, json.dumps(tree, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def read_line(path: Path) -> NDArray[np.float64]:
+def read_line(path: Path) -> Floats:
     """The one way of a file as (N, 3) lat, lon (deg), height (m, 0 where unknown), WGS84; a point is a way of one position.
 
     Raises InputError naming the file: unreadable, no GeoJSON, without exactly one line, with positions off the Earth.

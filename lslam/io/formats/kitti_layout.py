@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.geometry import portable, se3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.point_files import write_bin
@@ -38,17 +39,17 @@ def write_scan(
         np.savez_compressed(stream, **known)
 
 
-def write_times(folder: Path, stamps_ns: NDArray[np.int64]) -> None:
+def write_times(folder: Path, stamps_ns: Longs) -> None:
     """Write `times.txt`, seconds with all nine decimals."""
     write_text(folder / "times.txt", "".join(f"{seconds_text(int(stamp))}\n" for stamp in stamps_ns))
 
 
-def write_calib(folder: Path, T_cam0_lidar: NDArray[np.float64]) -> None:
+def write_calib(folder: Path, T_cam0_lidar: Floats) -> None:
     """Write `calib.txt` with the line `Tr`."""
     write_text(folder / "calib.txt", "Tr: " + " ".join(f"{v:.12e}" for v in T_cam0_lidar[:3].ravel()) + "\n")
 
 
-def in_camera(truth: Trajectory, T_cam0_lidar: NDArray[np.float64]) -> Trajectory:
+def in_camera(truth: Trajectory, T_cam0_lidar: Floats) -> Trajectory:
     """LiDAR poses as KITTI has them: camera 0 in camera 0 at the start."""
     poses = portable.product(portable.product(T_cam0_lidar, truth.poses), se3.inverse(T_cam0_lidar))
     return Trajectory(truth.stamps_ns, poses, "cam0", truth.has_stamps, source=truth.source)

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
+from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write
@@ -192,7 +192,7 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
     return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
 
 
-def _header(laspy: Any, offset: NDArray[np.float64], wkt: str) -> Any:
+def _header(laspy: Any, offset: Floats, wkt: str) -> Any:
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.scales, header.offsets = np.full(3, SCALE), offset
     header.creation_date = date(1970, 1, 1)  # laspy would put today's
@@ -205,7 +205,7 @@ def _header(laspy: Any, offset: NDArray[np.float64], wkt: str) -> Any:
     return header
 
 
-def _survey(cloud: Cloud) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _survey(cloud: Cloud) -> tuple[Floats, Floats, float]:
     """Smallest and largest coordinates (3,), m, and the largest intensity; zeros for nothing."""
     low, high, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
     for block in cloud.blocks():

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.geometry.geodesy import to_local
+from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprints_of
 from lslam.io.formats.osm_data import OsmData, Relation, Way
 from lslam.io.formats.osm_files import read_osm
-
-Floats = NDArray[np.float64]
 
 FARTHEST = 100e3  # m
 STOREY = 3.0  # m, docs/conventions.md

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.point_cloud import PointCloud
 
 IMU_SIZE = 48
 GRAVITY = 9.80665  # m/s2 of the unit g
-Integers = NDArray[np.int64]
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -162,13 +161,13 @@ def _transform(numbers: Any) -> Floats:
     return T
 
 
-def frames_and_times(heads: NDArray[np.uint8]) -> tuple[Integers, Integers]:
+def frames_and_times(heads: NDArray[np.uint8]) -> tuple[Longs, Longs]:
     """(P,) the frame of each packet and the time of its first column, ns, by its bytes (P, 10) at `Profile.positions`."""
     frame, time = _numbers(heads[:, :2], np.dtype("<u2")), _numbers(heads[:, 2:], np.dtype("<u8"))
     return frame[:, 0].astype(np.int64), time[:, 0].astype(np.int64)
 
 
-def points_of(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[PointCloud, Integers]:
+def points_of(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[PointCloud, Longs]:
     """Points of the packets' first returns, column by column, in the sensor's frame, and their times, ns."""
     p = sensor.profile
     body = packets[:, p.head : p.head + sensor.columns * sensor.column_bytes].reshape(-1, sensor.column_bytes)

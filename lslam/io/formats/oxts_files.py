@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.time_columns import read_stamps
 
@@ -31,9 +31,9 @@ class Oxts:
     problems : what was found wrong, one sentence each
     """
 
-    numbers: NDArray[np.int64]
-    stamps_ns: NDArray[np.int64] | None
-    values: NDArray[np.float64]
+    numbers: Longs
+    stamps_ns: Longs | None
+    values: Floats
     problems: list[str]
 
 
@@ -63,7 +63,7 @@ def read_oxts(folder: Path) -> Oxts | None:
     return Oxts(numbers[keep], stamps[rows[keep]], values[keep], problems)
 
 
-def _read_sample(path: Path) -> NDArray[np.float64]:
+def _read_sample(path: Path) -> Floats:
     try:
         words = path.read_text(encoding="utf-8").split()
         values = np.array([float(w) for w in words], np.float64)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Longs
 from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.ouster_packets import IMU_SIZE
@@ -32,7 +33,7 @@ def packet_topics(bag: Bag) -> list[BagTopic]:
     return [t for t in bag.of_type(SCANS, PACKET) if is_decoded(t) and not is_imu(bag, t)]
 
 
-def read_packets(topic: BagTopic, data: bytes) -> tuple[NDArray[np.int64], NDArray[np.uint8], str]:
+def read_packets(topic: BagTopic, data: bytes) -> tuple[Longs, NDArray[np.uint8], str]:
     """Stamps (P,), ns, 0 where there are none, and bytes (P, size) of the packets of a message, and its frame.
 
     Raises InputError when it is cut off.

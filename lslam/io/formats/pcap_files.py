@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError, cause
+from lslam.core.types.arrays import Bools, Longs
 from lslam.io.remote import RemotePath
-
-Integers = NDArray[np.int64]
 
 # First bytes of a pcap: byte order, and ns per unit of the second word of its times.
 _PCAP = {
@@ -47,19 +46,19 @@ class Datagrams:
     """
 
     data: NDArray[np.uint8]
-    stamps_ns: Integers
-    sizes: Integers
-    sources: Integers
-    first: Integers
-    count: Integers
-    begin: Integers
-    length: Integers
+    stamps_ns: Longs
+    sizes: Longs
+    sources: Longs
+    first: Longs
+    count: Longs
+    begin: Longs
+    length: Longs
     loss: str = ""
 
     def __len__(self) -> int:
         return len(self.sizes)
 
-    def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
+    def bytes_at(self, which: Longs, positions: tuple[int, ...]) -> NDArray[np.uint8]:
         """(K, P) the bytes at `positions` of the payloads `which`, which are so long."""
         at = np.repeat(np.array([positions], np.int64), len(which), axis=0)
         piece = np.repeat(self.first[which][:, None], len(positions), axis=1)
@@ -68,7 +67,7 @@ class Datagrams:
             piece += beyond
         return np.asarray(self.data[self.begin[piece] + at])
 
-    def payloads(self, which: Integers) -> NDArray[np.uint8]:
+    def payloads(self, which: Longs) -> NDArray[np.uint8]:
         """(K, size) the payloads `which`, which are of one size."""
         size = int(self.sizes[which[0]]) if len(which) else 0
         out = np.empty((len(which), size), np.uint8)
@@ -98,7 +97,7 @@ def read_datagrams(path: Path) -> Datagrams:
     return _assemble(data, frames, loss)
 
 
-def _frames(path: Path, data: memoryview) -> tuple[Integers, str]:
+def _frames(path: Path, data: memoryview) -> tuple[Longs, str]:
     """(N, 4) begin, captured bytes, stamp (ns) and link type of each frame, and what is lost at the end of the file."""
     magic = bytes(data[:4])
     if magic in _PCAP:
@@ -167,10 +166,10 @@ def _ticks_per_second(options: memoryview, order: str) -> int:
     return 10**6
 
 
-def _assemble(data: NDArray[np.uint8], frames: Integers, loss: str) -> Datagrams:
+def _assemble(data: NDArray[np.uint8], frames: Longs, loss: str) -> Datagrams:
     """The UDP datagrams in the frames; those that lack a piece are left out and counted."""
 
-    def word(at: Integers, size: int = 2) -> Integers:
+    def word(at: Longs, size: int = 2) -> Longs:
         """Big-endian numbers at these places."""
         value = np.zeros(len(at), np.int64)
         for k in range(size):
@@ -214,7 +213,7 @@ def _assemble(data: NDArray[np.uint8], frames: Integers, loss: str) -> Datagrams
     )  # fmt: skip
 
 
-def _datagram_of(address: Integers, number: Integers, is_piece: NDArray[np.bool_]) -> Integers:
+def _datagram_of(address: Longs, number: Longs, is_piece: Bools) -> Longs:
     """(N,) the frame that came first of the datagram that each frame is of.
 
     Pieces of one datagram share sender and number; numbers come again after 65,536 datagrams, never side by side.

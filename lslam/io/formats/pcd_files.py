@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors
+from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.point_cloud import AXES, beyond, organised, packed_columns, text_columns
 
@@ -153,7 +154,7 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
     return text_columns(table, labels, header.kinds) | more
 
 
-def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[NDArray[np.float64], set[int]] | None:
+def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[Floats, set[int]] | None:
     """Numbers of lines in which columns hold bytes in place of digits, a blank or the end of a line among them.
 
     C++ streams a char so: all columns of one byte are read as that. Any other one column of a few bytes is left NaN and named.

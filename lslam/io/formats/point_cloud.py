@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import NO_RING, is_measured
 from lslam.io.formats.time_columns import UNITS_NS
 
@@ -134,9 +135,7 @@ def packed_columns(
     return {name: table[str(k)] for k, name in enumerate(names)} | more
 
 
-def text_columns(
-    table: NDArray[np.float64], names: Sequence[str], kinds: Sequence[np.dtype[Any]]
-) -> dict[str, NDArray[Any]]:
+def text_columns(table: Floats, names: Sequence[str], kinds: Sequence[np.dtype[Any]]) -> dict[str, NDArray[Any]]:
     """Columns of numbers (N, K) that were text, by field; axes hold the digits that they hold, whatever type a header names."""
     columns, k = {}, 0
     for name, kind in zip(names, kinds, strict=True):
@@ -270,12 +269,12 @@ def _two_words(name: str, values: NDArray[Any]) -> Iterator[TimeColumn]:
     yield TimeColumn(f"{name} (float64)", ((high << shift) | low).view(np.float64))
 
 
-def _integers(values: NDArray[Any]) -> NDArray[np.int64] | None:
+def _integers(values: NDArray[Any]) -> Longs | None:
     """The values as int64, 0 where they are not finite; None where some have a fraction or none are numbers."""
     if values.dtype.kind in "iu":
         return values.astype(np.int64)
     if values.dtype.kind != "f":
         return None
     finite = np.where(np.isfinite(values) & (np.abs(values) < 2.0**62), values, 0)
-    whole: NDArray[np.int64] = finite.astype(np.int64)
+    whole: Longs = finite.astype(np.int64)
     return whole if (whole == finite).all() else None

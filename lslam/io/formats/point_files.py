@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError, input_errors
+from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write
@@ -196,7 +197,7 @@ def read_cloud(path: Path) -> ArrayCloud:
     return cloud
 
 
-def coordinate_step(points: NDArray[np.float64]) -> float:
+def coordinate_step(points: Floats) -> float:
     """Step of which all coordinates along an axis are multiples, m, the largest of the axes; 0 for those near the origin."""
     steps = [0.0]
     for column in points.T:

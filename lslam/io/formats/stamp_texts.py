@@ -9,9 +9,9 @@ from decimal import ROUND_HALF_EVEN, Decimal
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Longs
 
 LARGEST_NS = 2**62
 DAY = r"\d{4}[-/]\d\d[-/]\d\d"
@@ -70,7 +70,7 @@ def date_to_ns(text: str) -> int | None:
     return ns
 
 
-def utc_of(stamps_ns: NDArray[np.int64]) -> list[datetime] | None:
+def utc_of(stamps_ns: Longs) -> list[datetime] | None:
     """The instants of stamps (N,) ns, to the microsecond, or None when they are no Unix time: they tell no date then."""
     if not len(stamps_ns) or int(np.min(stamps_ns)) < _FIRST_NS:
         return None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.printable import shown
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.io.formats.atomic import write_text
@@ -32,7 +33,7 @@ def read_stamped_csv(
     columns: Sequence[tuple[str, ...]],
     optional: Sequence[tuple[str, ...]] = (),
     notes: list[str] | None = None,
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[Longs, Floats]:
     """Stamps (N,) ns and values (N, K), one column per entry of `columns`, each entry its accepted names.
 
     Columns of `optional` follow and are NaN where the file has none. The header is the first line; a leading `#` or `%`,
@@ -68,7 +69,7 @@ def read_stamped_csv(
     return (clock.stamps_ns, values) if order is None else (clock.stamps_ns[order], values[order])
 
 
-def _order(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.intp] | None:
+def _order(stamps: Longs, values: Floats) -> NDArray[np.intp] | None:
     """Rows by their stamps, copies once; None where they are so, or where a clock was set back: parts overlap or lie apart."""
     order = np.argsort(stamps, kind="stable")
     rows = np.column_stack([stamps - stamps.min(initial=0), values])[order]
@@ -83,9 +84,7 @@ def _order(stamps: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np
     return None if was_set_back else order
 
 
-def write_stamped_csv(
-    path: Path, names: Sequence[str], stamps_ns: NDArray[np.int64], values: NDArray[np.float64]
-) -> None:
+def write_stamped_csv(path: Path, names: Sequence[str], stamps_ns: Longs, values: Floats) -> None:
     """Write stamps (N,) as `stamp_ns` and values (N, K) under `names`, atomically; both read back exactly."""
     rows = [",".join(["stamp_ns", *names])]
     for stamp, row in zip(stamps_ns.tolist(), values.tolist(), strict=True):

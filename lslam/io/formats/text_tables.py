@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, cause
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.io.formats.stamp_texts import DAY, date_to_ns, seconds_text
 
 _DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
@@ -50,12 +50,12 @@ class TextTable:
         """What is wrong with row `k`, with its place in the file."""
         return InputError(f"{self.path}, line {self.rows[k].number}: {what}")
 
-    def numbers(self, column: int) -> NDArray[np.float64]:
+    def numbers(self, column: int) -> Floats:
         """(N,) float64 of a column, dates in seconds, NaN for what is no number or not there."""
         cells = (row.cells[column] if column < len(row.cells) else "" for row in self.rows)
         return np.array([_number(cell) for cell in cells], np.float64)
 
-    def values(self, columns: list[int]) -> NDArray[np.float64]:
+    def values(self, columns: list[int]) -> Floats:
         """(N, K) float64 of columns, NaN where a number is missing; InputError with the line of a cell that is text."""
         values = np.empty((len(self.rows), len(columns)))
         for k, (_, text, cells) in enumerate(self.rows):
@@ -65,7 +65,7 @@ class TextTable:
                 raise self.error(k, f"not a number in {text[:60]!r}") from None
         return values
 
-    def lost_rows(self, values: NDArray[np.float64], what: str) -> NDArray[np.bool_]:
+    def lost_rows(self, values: Floats, what: str) -> Bools:
         """Where `values` (N, K) of poses hold NaN, which messages call `what`.
 
         Raises InputError when that is everywhere, and with the line of one that is infinite.
@@ -84,7 +84,7 @@ class TextTable:
             if len(row.cells) < width or (len(row.cells) > width and not is_least):
                 raise self.error(k, f"{len(row.cells)} columns where {whose} has {width}")
 
-    def check_increasing(self, stamps_ns: NDArray[np.int64]) -> None:
+    def check_increasing(self, stamps_ns: Longs) -> None:
         """InputError with the first line whose stamp is not after the one before."""
         wrong = np.flatnonzero(np.diff(stamps_ns) <= 0)
         if len(wrong):
@@ -93,7 +93,7 @@ class TextTable:
             how = "repeats the stamp of the line before" if now == before else f"goes back in time from {before} s"
             raise self.error(k, f"{now} s {how}; sort the poses and keep one per stamp")
 
-    def select(self, mask: NDArray[np.bool_]) -> TextTable:
+    def select(self, mask: Bools) -> TextTable:
         """The rows where `mask` (N,) is true."""
         return replace(self, rows=[self.rows[k] for k in np.flatnonzero(mask).tolist()])
 

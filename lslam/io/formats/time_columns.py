@@ -13,15 +13,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Floats, Longs
 from lslam.io.formats.stamp_texts import date_to_ns, seconds_to_ns
 from lslam.io.formats.text_tables import Row, TextTable, read_rows, text_table
 from lslam.io.remote import as_path
 
 log = logging.getLogger("lslam")
-Floats = NDArray[np.float64]
 # The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
 Units = dict[int, int | None]
 UNITS_NS = {
@@ -41,7 +40,7 @@ _STAMPED, _TIMED, _ENDING = 0, 1, 2
 class RowTimes(NamedTuple):
     """stamps_ns : (N,); note : which columns hold them and which might have, empty without others; columns : all of these"""
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     note: str
     columns: set[int]
 
@@ -78,7 +77,7 @@ def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | 
     return RowTimes(_stamps(table, chosen, default_ns), note, others.union(chosen))
 
 
-def read_times(path: str | Path) -> NDArray[np.int64]:
+def read_times(path: str | Path) -> Longs:
     """Stamps (N,) int64 ns that increase, as of KITTI's `times.txt`. Raises InputError for a file without any."""
     stamps = read_stamps(as_path(path), must_increase=True)
     if not len(stamps):
@@ -86,7 +85,7 @@ def read_times(path: str | Path) -> NDArray[np.int64]:
     return stamps
 
 
-def read_stamps(path: Path, must_increase: bool = False) -> NDArray[np.int64]:
+def read_stamps(path: Path, must_increase: bool = False) -> Longs:
     """(N,) int64 ns of a text file, one stamp a line.
 
     The time is in the column that a header names, else in the first one or two; an index before it and columns behind it
@@ -234,7 +233,7 @@ def _increases(values: Floats) -> bool:
     return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > 0.9
 
 
-def _stamps(table: TextTable, units: Units, default_ns: int | None) -> NDArray[np.int64]:
+def _stamps(table: TextTable, units: Units, default_ns: int | None) -> Longs:
     out = np.zeros(len(table.rows), np.int64)
     for column, stated_ns in units.items():
         texts = [row.cells[column] if column < len(row.cells) else "" for row in table.rows]

@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.printable import shown
+from lslam.core.types.arrays import Floats
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.text_tables import TextTable, looks_like_header
 from lslam.io.formats.time_columns import SECOND_NS, find_clock, is_index, tokens_of, unit_of_fraction, unread_columns
 
-Floats = NDArray[np.float64]
 # A path that strays so far from a line, in parts of its length, has bends, in which a body turns.
 BENT = 0.01
 Prefix = tuple[str, ...]

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import so3
+from lslam.core.types.arrays import Longs
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats import trajectory_csv
 from lslam.io.formats.atomic import write_text
@@ -55,7 +55,7 @@ def read_kitti(table: TextTable, times: Path | None) -> Trajectory:
     return without_lost(trajectory)
 
 
-def scans_of(trajectory: Trajectory) -> NDArray[np.int64]:
+def scans_of(trajectory: Trajectory) -> Longs:
     """(N,) numbers of the scans that poses without stamps belong to."""
     return trajectory.stamps_ns // NOMINAL_STEP_NS
 
@@ -144,7 +144,7 @@ def find_times(path: str | Path) -> Path | None:
     return next((c for c in candidates if c.is_file() and c != path.resolve()), None)
 
 
-def _stamps_of_kitti(path: Path, scans: NDArray[np.int64], times: Path | None) -> NDArray[np.int64] | None:
+def _stamps_of_kitti(path: Path, scans: Longs, times: Path | None) -> Longs | None:
     """Stamps of the poses that belong to `scans` (N,), of a file with one for each scan."""
     source = find_times(path) if times is None else times
     if source is None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Bools, Longs
 from lslam.io.formats.point_cloud import PointCloud
 
 SIZE, BLOCKS, SLOTS = 1206, 12, 32
@@ -20,7 +21,6 @@ TURN = 36000  # 0.01 deg
 HOUR_US = 3_600_000_000
 RETURNS = {0x37: "strongest", 0x38: "last", 0x39: "dual"}
 DUAL = 0x39
-Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,13 @@ class Blocks:
     azimuth : (B,) 0.01 deg, unwrapped; times_ns : (B,); ranges, reflectivity : (B, 32) uint16 and uint8 as in the packet
     """
 
-    azimuth: Integers
-    times_ns: Integers
+    azimuth: Longs
+    times_ns: Longs
     ranges: NDArray[np.uint16]
     reflectivity: NDArray[np.uint8]
 
 
-def split_blocks(packets: NDArray[np.uint8], azimuth: Integers, times_ns: Integers, model: VelodyneModel) -> Blocks:
+def split_blocks(packets: NDArray[np.uint8], azimuth: Longs, times_ns: Longs, model: VelodyneModel) -> Blocks:
     """Blocks of `packets` (P, 1206), whose first ones have these unwrapped azimuths and times, (P,).
 
     Of two returns the last is taken, the first of each pair of blocks.
@@ -111,7 +111,7 @@ def split_blocks(packets: NDArray[np.uint8], azimuth: Integers, times_ns: Intege
     return Blocks(unwrapped.ravel()[is_block], times.ravel()[is_block], ranges[is_block], slots[..., 2][is_block])
 
 
-def points_of(blocks: Blocks, use: NDArray[np.bool_], began: int, model: VelodyneModel) -> tuple[PointCloud, Integers]:
+def points_of(blocks: Blocks, use: Bools, began: int, model: VelodyneModel) -> tuple[PointCloud, Longs]:
     """Points of the blocks `use` (B,) in the order they were measured, x forward, y left, z up, and their times, ns.
 
     began : what unwrapped azimuths count from, 0.01 deg

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import portable, se3
 from lslam.core.printable import printable, shown
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
@@ -72,14 +72,14 @@ class BagSequence(SequenceOnDisk):
 
     bag: Bag
     topic: BagTopic
-    messages: NDArray[np.int64]
-    headers_ns: NDArray[np.int64]
+    messages: Longs
+    headers_ns: Longs
     uses: dict[str, str] = field(default_factory=dict)
     halves: Halves = field(default_factory=dict)
     revolutions: Revolutions | None = None
 
     @property
-    def recorded_ns(self) -> NDArray[np.int64]:
+    def recorded_ns(self) -> Longs:
         """When the message of each scan was recorded, (N,)."""
         return self.topic.stamps_ns[self.messages]
 
@@ -107,7 +107,7 @@ class BagSequence(SequenceOnDisk):
         cloud, shift, _ = put_together(self.bag, self.topic, (k, *self.halves.get(k, ())))
         return in_metres(cloud, self.unit_m), shift
 
-    def ahead(self, stamps: NDArray[np.int64], recorded: NDArray[np.int64], what: str) -> int:
+    def ahead(self, stamps: Longs, recorded: Longs, what: str) -> int:
         """By how much another clock is ahead of that of these scans, ns, see `ahead_of`."""
         if self.revolutions is not None:
             return 0
@@ -354,7 +354,7 @@ def find_truth(sequence: BagSequence, links: Links, lidar: str, voice: Voice) ->
     return Trajectory(stamps, poses, "lidar", True, None, f"{bag.path}, {topic.name}")
 
 
-def _find(links: Links, lidar: str, frame: str, what: str, voice: Voice) -> NDArray[np.float64] | None:
+def _find(links: Links, lidar: str, frame: str, what: str, voice: Voice) -> Floats | None:
     T, source = (links.find(lidar, frame) if frame else None) or (None, "")
     if T is not None:
         voice.notes.append(f"extrinsics of the {what}: T_{lidar}_{frame}, {source}")

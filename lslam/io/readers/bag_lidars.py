@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Bools, Floats, Longs, Stamps
 from lslam.core.types.scan import NO_RING, is_measured
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.bag_streams import Transforms, chain, is_static, read_transforms
@@ -25,7 +26,6 @@ from lslam.io.readers.ground_truth import Voice
 
 ALL = "all"
 UNNAMED = "unnamed"
-Stamps = NDArray[np.int64]
 
 _MOST = 40  # parts of a revolution; more messages of one stamp come from a clock that stands still
 _STAMPS_LOOKED_AT = 40  # stamps; of more of them so many are looked at before the recording is read
@@ -35,7 +35,6 @@ _SHARED = 0.2  # of azimuths or of the time: parts of one revolution meet at the
 
 # Further messages of a scan, by the first of them.
 Halves = Mapping[int, tuple[int, ...]]
-Floats = NDArray[np.float64]
 
 # What moves by less over a whole recording is rigid: the rounding of a driver, the play of a joint.
 _STILL = 1e-3  # m, rad
@@ -53,8 +52,8 @@ class ScanIndex:
     topic: BagTopic
     name: str
     frame: str
-    messages: NDArray[np.int64]
-    stamps_ns: NDArray[np.int64]
+    messages: Longs
+    stamps_ns: Longs
     halves: Halves
 
     def __str__(self) -> str:
@@ -70,9 +69,7 @@ def name_lidars(frames: Sequence[str], ids: Sequence[int | None]) -> list[str]:
     ]
 
 
-def choose_lidars(
-    topic: BagTopic, names: Sequence[str], wanted: str | None, voice: Voice
-) -> list[tuple[str, NDArray[np.bool_]]]:
+def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voice: Voice) -> list[tuple[str, Bools]]:
     """The LiDARs of a topic that are read, the first one leads: their names, and which of the N messages are theirs, (N,) bool.
 
     names : (N,) of the sensor of each message; wanted : names with commas between them, `all`, or None
@@ -226,7 +223,7 @@ def _is_complement(a: PointCloud, b: PointCloud) -> bool:
     return shorter > 0 and min(a1, b1) - max(a0, b0) <= _SHARED * shorter
 
 
-def _azimuths(cloud: PointCloud) -> NDArray[np.int64]:
+def _azimuths(cloud: PointCloud) -> Longs:
     """(90,) points of each 4 deg."""
     return np.histogram(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0])), _BINS, (-180, 180))[0]
 

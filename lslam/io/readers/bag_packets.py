@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Longs
 from lslam.io.formats import velodyne_packets
 from lslam.io.formats.bag_files import Bag, BagTopic
 from lslam.io.formats.bag_streams import read_text
 from lslam.io.formats.ouster_packets import OusterSensor, parse_metadata, read_metadata
 from lslam.io.formats.packet_messages import PACKET, SCANS, is_imu, read_packets
 from lslam.io.readers.ground_truth import Voice
-from lslam.io.readers.pcap_revolutions import Integers, Opened, metadata_beside, open_velodyne, open_with_metadata
+from lslam.io.readers.pcap_revolutions import Opened, metadata_beside, open_velodyne, open_with_metadata
 
 # The frame of the points that `lslam.io.formats.ouster_packets` makes, as its driver calls it.
 _OUSTER_FRAME = "os_sensor"
@@ -34,9 +35,9 @@ class BagPackets:
 
     bag: Bag
     topics: tuple[BagTopic, ...]
-    stamps_ns: Integers
-    sizes: Integers
-    sources: Integers
+    stamps_ns: Longs
+    sizes: Longs
+    sources: Longs
     places: NDArray[np.int32]
     positions: tuple[int, ...]
     heads: NDArray[np.uint8]
@@ -44,11 +45,11 @@ class BagPackets:
     def __len__(self) -> int:
         return len(self.sizes)
 
-    def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
+    def bytes_at(self, which: Longs, positions: tuple[int, ...]) -> NDArray[np.uint8]:
         """(K, P) the bytes at `positions`, which are some of those that were kept, of the packets `which`."""
         return self.heads[which][:, [self.positions.index(p) for p in positions]]
 
-    def payloads(self, which: Integers) -> NDArray[np.uint8]:
+    def payloads(self, which: Longs) -> NDArray[np.uint8]:
         """(K, size) the packets `which`, which are of one size."""
         rows = []
         for (n, message), places in groupby(self.places[which].tolist(), itemgetter(0, 1)):

@@ -9,9 +9,9 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, LslamError, UsageError
+from lslam.core.types.arrays import Bools, Stamps
 from lslam.io.formats.bag_files import Bag, BagTopic, Header, read_header
 from lslam.io.formats.bag_listing import missing_parts
 from lslam.io.formats.bag_streams import Stream, read_fixes, read_imu
@@ -29,8 +29,6 @@ _LATE_STEPS = 10
 _CROWDED = 1.5  # times as many messages as the rate makes: they tell of a time that others have told of
 _APART_NS = 60 * 10**9  # parts of one recording follow each other sooner
 _FEW = 4  # messages that may come late at the seam of two parts
-
-Stamps = NDArray[np.int64]
 
 
 def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> list[BagTopic]:
@@ -182,7 +180,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
     return indices
 
 
-def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice: Voice) -> NDArray[np.bool_]:
+def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice: Voice) -> Bools:
     """Which messages (N,) are no copies of earlier ones, as of a recording that was played in a loop; said in `voice`."""
     own = np.ones(len(stamps), bool)
     _, first, again = np.unique(stamps, return_index=True, return_inverse=True)
@@ -233,7 +231,7 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
     return index[firsts], ordered
 
 
-def _lateness(stamps: Stamps) -> tuple[Stamps, NDArray[np.bool_]]:
+def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
     """By how much messages are stamped earlier than one before them, ns, and which of them are so by no mere jitter."""
     late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
     steps = np.diff(stamps)
@@ -243,7 +241,7 @@ def _lateness(stamps: Stamps) -> tuple[Stamps, NDArray[np.bool_]]:
     return late, (late > max(_LATE_NS, _LATE_STEPS * min(step, _LATE_NS))) | _told_again(stamps, late, step)
 
 
-def _told_again(stamps: Stamps, late: Stamps, step: float) -> NDArray[np.bool_]:
+def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
     """Which messages, late by `late` ns, are behind a clock that was set back: they do not fill a hole, they interleave."""
     again = np.zeros(len(stamps), bool)
     ahead = stamps[late == 0]

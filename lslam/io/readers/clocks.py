@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Bools, Longs, Stamps
 from lslam.io.readers.ground_truth import Voice
-
-Stamps = NDArray[np.int64]
 
 # Median intervals of two clocks that both tell the time of the drive; beyond, one was played back at another speed.
 _SLOWEST, _FASTEST = 0.8, 1.25
@@ -195,12 +194,12 @@ def _in_turns(h: Stamps, w: Stamps) -> bool:
     return bool(np.mean(is_irregular) > _MANY and _recording_spread(w, period) < 0.5 * period)
 
 
-def runs(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+def runs(mask: Bools) -> Longs:
     """(K, 2) where each run of true values begins and, behind its last, ends."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))).reshape(-1, 2)
 
 
-def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> NDArray[np.bool_]:
+def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
     """(N,) which late messages came in their turn, of a clock that was set back: those behind are as far from the witness."""
     back = np.zeros(len(h), np.bool_)
     if not late_ns.any():

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors
 from lslam.core.printable import printable
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import Scan, Span
 from lslam.core.types.sequence import readable
 from lslam.core.types.trajectory import Trajectory
@@ -50,7 +51,7 @@ class FolderSequence(SequenceOnDisk):
     rows: int | None = None
     cols: int | None = None
     per_point: Path | None = None
-    sweep_s: NDArray[np.float64] | None = None
+    sweep_s: Floats | None = None
     record: PointRecord | None = None
 
     def _read(self, index: int) -> Scan:
@@ -117,19 +118,19 @@ class Folder:
             self.voice.problems.append(f"calibration is not used: {error}")
             return None
 
-    def take_rows(self, source: Path, stamps: NDArray[np.int64]) -> tuple[NDArray[np.int64], float]:
+    def take_rows(self, source: Path, stamps: Longs) -> tuple[Longs, float]:
         """Keep the scans that have a row of stamps in `source`; the stamps of these, which increase, and the rate, Hz."""
         self.files, stamps = rows_of_scans(source, stamps, self.files, self.voice)
         return check_stamps(stamps, self.info.rate_hz, source, self.voice.problems)
 
-    def clock(self, stamps: NDArray[np.int64], rate_hz: float) -> PointClock | None:
+    def clock(self, stamps: Longs, rate_hz: float) -> PointClock | None:
         """How per-point times of the files are read, learnt on a few scans."""
         if self.record == KITTI:
             return None
         samples = read_samples(len(self.files), lambda k: Sample(self.read(self.files[k]), int(stamps[k])))
         return open_clock(list(samples.values()), rate_hz, self.info, self.voice.notes, self.voice.problems)
 
-    def truth(self, path: Path | None, stamps: NDArray[np.int64]) -> Trajectory | None:
+    def truth(self, path: Path | None, stamps: Longs) -> Trajectory | None:
         """The poses in a file, of the body that is stated or else that the file names."""
         truth = None if path is None else load_poses(path, stamps, self.files, self.voice)
         return None if truth is None else replace(truth, frame=self.info.ground_truth_frame or truth.frame)

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import geodesy, portable, se3, so3
 from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import whole_number
@@ -56,7 +56,7 @@ def find_ground_truth(folder: Path, info: SequenceInfo, voice: Voice) -> Path | 
     return next((folder / name for name in USUAL_NAMES if (folder / name).is_file()), None)
 
 
-def load_poses(path: Path, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice) -> Trajectory | None:
+def load_poses(path: Path, stamps_ns: Longs, files: list[Path], voice: Voice) -> Trajectory | None:
     """Poses of `path` in the frame of the file; rows without time get the stamps of the scans they belong to."""
     try:
         table = read_table(path)
@@ -72,8 +72,8 @@ class Numbered(NamedTuple):
     """Scans and poses of the same numbers: the truth of scans that `have` (N,) a pose, stamps_ns (N,) of all scans."""
 
     truth: Trajectory
-    have: NDArray[np.bool_]
-    stamps_ns: NDArray[np.int64]
+    have: Bools
+    stamps_ns: Longs
 
 
 def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
@@ -104,7 +104,7 @@ def to_lidar(
     frame: str,
     calibration: Calibration,
     voice: Voice,
-    T_body_lidar: NDArray[np.float64] | None = None,
+    T_body_lidar: Floats | None = None,
 ) -> Trajectory | None:
     """`truth`, poses of `frame`, as poses of the LiDAR; None, with the reason in the problems, when extrinsics are missing.
 
@@ -143,7 +143,7 @@ def to_lidar(
     return replace(truth, frame="lidar")
 
 
-def _pair(truth: Trajectory, stamps_ns: NDArray[np.int64], files: list[Path], voice: Voice) -> Trajectory | None:
+def _pair(truth: Trajectory, stamps_ns: Longs, files: list[Path], voice: Voice) -> Trajectory | None:
     """The poses of the scans, by the numbers of their files or by index, with the stamps of the scans."""
     numbers = scans_of(truth)
     count = int(numbers[-1]) + 1
@@ -163,9 +163,7 @@ def _pair(truth: Trajectory, stamps_ns: NDArray[np.int64], files: list[Path], vo
     return Trajectory(stamps_ns[have], poses, truth.frame, source=truth.source)
 
 
-def oxts_truth(
-    oxts: Oxts, scan_stamps_ns: NDArray[np.int64], T_lidar_imu: NDArray[np.float64] | None, voice: Voice
-) -> Trajectory | None:
+def oxts_truth(oxts: Oxts, scan_stamps_ns: Longs, T_lidar_imu: Floats | None, voice: Voice) -> Trajectory | None:
     """LiDAR poses at the stamps of the scans, in the frame of the first; None, with the reason said, when something is missing.
 
     As the devkit's convertOxtsToPose (R = Rz(yaw) Ry(pitch) Rx(roll)), but with positions in a transverse Mercator

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lslam.core.errors import InputError
 from lslam.core.printable import printable
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.calibration_files import read_odometry_calib
@@ -63,7 +61,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
     )  # fmt: skip
 
 
-def _stamps(folder: Folder) -> tuple[NDArray[np.int64], float]:
+def _stamps(folder: Folder) -> tuple[Longs, float]:
     path = folder.path / (folder.info.stamps or "times.txt")
     stamps = load_stamps(path, folder.voice.problems) if path.is_file() else None
     if stamps is not None:
@@ -73,7 +71,7 @@ def _stamps(folder: Folder) -> tuple[NDArray[np.int64], float]:
     return nominal_stamps(len(folder.files), rate), rate
 
 
-def _tr(folder: Folder) -> NDArray[np.float64] | None:
+def _tr(folder: Folder) -> Floats | None:
     path = folder.path / "calib.txt"
     if not path.is_file():
         folder.voice.notes.append(f"{path} is missing: the camera's place is unknown")
@@ -81,14 +79,14 @@ def _tr(folder: Folder) -> NDArray[np.float64] | None:
     return folder.calibration(path, _read_tr)
 
 
-def _read_tr(path: Path) -> NDArray[np.float64]:
+def _read_tr(path: Path) -> Floats:
     T_cam0_lidar = read_odometry_calib(path)
     if T_cam0_lidar is None:
         raise InputError(f"{path} has no Tr (T_cam0_lidar): poses cannot be carried between camera and LiDAR")
     return T_cam0_lidar
 
 
-def _ground_truth(folder: Folder, stamps: NDArray[np.int64], calibration: Calibration) -> Trajectory | None:
+def _ground_truth(folder: Folder, stamps: Longs, calibration: Calibration) -> Trajectory | None:
     number = sequence_number(folder.path.name) or folder.path.name
     usual = [above / "poses" / f"{number}.txt" for above in (folder.path.parent.parent, folder.path.parent)]
     path = next((p for p in usual if p.is_file()), None)

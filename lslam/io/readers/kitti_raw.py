@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration, Sequence
@@ -129,7 +129,7 @@ def _oxts(folder: Folder) -> Oxts | None:
     return oxts
 
 
-def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[NDArray[np.int64], float, float | None]:
+def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[Longs, float, float | None]:
     """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the share of the sweep that is over by then."""
     info, voice = folder.info, folder.voice
     compensated = bool(info.motion_compensated)
@@ -159,7 +159,7 @@ def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[NDArra
     return *folder.take_rows(source, even if (full < 0).any() else full), AHEAD
 
 
-def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], folder: Folder) -> NDArray[np.int64]:
+def _evened(numbers: Longs, stamps_ns: Longs, folder: Folder) -> Longs:
     """Stamps of scans `numbers`, each that of an OXTS sample near to it, as a scanner that turns evenly takes them.
 
     Its rate wanders by parts in a thousand: each stamp becomes that of the line through the `_EVEN` about it.
@@ -181,7 +181,7 @@ def _evened(numbers: NDArray[np.int64], stamps_ns: NDArray[np.int64], folder: Fo
     return even
 
 
-def _sweeps(folder: Folder, rate: float) -> NDArray[np.float64]:
+def _sweeps(folder: Folder, rate: float) -> Floats:
     """Duration of each sweep, s, from KITTI's start and end stamps, else one period."""
     folder.voice.notes.append("per-point times from the azimuth: the HDL-64E turns clockwise and a scan starts behind")
     ends = [folder.path / "velodyne_points" / f"timestamps_{which}.txt" for which in ("start", "end")]
@@ -208,15 +208,13 @@ def _calibration(folder: Folder) -> Calibration:
     return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu)
 
 
-def oxts_streams(oxts: Oxts, stamps_ns: NDArray[np.int64]) -> tuple[ImuStream, GnssStream]:
+def oxts_streams(oxts: Oxts, stamps_ns: Longs) -> tuple[ImuStream, GnssStream]:
     """The IMU and the fixes of OXTS at `stamps_ns` (N,)."""
     imu = ImuStream(stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
     return imu, GnssStream(stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
 
 
-def _ground_truth(
-    folder: Folder, stamps: NDArray[np.int64], oxts: Oxts | None, calibration: Calibration
-) -> Trajectory | None:
+def _ground_truth(folder: Folder, stamps: Longs, oxts: Oxts | None, calibration: Calibration) -> Trajectory | None:
     if folder.info.ground_truth is None:
         return None if oxts is None else oxts_truth(oxts, stamps, calibration.T_lidar_imu, folder.voice)
     truth = folder.truth(find_ground_truth(folder.path, folder.info, folder.voice), stamps)

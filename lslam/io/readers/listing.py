@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, input_errors
+from lslam.core.types.arrays import Longs, Stamps
 from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.time_columns import read_stamps
 
 DEFAULT_RATE_HZ = 10.0
-Stamps = NDArray[np.int64]
 
 
 def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:
@@ -36,14 +36,14 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
     return [(0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts]
 
 
-def file_numbers(files: list[Path]) -> NDArray[np.int64] | None:
+def file_numbers(files: list[Path]) -> Longs | None:
     """The number in each name when all names are plain numbers below 1e9 (larger ones are times), else None."""
     if not all(re.fullmatch(r"0*\d{1,9}", p.stem) for p in files):
         return None
     return np.array([int(p.stem) for p in files], np.int64)
 
 
-def rows_of(files: list[Path], count: int) -> tuple[NDArray[np.int64], str]:
+def rows_of(files: list[Path], count: int) -> tuple[Longs, str]:
     """Row of a file with `count` rows that belongs to each scan, -1 for none, and the rule in words.
 
     Scans in KITTI are numbered by row, and scans may be missing. Where the numbers reach beyond the rows the i-th scan goes

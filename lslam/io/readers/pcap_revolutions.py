@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
 from lslam.io.formats.ouster_packets import IMU_SIZE, OusterSensor, frames_and_times, imu_of, read_metadata
@@ -34,7 +35,6 @@ from lslam.io.formats.velodyne_packets import (
 )
 from lslam.io.readers.ground_truth import Voice
 
-Integers = NDArray[np.int64]
 # Shares of a revolution: less is no scan, and so much is one where it is the only one.
 SLIVER, ALONE = 0.1, 0.9
 _HOUR_NS = HOUR_US * 1000
@@ -46,24 +46,24 @@ class Packets(Protocol):
     """Packets that lie somewhere; of what they hold only that is read which is asked for. See `lslam.io.formats.pcap_files`."""
 
     @property
-    def stamps_ns(self) -> Integers:
+    def stamps_ns(self) -> Longs:
         """(N,) when each arrived."""
 
     @property
-    def sizes(self) -> Integers:
+    def sizes(self) -> Longs:
         """(N,) bytes."""
 
     @property
-    def sources(self) -> Integers:
+    def sources(self) -> Longs:
         """(N,) whose they are."""
 
     def __len__(self) -> int:
         """Number of packets."""
 
-    def bytes_at(self, which: Integers, positions: tuple[int, ...]) -> NDArray[np.uint8]:
+    def bytes_at(self, which: Longs, positions: tuple[int, ...]) -> NDArray[np.uint8]:
         """(K, P) the bytes at `positions` of the packets `which`, which are so long."""
 
-    def payloads(self, which: Integers) -> NDArray[np.uint8]:
+    def payloads(self, which: Longs) -> NDArray[np.uint8]:
         """(K, size) the packets `which`, which are of one size."""
 
 
@@ -71,10 +71,10 @@ class Revolutions(Protocol):
     """The revolutions of a capture."""
 
     @property
-    def stamps_ns(self) -> Integers:
+    def stamps_ns(self) -> Longs:
         """(N,) when the first point of each was measured."""
 
-    def read(self, index: int) -> tuple[PointCloud, Integers]:
+    def read(self, index: int) -> tuple[PointCloud, Longs]:
         """Points of revolution `index` in the order they were measured, and when each was, ns."""
 
 
@@ -87,7 +87,7 @@ class Opened:
     rings: int
     sensor: str
     imu: ImuStream | None = None
-    T_lidar_imu: NDArray[np.float64] | None = None
+    T_lidar_imu: Floats | None = None
     uses: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -99,7 +99,7 @@ def read_scan(revolutions: Revolutions, index: int, is_timed: bool) -> Scan:
     return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings)
 
 
-def of_one_sender(datagrams: Packets, which: Integers, what: str, voice: Voice) -> Integers:
+def of_one_sender(datagrams: Packets, which: Longs, what: str, voice: Voice) -> Longs:
     """Those of the datagrams `which` that come from the sender of most; others are named among the problems."""
     senders, counts = np.unique(datagrams.sources[which], return_counts=True)
     if len(senders) < 2:
@@ -110,7 +110,7 @@ def of_one_sender(datagrams: Packets, which: Integers, what: str, voice: Voice) 
     return np.asarray(which[datagrams.sources[which] == chosen], np.int64)
 
 
-def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> NDArray[np.bool_]:
+def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> Bools:
     """Which revolutions are scans, by the share of its packets that each has.
 
     Where revolutions are missing, a packet or two of the one before are kept with the next: that is no scan.
@@ -124,7 +124,7 @@ def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> NDArray[np.bo
     return keep
 
 
-def in_order(times_ns: Integers, what: str, voice: Voice) -> Integers:
+def in_order(times_ns: Longs, what: str, voice: Voice) -> Longs:
     """Order of packets by their own times, each time once; said where it is not that of the capture."""
     order = np.argsort(times_ns, kind="stable")
     if late := int((np.diff(times_ns) < 0).sum()):
@@ -158,17 +158,17 @@ class VelodyneRevolutions:
     datagrams: Packets
     model: VelodyneModel
     began: int
-    packets: Integers
-    azimuth: Integers
-    times_ns: Integers
-    turns: Integers
+    packets: Longs
+    azimuth: Longs
+    times_ns: Longs
+    turns: Longs
 
     @cached_property
-    def stamps_ns(self) -> Integers:
+    def stamps_ns(self) -> Longs:
         """(N,) when the first block of each revolution was measured."""
         return np.array([self._stamp(turn) for turn in self.turns.tolist()], np.int64)
 
-    def read(self, index: int) -> tuple[PointCloud, Integers]:
+    def read(self, index: int) -> tuple[PointCloud, Longs]:
         """Points of revolution `index` in the order they were measured, and when each was, ns."""
         turn = int(self.turns[index])
         # One packet more: the azimuth of the next block tells how far the last one turns.
@@ -225,7 +225,7 @@ def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
     return Opened(revolutions, round(rate * 1e9 / TURN, 3), model.lasers, model.name)
 
 
-def _factory(path: Path, datagrams: Packets, which: Integers) -> tuple[VelodyneModel, int]:
+def _factory(path: Path, datagrams: Packets, which: Longs) -> tuple[VelodyneModel, int]:
     mode, number = (int(v) for v in datagrams.bytes_at(which[:1], (1204, 1205))[0])
     if mode not in RETURNS or number not in MODELS:
         known = ", ".join(model.name for model in MODELS.values())
@@ -240,7 +240,7 @@ def _factory(path: Path, datagrams: Packets, which: Integers) -> tuple[VelodyneM
 _LONGEST_NS = 86_400 * 10**9
 
 
-def _absolute(past_hour_us: Integers, captured_ns: Integers, voice: Voice) -> Integers:
+def _absolute(past_hour_us: Longs, captured_ns: Longs, voice: Voice) -> Longs:
     """Times of the sensor's clock, which tells the hour's microseconds, in ns with the hour that the capture tells.
 
     A sensor without satellites counts from another minute: by how much is found in the first packet and stays.
@@ -253,7 +253,7 @@ def _absolute(past_hour_us: Integers, captured_ns: Integers, voice: Voice) -> In
     return within + hours * _HOUR_NS
 
 
-def _unwrapped(path: Path, angle: Integers, times_ns: Integers) -> tuple[Integers, float]:
+def _unwrapped(path: Path, angle: Longs, times_ns: Longs) -> tuple[Longs, float]:
     """Azimuths from the first, 0.01 deg, and the rate, 0.01 deg/ns; lost packets are bridged by the rate."""
     steps, spans = np.diff(angle) % TURN, np.diff(times_ns)
     if len(spans) and float(np.abs(spans.astype(np.float64)).max()) > _LONGEST_NS:
@@ -277,13 +277,13 @@ class OusterRevolutions:
 
     datagrams: Packets
     sensor: OusterSensor
-    packets: Integers
-    first: Integers
-    count: Integers
-    stamps_ns: Integers
+    packets: Longs
+    first: Longs
+    count: Longs
+    stamps_ns: Longs
     shift_ns: int
 
-    def read(self, index: int) -> tuple[PointCloud, Integers]:
+    def read(self, index: int) -> tuple[PointCloud, Longs]:
         """Points of revolution `index` in the order they were measured, and when each was, ns."""
         first = int(self.first[index])
         packets = self.datagrams.payloads(self.packets[first : first + int(self.count[index])])
@@ -329,7 +329,7 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
     return Opened(revolutions, sensor.rate_hz, sensor.beams, sensor.name, imu, T_lidar_imu)
 
 
-def _shift(times_ns: Integers, captured_ns: Integers, voice: Voice) -> int:
+def _shift(times_ns: Longs, captured_ns: Longs, voice: Voice) -> int:
     """What makes Unix time of a clock that counts from when the sensor was switched on: the fastest packet tells."""
     if times_ns[0] >= _UNIX_NS:
         return 0
@@ -338,7 +338,7 @@ def _shift(times_ns: Integers, captured_ns: Integers, voice: Voice) -> int:
     return shift
 
 
-def _whole(count: Integers, voice: Voice) -> Integers:
+def _whole(count: Longs, voice: Voice) -> Longs:
     """Which frames are scans: where a capture begins or ends within a revolution, that one is not."""
     keep = np.ones(len(count), bool)
     if len(count) > 2:

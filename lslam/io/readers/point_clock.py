@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Bools, Longs, Stamps
 from lslam.core.types.scan import is_measured
 from lslam.core.types.sequence import readable
 from lslam.io.formats.point_cloud import PointCloud
@@ -33,7 +34,6 @@ _FIRST, _ENOUGH = 3, 5000
 _OFTEN = 0.02
 # Absolute times that lie farther from the stamp are of another clock.
 _OTHER_CLOCK_NS = 10**9
-Stamps = NDArray[np.int64]
 T = TypeVar("T")
 _OTHER_EPOCH_NS = 10**10  # by which the times of points and of recording lie apart
 _SLOW_HZ = 1.0  # tried where no rate is stated and no sweep is as short as usual
@@ -187,7 +187,7 @@ def open_clock(
     return clock
 
 
-def _unwrapped(values: NDArray[Any], usable: NDArray[np.bool_], width: float) -> tuple[NDArray[Any], int]:
+def _unwrapped(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[Any], int]:
     """The values, integers as int64 and short ones counted on beyond their range, and how many usable ones that changed."""
     if values.dtype.kind not in "iu":
         return values, 0
@@ -202,9 +202,7 @@ def _unwrapped(values: NDArray[Any], usable: NDArray[np.bool_], width: float) ->
     return beyond, int(np.count_nonzero((beyond != plain) & usable))
 
 
-def _step(
-    values: NDArray[Any], usable: NDArray[np.bool_], good: NDArray[np.bool_], sweep: float
-) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
+def _step(values: NDArray[Any], usable: Bools, good: Bools, sweep: float) -> tuple[NDArray[Any], Bools] | None:
     """Values with those behind a step of the clock moved to follow on the others, and which are good then; None without a step.
 
     good : the largest part; sweep : usual length of one
@@ -233,7 +231,7 @@ def _is_set_back(values: NDArray[Any], sweep: float) -> bool:
     return bool(values[parts[0]].min() > values[parts[1]].max())
 
 
-def _parts(values: NDArray[Any]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+def _parts(values: NDArray[Any]) -> tuple[Bools, Bools] | None:
     """The times (N,) on either side of the largest hole, those first that come first; None where few are on one side."""
     if len(values) < 2:
         return None
@@ -248,7 +246,7 @@ def _parts(values: NDArray[Any]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] 
 class PointStamps(NamedTuple):
     """When the first points of the scans were measured, (N,) ns, how long a sweep takes, s, and the name of the field."""
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     sweep_s: float
     field: str
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Bools
 from lslam.core.types.scan import Span, is_measured
 from lslam.io.formats.point_cloud import UNITS, PointCloud, TimeColumn
 
@@ -165,7 +166,7 @@ def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, r
     return _TimeReading(usual, values.dtype, low, high, is_absolute, instant)
 
 
-def is_usable(cloud: PointCloud, values: NDArray[Any]) -> NDArray[np.bool_]:
+def is_usable(cloud: PointCloud, values: NDArray[Any]) -> Bools:
     """(N,) the points whose times count: measured ones, all where none is, whose time is a number."""
     measured = is_measured(cloud.points)
     if not measured.any():
@@ -182,7 +183,7 @@ def _limits(values: NDArray[Any], width: float) -> tuple[float, float]:
     return float(low), float(low) + float(high - low)
 
 
-def densest(values: NDArray[Any], among: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
+def densest(values: NDArray[Any], among: Bools, width: float) -> Bools:
     """(N,) those of the values `among`, finite ones, that lie within the stretch of `width` that holds most of them."""
     if not among.any():
         return among

@@ -7,8 +7,8 @@ from math import inf, isnan, log, nan
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
 from lslam.core.types.sequence import readable
 from lslam.io.formats.point_cloud import PointCloud
 from lslam.io.formats.sequence_toml import LENGTHS
@@ -39,7 +39,7 @@ def settle_unit(sequence: T) -> T:
         name = next(name for name, length in LENGTHS.items() if length == sequence.unit_m)
         sequence.notes.append(f"points in {name}, as stated")
         return sequence
-    some: list[NDArray[np.float64]] = []
+    some: list[Floats] = []
     last = len(sequence) - 1
     for _, scan in readable(sorted({0, len(sequence) // 2, last}) if last >= 0 else (), sequence.scan):
         points = scan.points[np.isfinite(scan.points).all(1) & (scan.points != 0).any(1)].astype(np.float64)
@@ -53,7 +53,7 @@ def settle_unit(sequence: T) -> T:
     return sequence
 
 
-def find_unit(scans: list[NDArray[np.float64]]) -> tuple[str | None, str]:
+def find_unit(scans: list[Floats]) -> tuple[str | None, str]:
     """The unit, one of `LENGTHS`, in which the scans (N, 3) are most usual, None where it is unclear; and a sentence."""
     reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans]))
     height = _median([_ground(points) for points in scans])
@@ -87,7 +87,7 @@ def _median(values: list[float]) -> float:
     return float(np.median(numbers)) if numbers else nan
 
 
-def _ground(points: NDArray[np.float64]) -> float:
+def _ground(points: Floats) -> float:
     """How far below the sensor most of the points are that lie below it; NaN where few do."""
     level = np.hypot(points[:, 0], points[:, 1])
     below = -points[points[:, 2] < -0.05 * level, 2]
@@ -98,7 +98,7 @@ def _ground(points: NDArray[np.float64]) -> float:
     return float(edges[k] + edges[k + 1]) / 2
 
 
-def _noise(points: NDArray[np.float64]) -> float:
+def _noise(points: Floats) -> float:
     """Thickness of surfaces: of the flattest patches of a tenth of their range; NaN where there are too few."""
     from scipy.spatial import cKDTree
 
@@ -115,7 +115,7 @@ def _noise(points: NDArray[np.float64]) -> float:
     return float(np.percentile(thickness, 25)) if len(thickness) >= _PATCHES // 10 else nan
 
 
-def _step(points: NDArray[np.float64]) -> float:
+def _step(points: Floats) -> float:
     """Step of which all coordinates are multiples, 0 where there is none above a thousandth."""
     for step in (1.0, 0.5, 0.1, 0.01, 0.001):
         if np.abs(points / step - np.round(points / step)).max() < 1e-3:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration
@@ -75,7 +75,7 @@ def _scans_in(folder: Path) -> tuple[list[Path], list[str]]:
 
 
 def _stamps_and_truth(
-    folder: Folder, beside: list[NDArray[np.int64]], calibration: Calibration
+    folder: Folder, beside: list[Longs], calibration: Calibration
 ) -> tuple[StampedScans, Trajectory | None]:
     """Stamps from their file, the file names, or the ground truth that goes with the scans by index; else nominal."""
     info, files, voice = folder.info, folder.files, folder.voice
@@ -131,7 +131,7 @@ def _stamps_file(folder: Folder) -> Path | None:
     return None
 
 
-def _truth(folder: Folder, path: Path | None, stamps: NDArray[np.int64], calibration: Calibration) -> Trajectory | None:
+def _truth(folder: Folder, path: Path | None, stamps: Longs, calibration: Calibration) -> Trajectory | None:
     truth = folder.truth(path, stamps)
     if truth is None:
         return None
@@ -143,7 +143,7 @@ def _truth(folder: Folder, path: Path | None, stamps: NDArray[np.int64], calibra
     return to_lidar(truth, frame, calibration, folder.voice, T_body_lidar)
 
 
-def _mcd_extrinsics(folder: Folder) -> NDArray[np.float64] | None:
+def _mcd_extrinsics(folder: Folder) -> Floats | None:
     """T_body_lidar of a Multi-Campus recording, where its calibration lies beside the scans."""
     for path in sorted(folder.path.glob("*_calib.yaml")):
         T_body_lidar = folder.calibration(path, read_mcd_extrinsics)

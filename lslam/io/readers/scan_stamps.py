@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Longs, Stamps
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.point_cloud import PointCloud
 from lslam.io.formats.text_tables import read_rows
@@ -21,7 +21,6 @@ from lslam.io.readers.ground_truth import Voice
 from lslam.io.readers.listing import check_stamps, file_numbers, filled_stamps, load_stamps, rows_of
 from lslam.io.readers.point_clock import PointStamps, point_stamps
 
-Stamps = NDArray[np.int64]
 _STEP = 1.5  # median intervals, from which on a gap is held against other clocks
 _NEAR = 0.25  # of the interval, how far a gap may lie from whole ones
 
@@ -165,7 +164,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
     return [file for file, row in zip(files, rows.tolist(), strict=True) if row >= 0], stamps[rows[rows >= 0]]
 
 
-def _labelled(path: Path, files: list[Path], count: int) -> NDArray[np.int64] | None:
+def _labelled(path: Path, files: list[Path], count: int) -> Longs | None:
     """(N,) row of each file, -1 for none, by a column that names the files or their numbers; None when there is no such one."""
     cells = [row.text.replace(",", " ").replace(";", " ").split() for row in read_rows(path)[0]][-count:]
     if len(cells) != count or min(map(len, cells)) < 2:

@@ -6,9 +6,7 @@ from abc import abstractmethod
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.types.arrays import Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
@@ -31,7 +29,7 @@ class SequenceOnDisk(Scans):
     name: str
     path: Path
     kind: str
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     rate_hz: float
     motion_compensated: bool | None = None
     calibration: Calibration = field(default_factory=Calibration)
