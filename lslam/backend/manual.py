@@ -23,8 +23,7 @@ from lslam.core.types.sequence import Selection, Sequence
 from lslam.core.types.trajectory import Keyframe
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.stamp_texts import seconds_to_ns
-from lslam.io.formats.text_tables import separator_of, split_cells
+from lslam.io.formats.text_tables import seconds_to_ns, separator_of, split_cells
 from lslam.maps.georeference import to_wgs84
 
 # What a run writes into the column is its own verdict, and says nothing here: its loops.csv can be edited and given back.

@@ -17,7 +17,7 @@ from fastkml.utils import find_all
 from lslam.core.geometry import se3
 from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.stamp_texts import utc_of
+from lslam.io.formats.text_tables import utc_of
 from lslam.io.formats.trajectory_files import read_trajectory, write_tum
 
 KML_NS, GX_NS = "{http://www.opengis.net/kml/2.2}", "{http://www.google.com/kml/ext/2.2}"

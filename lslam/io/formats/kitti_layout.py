@@ -13,7 +13,7 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.point_files import write_bin
-from lslam.io.formats.stamp_texts import seconds_text
+from lslam.io.formats.text_tables import seconds_text
 
 POINTS, PER_POINT = "velodyne", "per_point"
 

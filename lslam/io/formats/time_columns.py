@@ -16,8 +16,7 @@ import numpy as np
 
 from lslam.core.errors import InputError
 from lslam.core.types.arrays import Floats, Longs
-from lslam.io.formats.stamp_texts import date_to_ns, seconds_to_ns
-from lslam.io.formats.text_tables import Row, TextTable, read_rows, text_table
+from lslam.io.formats.text_tables import Row, TextTable, date_to_ns, read_rows, seconds_to_ns, text_table
 from lslam.io.remote import as_path
 
 log = logging.getLogger("lslam")

@@ -28,8 +28,14 @@ from lslam.core.types.arrays import Longs
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats import trajectory_csv
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.stamp_texts import seconds_text
-from lslam.io.formats.text_tables import TextTable, looks_like_header, read_table, separator_of, split_cells
+from lslam.io.formats.text_tables import (
+    TextTable,
+    looks_like_header,
+    read_table,
+    seconds_text,
+    separator_of,
+    split_cells,
+)
 from lslam.io.formats.time_columns import find_clock, read_times
 from lslam.io.formats.trajectory_csv import write_euroc
 from lslam.io.remote import as_path

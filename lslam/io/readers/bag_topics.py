@@ -17,7 +17,7 @@ from lslam.io.formats.bag_listing import missing_parts
 from lslam.io.formats.bag_streams import Stream, read_fixes, read_imu
 from lslam.io.formats.packet_messages import is_packets, maker_by_name, not_decoded, packet_topics
 from lslam.io.formats.pointcloud2 import livox_id
-from lslam.io.formats.stamp_texts import seconds_text
+from lslam.io.formats.text_tables import seconds_text
 from lslam.io.readers.bag_lidars import ScanIndex, choose_lidars, find_halves, name_lidars
 from lslam.io.readers.clocks import MESSAGES_PER_STAMP, Clock, agree, runs, say_jitter, stands_still
 from lslam.io.readers.ground_truth import Voice

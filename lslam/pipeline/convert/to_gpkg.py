@@ -17,7 +17,7 @@ from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import CorrectedMap
 from lslam.core.types.gnss import Georeference
-from lslam.io.formats.stamp_texts import utc_of
+from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import to_lat_lon
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.convert import staged

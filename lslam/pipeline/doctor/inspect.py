@@ -15,7 +15,7 @@ from lslam.core.types.scan import Span
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.bag_files import Bag, BagTopic, open_bag
-from lslam.io.formats.stamp_texts import utc_of
+from lslam.io.formats.text_tables import utc_of
 from lslam.io.readers import bag as bag_reader
 from lslam.io.readers.lookup import find_folder
 from lslam.odometry.frontend.point_times import with_point_times

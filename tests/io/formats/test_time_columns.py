@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from lslam.core.errors import InputError
-from lslam.io.formats.stamp_texts import date_to_ns
 from lslam.io.formats.stamped_csv import read_gnss_csv, read_imu_csv
+from lslam.io.formats.text_tables import date_to_ns
 from lslam.io.formats.time_columns import read_stamps, read_times
 
 NS = 1_700_000_000_950_000_007 + np.arange(30) * 97_000_000

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 from lslam.core.errors import InputError, LslamError, OutputError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
-from lslam.io.formats.stamp_texts import seconds_text, seconds_to_ns
+from lslam.io.formats.text_tables import seconds_text, seconds_to_ns
 from lslam.io.formats.trajectory_files import (
     FORMATS,
     WRITTEN,
