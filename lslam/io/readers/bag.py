@@ -48,8 +48,7 @@ from lslam.io.readers.point_clock import (
     step_against,
 )
 from lslam.io.readers.point_times import Sample
-from lslam.io.readers.point_units import in_metres, settle_unit
-from lslam.io.readers.sequence_on_disk import SequenceOnDisk
+from lslam.io.readers.sequence_on_disk import SequenceOnDisk, in_metres, settle_unit
 from lslam.io.readers.sidecars import calibration_over, compensation_note, read_info, stated_times
 from lslam.registration.preprocessing.merged_lidars import FurtherLidar, MergedLidars
 

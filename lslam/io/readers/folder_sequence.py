@@ -26,9 +26,8 @@ from lslam.io.readers.ground_truth import Voice, load_poses
 from lslam.io.readers.listing import check_stamps
 from lslam.io.readers.point_clock import PointClock, open_clock, read_samples
 from lslam.io.readers.point_times import Sample, azimuth_times
-from lslam.io.readers.point_units import in_metres, settle_unit
 from lslam.io.readers.scan_stamps import rows_of_scans
-from lslam.io.readers.sequence_on_disk import SequenceOnDisk
+from lslam.io.readers.sequence_on_disk import SequenceOnDisk, in_metres, settle_unit
 from lslam.io.readers.sidecars import compensation_note, load_streams, per_point_folder, read_info, stated_times
 
 Matrix = NDArray[np.float64]

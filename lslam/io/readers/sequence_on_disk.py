@@ -1,19 +1,38 @@
-"""What the sequences of all readers have in common."""
+"""What the sequences of all readers have in common, and the unit of their coordinates."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import inf, isnan, log, nan
 from pathlib import Path
+from typing import TypeVar
 
-from lslam.core.types.arrays import Longs
+import numpy as np
+
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
-from lslam.core.types.sequence import Calibration, Scans, StatedTimes, no_shared_time
+from lslam.core.types.sequence import Calibration, Scans, StatedTimes, no_shared_time, readable
 from lslam.core.types.trajectory import Trajectory
+from lslam.io.formats.point_cloud import PointCloud
+from lslam.io.formats.sequence_toml import LENGTHS
 from lslam.io.readers.point_clock import PointClock
 from lslam.io.readers.point_times import TimeRule
+
+# Scans of a sensor that drives or is carried have smaller medians in metres.
+_LONG_RANGE_M = 60.0
+# What is usual, m: the sensor's height, the thickness of surfaces, and, which says less, the median range.
+_HEIGHT_M, _NOISE_M, _RANGE_M, _RANGE_WEIGHT = 1.5, 0.01, 8.0, 0.5
+# By how much the best unit has to be nearer to what is usual than the next one, as a logarithm.
+_MARGIN = 2.0
+_MIN_POINTS = 100
+_PATCHES, _PATCH_POINTS, _MOST_POINTS = 200, 12, 60_000
+# What no LiDAR and no recording has: steps of coordinates, and surfaces thinner or thicker.
+_COARSEST_M, _THINNEST_M, _THICKEST_M = 0.1, 0.002, 0.3
+
+T = TypeVar("T", bound="SequenceOnDisk")
 
 
 @dataclass(kw_only=True)
@@ -71,3 +90,98 @@ class SequenceOnDisk(Scans):
     @abstractmethod
     def _read(self, index: int) -> Scan:
         """Scan `index`, which there is."""
+
+
+def in_metres(cloud: PointCloud, unit_m: float | None) -> PointCloud:
+    """The cloud with its points in m."""
+    return cloud if unit_m in (None, 1.0) else replace(cloud, points=cloud.points * np.float32(unit_m))
+
+
+def settle_unit(sequence: T) -> T:
+    """The sequence, its unit found where nobody states it; the decision is a note, what stays unclear a problem."""
+    if sequence.unit_m is not None:
+        name = next(name for name, length in LENGTHS.items() if length == sequence.unit_m)
+        sequence.notes.append(f"points in {name}, as stated")
+        return sequence
+    some: list[Floats] = []
+    last = len(sequence) - 1
+    for _, scan in readable(sorted({0, len(sequence) // 2, last}) if last >= 0 else (), sequence.scan):
+        points = scan.points[np.isfinite(scan.points).all(1) & (scan.points != 0).any(1)].astype(np.float64)
+        some += [points] if len(points) >= _MIN_POINTS else []
+        if some and float(np.median(np.linalg.norm(some[0], axis=1))) < _LONG_RANGE_M:
+            return sequence
+    if some:
+        unit, sentence = find_unit(some)
+        sequence.unit_m = None if unit is None else LENGTHS[unit]
+        (sequence.problems if unit is None else sequence.notes).append(sentence)
+    return sequence
+
+
+def find_unit(scans: list[Floats]) -> tuple[str | None, str]:
+    """The unit, one of `LENGTHS`, in which the scans (N, 3) are most usual, None where it is unclear; and a sentence."""
+    reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans]))
+    height = _median([_ground(points) for points in scans])
+    noise = _median([_noise(points) for points in scans])
+    step = max(_step(points) for points in scans)
+    evidence = [
+        (reach, _RANGE_M, _RANGE_WEIGHT, f"half of the points lie beyond {reach:.4g}"),
+        (height, _HEIGHT_M, 1.0, f"the ground {height:.4g} below the sensor"),
+        (noise, _NOISE_M, 1.0, f"surfaces are {noise:.2g} thick"),
+    ]
+    evidence = [row for row in evidence if not isnan(row[0])]
+    costs = {}
+    for name, length in LENGTHS.items():
+        thickness_m = noise * length
+        is_impossible = step * length > _COARSEST_M or thickness_m <= _THINNEST_M or thickness_m >= _THICKEST_M
+        apart = [
+            weight * abs(log(max(value * length, _THINNEST_M) / usual_m)) for value, usual_m, weight, _ in evidence
+        ]
+        costs[name] = inf if is_impossible else sum(apart)
+    best, second, *_ = sorted(costs, key=lambda name: costs[name])
+    sentences = [row[-1] for row in evidence] + ([f"coordinates lie in steps of {step:g}"] if step else [])
+    why = f"{', '.join(sentences)}; point_unit in sequence.toml states another unit"
+    if costs[best] < inf and costs[second] - costs[best] >= _MARGIN and (not isnan(noise) or step >= 1):
+        return best, f"points in {best}, found: {why}"
+    return None, f"points are taken to be in m, though {why}"
+
+
+def _median(values: list[float]) -> float:
+    """Without NaN; NaN where nothing is left."""
+    numbers = [value for value in values if not isnan(value)]
+    return float(np.median(numbers)) if numbers else nan
+
+
+def _ground(points: Floats) -> float:
+    """How far below the sensor most of the points are that lie below it; NaN where few do."""
+    level = np.hypot(points[:, 0], points[:, 1])
+    below = -points[points[:, 2] < -0.05 * level, 2]
+    if len(below) < _MIN_POINTS:
+        return nan
+    counts, edges = np.histogram(below, 40, (0.0, float(np.percentile(below, 99))))
+    k = int(np.argmax(counts))
+    return float(edges[k] + edges[k + 1]) / 2
+
+
+def _noise(points: Floats) -> float:
+    """Thickness of surfaces: of the flattest patches of a tenth of their range; NaN where there are too few."""
+    from scipy.spatial import cKDTree
+
+    points = points[:_MOST_POINTS]
+    r = np.linalg.norm(points, axis=1)
+    tree = cKDTree(points)
+    thickness = []
+    for k in np.linspace(0, len(points) - 1, _PATCHES).astype(int):
+        patch = points[tree.query_ball_point(points[k], 0.1 * r[k])]
+        if len(patch) >= _PATCH_POINTS:
+            spread = np.linalg.svd(patch - patch.mean(0), compute_uv=False) / len(patch) ** 0.5
+            if spread[1] > 0.2 * spread[0]:
+                thickness.append(float(spread[2]))
+    return float(np.percentile(thickness, 25)) if len(thickness) >= _PATCHES // 10 else nan
+
+
+def _step(points: Floats) -> float:
+    """Step of which all coordinates are multiples, 0 where there is none above a thousandth."""
+    for step in (1.0, 0.5, 0.1, 0.01, 0.001):
+        if np.abs(points / step - np.round(points / step)).max() < 1e-3:
+            return step
+    return 0.0

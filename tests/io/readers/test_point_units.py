@@ -11,7 +11,7 @@ from point_writers import packed, revolution
 
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo, write_sequence_toml
 from lslam.io.readers import open_sequence
-from lslam.io.readers.point_units import find_unit
+from lslam.io.readers.sequence_on_disk import find_unit
 
 
 def room(seed: int, height_m: float = 1.7, size: float = 1.0) -> NDArray[np.float64]:
