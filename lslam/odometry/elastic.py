@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.elastic_constraints import ElasticConstraints

@@ -7,10 +7,21 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, find
 from lslam.core.kernels.jit import inline, kernel
-from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.linearisation import (
+    INFORMATION,
+    INLIERS,
+    LEVER,
+    MATCHED,
+    ROBUST,
+    SQUARED,
+    Pose,
+    Search,
+    Settings,
+    Sums,
+    Width,
+)
 from lslam.core.kernels.voxel import index_of, pack
 
 Floats = NDArray[np.float64]

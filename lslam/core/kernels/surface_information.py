@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, LEVER
 from lslam.core.kernels.jit import inline, inline_with_arrays
 from lslam.core.kernels.linalg import eigen
+from lslam.core.kernels.linearisation import INFORMATION, LEVER
 from lslam.core.kernels.residuals import add_information
 
 Floats = NDArray[np.float64]
