@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
 from lslam.core.geometry.normal_equations import Normal
-from lslam.core.kernels import positive
+from lslam.core.kernels import linalg
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry.plane_factors import Sightings, WindowPrior, normal_equations, step_residual
 from lslam.odometry.plane_values import ORDER, PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
@@ -81,7 +81,7 @@ class PlaneWindow:
         """One state that is known as the motion model says, and no planes."""
         values = WindowValues.begin(state)
         C = state.covariance[np.ix_(ORDER, ORDER)]
-        information = positive.inverse(C)
+        information = linalg.inverse(C)
         return cls(T_imu_lidar, values, WindowPrior(information, np.zeros(len(C)), values))
 
     @property
@@ -146,14 +146,14 @@ class PlaneWindow:
 
     def joint_covariance(self) -> Floats:
         """(27 + 3 M) square: the shared part, the newest state and the planes."""
-        return positive.inverse(self.normal().without(self._older).H)
+        return linalg.inverse(self.normal().without(self._older).H)
 
     def covariance_on_planes(self) -> Floats:
         """(6, 6) of the newest pose, were the planes known exactly."""
         first = self.values.first_plane
         H = np.ascontiguousarray(self.normal().H[:first, :first])
         left = Normal(H, np.zeros(first)).without(self._older[:first])
-        return positive.inverse(left.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
+        return linalg.inverse(left.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
 
     @property
     def _older(self) -> NDArray[np.bool_]:

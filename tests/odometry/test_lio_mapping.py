@@ -14,7 +14,7 @@ from warmed_kernels import recorded
 import lslam
 from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, UsageError
-from lslam.core.kernels import positive
+from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
@@ -134,7 +134,7 @@ def test_it_does_nothing_without_an_imu() -> None:
 def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = replace(walk(), scans=walk().scans[:8])
     one, method, _ = tracker_of(sequence, windowed())
-    calls = recorded(monkeypatch, positive, "inverse", "complement", "solved")
+    calls = recorded(monkeypatch, linalg, "inverse", "complement", "solved")
     method.warm_up()
     warm = set(calls)
     assert len(method.registration.map) == 0

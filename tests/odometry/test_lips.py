@@ -17,7 +17,7 @@ from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.geometry.normal_equations import Normal
-from lslam.core.kernels import positive
+from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
@@ -119,7 +119,7 @@ def test_planes_are_registered_over_a_gap_and_a_lost_scan() -> None:
 
 def test_warming_up_compiles_what_the_window_is_solved_with(monkeypatch: pytest.MonkeyPatch) -> None:
     one = tracker()
-    calls = recorded(monkeypatch, positive, "inverse", "complement", "solved")
+    calls = recorded(monkeypatch, linalg, "inverse", "complement", "solved")
     one.odometry.warm_up()
     warm = set(calls)
     assert {name for name, _ in warm} == {"inverse", "complement", "solved"}

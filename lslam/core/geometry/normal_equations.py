@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels import positive
+from lslam.core.kernels import linalg
 
 Floats = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ class Normal:
 
     def step(self) -> Floats:
         """(N,) the update to the minimum; NaN where H is not positive definite."""
-        return -positive.solved(self.H, self.g)
+        return -linalg.solved(self.H, self.g)
 
     def without(self, out: NDArray[np.bool_]) -> Normal:
         """The Schur complement: the variables `out` (N,) are marginalised."""
@@ -33,7 +33,7 @@ class Normal:
         n = len(across[0])
         rest = np.zeros((n, n))
         rest[:-1, :-1], rest[:-1, -1], rest[-1, :-1] = self.H[np.ix_(kept, kept)], self.g[kept], self.g[kept]
-        left = positive.complement(self.H[np.ix_(out, out)], across, rest)
+        left = linalg.complement(self.H[np.ix_(out, out)], across, rest)
         return Normal(0.5 * (left[:-1, :-1] + left[:-1, :-1].T), left[:-1, -1].copy())
 
 
@@ -42,4 +42,4 @@ def warm_up() -> None:
     normal = Normal(np.eye(2), np.zeros(2))
     normal.step()
     normal.without(np.array([True, False]))
-    positive.inverse(normal.H)
+    linalg.inverse(normal.H)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.normal_equations import Normal
-from lslam.core.kernels import positive
+from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import Gyroscope
@@ -113,7 +113,7 @@ class Window:
         moment = moment_of(state, instant_ns, stamp_ns, T_imu_scan)
         order = np.concatenate([COMMON, OWN])
         e = state.estimate
-        information = positive.inverse(state.covariance[np.ix_(order, order)])
+        information = linalg.inverse(state.covariance[np.ix_(order, order)])
         past = Past(information, np.zeros(len(order)), e.gravity, e.gyroscope.axes, moment)
         return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, e.gyroscope.noise, past)
 
@@ -135,7 +135,7 @@ class Window:
         window, H = self, np.zeros((0, 0))
         for _ in range(MOST_STEPS):
             H, g = window.equations(imu)
-            d = -positive.solved(H, g)
+            d = -linalg.solved(H, g)
             if not np.isfinite(d).all():
                 break
             window = window.moved(d)
@@ -217,7 +217,7 @@ class Window:
         W = certainty(nanoseconds, self.rate_variance, self.noise)
         if step.hidden is not None:
             Q = process_noise(1e-9 * nanoseconds, self.rate_variance, self.noise) + cut_noise(step.hidden, F)
-            W = positive.inverse(Q[np.ix_(OWN, OWN)])
+            W = linalg.inverse(Q[np.ix_(OWN, OWN)])
         J = np.concatenate([-F[OWN][:, COMMON], -F[OWN][:, OWN], np.eye(EACH)], axis=1)
         return b.away(led), J, W
 
@@ -246,7 +246,7 @@ class Window:
         which = np.r_[0:SHARED, len(H) - EACH : len(H)]
         P = np.zeros_like(like.covariance)
         order = np.concatenate([COMMON, OWN])
-        P[np.ix_(order, order)] = positive.inverse(H)[np.ix_(which, which)]
+        P[np.ix_(order, order)] = linalg.inverse(H)[np.ix_(which, which)]
         gyroscope = replace(like.estimate.gyroscope, bias=m.gyro_bias, axes=self.axes, covariance=P[GYRO, GYRO])
         estimate = ImuEstimate(m.velocity, self.gravity, m.accel_bias, gyroscope, P[REST, REST])
         return NavigationState(se3.normalise(m.T_world_imu), estimate, P)

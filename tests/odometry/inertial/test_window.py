@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
-from lslam.core.kernels import positive
+from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import Gyroscope
@@ -151,14 +151,14 @@ def test_a_marginalised_window_has_the_estimate_of_the_whole(monkeypatch: pytest
     part, H_part = slid.solved(imu)
     assert len(part.moments) == 4
     tail = np.r_[0:SHARED, len(H) - 4 * EACH : len(H)]
-    sigma = np.sqrt(np.diag(positive.inverse(H))[tail])
+    sigma = np.sqrt(np.diag(linalg.inverse(H))[tail])
     off = np.concatenate([
         part.gravity - whole.gravity, (part.axes - whole.axes).ravel(),
         *(a.away(b) for a, b in zip(part.moments, whole.moments[4:], strict=True)),
     ])  # fmt: skip
     # Linearised earlier: a small part of what is known at all.
     assert np.abs(off / sigma).max() < 0.05
-    np.testing.assert_allclose(np.sqrt(np.diag(positive.inverse(H_part))), sigma, rtol=0.02)
+    np.testing.assert_allclose(np.sqrt(np.diag(linalg.inverse(H_part))), sigma, rtol=0.02)
 
 
 def test_biases_and_velocity_are_found() -> None:
