@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, extent, rotate_left
 from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Pose, Sums
-from lslam.core.kernels.surface_information import solve_on_surfaces
+from lslam.core.kernels.residuals import solve_on_surfaces
 
 Floats = NDArray[np.float64]
 Limits = tuple[float, float, float]

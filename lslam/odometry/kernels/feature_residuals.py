@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linearisation import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED, Pose, Sums, Width
-from lslam.core.kernels.residuals import add_row
-from lslam.core.kernels.surface_information import add_surface
+from lslam.core.kernels.residuals import add_row, add_surface
 from lslam.core.kernels.voxel import index_of, pack
 from lslam.odometry.kernels.feature_grid import nearest
 from lslam.odometry.kernels.lines import add_line

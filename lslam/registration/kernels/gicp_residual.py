@@ -20,8 +20,15 @@ from lslam.core.kernels.linearisation import (
     Sums,
     Width,
 )
-from lslam.core.kernels.residuals import Voxels, add_information, nearest, octant_slots, variance_of
-from lslam.core.kernels.surface_information import add_surface, thin_information
+from lslam.core.kernels.residuals import (
+    Voxels,
+    add_information,
+    add_surface,
+    nearest,
+    octant_slots,
+    thin_information,
+    variance_of,
+)
 from lslam.registration.kernels.discs import EXTENT2, disc
 
 Floats = NDArray[np.float64]

@@ -23,8 +23,7 @@ from lslam.core.kernels.linearisation import (
     Sums,
     Width,
 )
-from lslam.core.kernels.residuals import Voxels, add_information, octant_slots
-from lslam.core.kernels.surface_information import add_surface
+from lslam.core.kernels.residuals import Voxels, add_information, add_surface, octant_slots
 from lslam.registration.kernels.discs import disc
 
 Floats = NDArray[np.float64]
