@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from lslam.core.version import __version__
 
 if TYPE_CHECKING:
-    from lslam.core.config.load import load_config
+    from lslam.core.config.config import load_config
     from lslam.evaluation.evaluate import evaluate
     from lslam.io.readers import open_sequence
     from lslam.pipeline.run import run
@@ -28,7 +28,7 @@ _HOMES = {
     "Registration": ("lslam.registration.registration", "Registration"),
     "compare": ("lslam.studies.from_python", "compare"),
     "evaluate": ("lslam.evaluation.evaluate", "evaluate"),
-    "load_config": ("lslam.core.config.load", "load_config"),
+    "load_config": ("lslam.core.config.config", "load_config"),
     "open_sequence": ("lslam.io.readers", "open_sequence"),
     "run": ("lslam.pipeline.run", "run"),
     "simulate": ("lslam.simulation.scenarios", "simulate"),

@@ -67,7 +67,7 @@ def command(jobs_file: Path, **given: Any) -> None:
 
 def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
     if path != Path("-"):
-        from lslam.core.config.load import check_settings
+        from lslam.core.config.config import check_settings
         from lslam.core.config.study import read_batch
 
         check_settings(given["settings"])

@@ -36,7 +36,7 @@ def show(config_file: Path | None, preset: str | None, settings: tuple[str, ...]
 @command.command(epilog="Example: lslam config presets")
 def presets() -> None:
     """List the presets that `--preset` takes."""
-    from lslam.core.config.load import known_presets
+    from lslam.core.config.config import known_presets
 
     known = known_presets()
     width = max(len(name) for name in known)

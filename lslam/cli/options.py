@@ -118,8 +118,8 @@ def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], d
     """
     from pydantic import ValidationError
 
+    from lslam.core.config.config import explain
     from lslam.core.config.input import AS_CONFIGURED, ScanRange
-    from lslam.core.config.load import explain
 
     words = list(words)
     common: dict[str, int] = {}

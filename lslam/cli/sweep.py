@@ -98,7 +98,7 @@ def command(study: str | None, **given: Any) -> None:
 def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     """The study that the options describe. They are checked as far as possible before heavy imports."""
     seeds = None if given["seeds"] is None else options.seeds_of(given["seeds"])
-    from lslam.core.config.load import check_settings
+    from lslam.core.config.config import check_settings
     from lslam.core.config.study import parse_study
     from lslam.studies.output import STUDY, require_free
     from lslam.studies.sweep import find_study

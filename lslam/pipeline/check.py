@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lslam.backend.loops import require_descriptor
 from lslam.core.config import Config
-from lslam.core.config.load import read_preset
+from lslam.core.config.config import read_preset
 from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.core.errors import UsageError
 from lslam.evaluation import check_words, parse_delta

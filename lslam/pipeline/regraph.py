@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core.config import Config
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 from lslam.core.errors import InputError, UsageError
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers import open_sequence

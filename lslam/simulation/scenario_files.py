@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from lslam.core.config.load import setting_value, shipped
+from lslam.core.config.config import setting_value, shipped
 from lslam.core.config.section import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.core.geometry import portable

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lslam.core.config.load import read_toml
+from lslam.core.config.config import read_toml
 from lslam.core.errors import InterruptedRunError, LslamError, OutputExistsError
 from lslam.core.types.study import StudyRow
 from lslam.core.untrusted import parse_toml

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.core.config.load import shipped
+from lslam.core.config.config import shipped
 from lslam.core.config.study import ExpectedFinding, StudyConfig, parse_study, read_study
 from lslam.core.errors import InputError, RunFailedError, UsageError, nearest
 from lslam.core.printable import toml_text

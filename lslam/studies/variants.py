@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from lslam.core.config import Config, load_config
-from lslam.core.config.load import known_presets
+from lslam.core.config.config import known_presets
 from lslam.core.config.study import Point, StudyConfig
 from lslam.core.errors import ConfigError, UsageError, nearest
 from lslam.core.printable import file_safe

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from recorded import PLACES, TRUTH_AT_S
 from scores import ate, origin
 
+from lslam.core.config.config import load_config
 from lslam.core.config.input import PreprocessConfig
-from lslam.core.config.load import load_config
 from lslam.core.errors import LslamError
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.se3 import poses_at

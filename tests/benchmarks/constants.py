@@ -28,7 +28,7 @@ import numpy as np
 import tables
 from constant_drives import ROOT, RUNS, load
 
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 
 # What a scan passes: files, and which runs tell of their numbers.
 PATH: dict[str, tuple[str, ...]] = {

@@ -32,7 +32,7 @@ from traced import Traced
 
 from lslam import Registration
 from lslam.core.config import load_config
-from lslam.core.config.load import known_presets
+from lslam.core.config.config import known_presets
 from lslam.core.errors import RunFailedError
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import poses_at

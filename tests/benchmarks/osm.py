@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 import lslam
 from lslam.core.config import Config
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 from lslam.core.geometry import geodesy, se2
 from lslam.evaluation.thesis import planar
 from lslam.evaluation.timing import read_timing_rows

@@ -12,7 +12,7 @@ from osm_builders import ExtractMaker
 
 from lslam.backend.manual import read_control_points, read_named_pairs
 from lslam.core.config import load_config
-from lslam.core.config.load import to_toml
+from lslam.core.config.config import to_toml
 from lslam.core.config.study import read_batch, read_study
 from lslam.core.errors import LslamError
 from lslam.core.types.study import StudyRow

@@ -15,7 +15,7 @@ from lslam.backend.graph.problem import PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.outcome import Given, solve
 from lslam.core.config import Config
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se2, se3
 from lslam.core.types.constraint import Constraint

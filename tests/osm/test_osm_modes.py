@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import lslam
 from lslam.core.config import Config
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 from lslam.core.geometry import geodesy, se2, se3
 from lslam.core.types.building import CorrectedMap, KeyframeMatch
 from lslam.core.types.stage_clock import KeyframeClocks

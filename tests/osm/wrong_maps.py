@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lslam
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 from lslam.core.geometry import geodesy, se2
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_files import write_osm

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.core.config.load import load_config
+from lslam.core.config.config import load_config
 from lslam.core.types.scan import Scan
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 from lslam.studies.grid import Job

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from lslam.core.config import Config, load_config, to_toml
-from lslam.core.config.load import BASE, known_presets, read_preset
+from lslam.core.config.config import BASE, known_presets, read_preset
 from lslam.core.errors import ConfigError, InputError, UsageError
 
 MINE = """summary = "ours"
@@ -79,7 +79,7 @@ def test_a_resolved_configuration_repeats_itself_and_names_its_preset(
 
 def test_an_unknown_preset_is_answered_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = {"thesis-icp": "", "thesis-loam": ""}
-    monkeypatch.setattr("lslam.core.config.load._presets", lambda: shipped)
+    monkeypatch.setattr("lslam.core.config.config._presets", lambda: shipped)
     with pytest.raises(
         UsageError, match=r"no preset 'thesis-ipc' and no TOML file; did you mean 'thesis-icp'"
     ) as caught:
