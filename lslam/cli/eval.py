@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from lslam.core.config.outputs import EvalConfig
     from lslam.core.types.sequence import Calibration
     from lslam.core.types.trajectory import Trajectory
-    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.metric import Evaluation
     from lslam.evaluation.timing import Timing
 
 EPILOG = """\b

@@ -15,15 +15,18 @@ from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
+    AbsoluteError,
     Document,
+    Evaluation,
     MatchedPoses,
     MetricRow,
     TrajectoryMetric,
     cells_of,
+    describe,
+    percent_of_length,
     statistics_document,
     two,
 )
-from lslam.evaluation.results import AbsoluteError, Evaluation, describe, percent_of_length
 
 
 def absolute_error(estimate: Floats, truth: Floats, alignment: str, has_rotations: bool = True) -> AbsoluteError:

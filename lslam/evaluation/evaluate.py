@@ -19,9 +19,8 @@ from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset
 from lslam.evaluation.frames import body_turn, reconcile
 from lslam.evaluation.kitti_drift import KittiOdometry
-from lslam.evaluation.metric import MatchedPoses, TrajectoryMetric
+from lslam.evaluation.metric import Evaluation, MatchedPoses, TrajectoryMetric
 from lslam.evaluation.relative import RelativePoseError
-from lslam.evaluation.results import Evaluation
 from lslam.evaluation.thesis import DelTufo, Girolimetto
 from lslam.evaluation.time_offset import fit_offset
 

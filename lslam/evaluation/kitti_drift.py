@@ -12,8 +12,7 @@ from lslam.core.config.outputs import EvalConfig
 from lslam.core.printable import counted, significant
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
-from lslam.evaluation.metric import NO_ROTATIONS, Document, MatchedPoses, MetricRow, TrajectoryMetric
-from lslam.evaluation.results import Evaluation
+from lslam.evaluation.metric import NO_ROTATIONS, Document, Evaluation, MatchedPoses, MetricRow, TrajectoryMetric
 
 LENGTHS = (100, 200, 300, 400, 500, 600, 700, 800)
 START_EVERY = 10

@@ -17,14 +17,16 @@ from lslam.evaluation import parse_delta
 from lslam.evaluation.metric import (
     NO_ROTATIONS,
     Document,
+    Evaluation,
     MatchedPoses,
     MetricRow,
+    RelativeError,
     TrajectoryMetric,
     cells_of,
+    describe,
     statistics_document,
     two,
 )
-from lslam.evaluation.results import Evaluation, RelativeError, describe
 
 Pairs = NDArray[np.int64]
 TOLERANCE = 0.1  # of the distance, for pairs that must be as far apart as asked

@@ -17,8 +17,15 @@ from lslam.core.printable import fixed, metres, significant
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.absolute import align
-from lslam.evaluation.metric import NO_ROTATIONS, MatchedPoses, MetricRow, TrajectoryMetric, two
-from lslam.evaluation.results import Evaluation, percent_of_length
+from lslam.evaluation.metric import (
+    NO_ROTATIONS,
+    Evaluation,
+    MatchedPoses,
+    MetricRow,
+    TrajectoryMetric,
+    percent_of_length,
+    two,
+)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.metric import Evaluation
 
 # How fixes were used.
 _WAYS = {"graph": "GNSS in the graph", "fit": "GNSS fitted afterwards"}

@@ -16,8 +16,7 @@ from lslam.core.printable import significant
 from lslam.core.types.run_record import Crispness, RunRecord
 from lslam.core.version import __version__
 from lslam.evaluation.evaluate import METRICS, shown_metrics
-from lslam.evaluation.metric import MetricRow
-from lslam.evaluation.results import Evaluation
+from lslam.evaluation.metric import Evaluation, MetricRow
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.reports.grid_text import comma_separated, latex, markdown
 

@@ -21,7 +21,7 @@ from lslam.reports.picture import COLOURS, label, shown_figure
 from lslam.reports.plots import first_available
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.metric import Evaluation
 
 
 # mm: a column and the text of two in IEEE's journals.

@@ -28,7 +28,7 @@ from lslam.reports.svg import Track
 from lslam.reports.text import imu_rows, localization_rows
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.metric import Evaluation
 
 
 TIME = "s since the first scan"

@@ -18,7 +18,7 @@ from lslam.reports.plots import first_available
 from lslam.reports.png import VIRIDIS, usual_range
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.metric import Evaluation
 
 
 STATUSES = ("registered", "standing", "bridged", "skipped", "not known")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lslam.core.types.arrays import Floats
-    from lslam.evaluation.results import AbsoluteError, Evaluation
+    from lslam.evaluation.metric import AbsoluteError, Evaluation
     from lslam.io.formats.osm_buildings import BuildingExtract
 
 

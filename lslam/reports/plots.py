@@ -17,7 +17,7 @@ from lslam.reports.facts import RunFacts, stage_matrix
 from lslam.reports.svg import By, Track, plane_chart
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import AbsoluteError, Evaluation
+    from lslam.evaluation.metric import AbsoluteError, Evaluation
 
 
 DISTANCE = "distance along ground truth, m"

@@ -14,7 +14,7 @@ from lslam.reports.back_end import back_end_rows, before_and_after
 from lslam.reports.facts import Failure, RunFacts, run_facts
 
 if TYPE_CHECKING:
-    from lslam.evaluation.results import Evaluation
+    from lslam.evaluation.metric import Evaluation
 
 
 def localization_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:

@@ -20,7 +20,7 @@ from lslam.core.types.sequence import Sequence as Recording
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.results import AbsoluteError
+from lslam.evaluation.metric import AbsoluteError
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
 from lslam.reports import compare_html, compare_table

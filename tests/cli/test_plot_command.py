@@ -11,7 +11,7 @@ from calling import SAMPLE, assert_one_sentence, lslam
 
 import lslam as lslam_api
 from lslam.core.config import load_config
-from lslam.evaluation.results import AbsoluteError
+from lslam.evaluation.metric import AbsoluteError
 from lslam.pipeline.plot_run import plotted_run
 from lslam.reports.figures import draw_figure
 

@@ -13,7 +13,7 @@ from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.absolute import absolute_error
-from lslam.evaluation.results import describe
+from lslam.evaluation.metric import describe
 from lslam.evaluation.thesis import axis_errors
 
 TRUTH, ESTIMATE = drive().poses, disturb(drive()).poses

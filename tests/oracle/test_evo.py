@@ -16,8 +16,8 @@ import pytest
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
+from lslam.evaluation.metric import Evaluation
 from lslam.evaluation.relative import by_index, by_path, error_transforms
-from lslam.evaluation.results import Evaluation
 from lslam.io.formats.trajectory_files import read_trajectory, write_tum
 
 GOLDEN = json.loads(make_golden.GOLDEN.read_text())

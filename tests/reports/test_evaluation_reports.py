@@ -16,7 +16,7 @@ from lslam.core.errors import OutputError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.results import Evaluation
+from lslam.evaluation.metric import Evaluation
 from lslam.evaluation.timing import StageTime, Timing
 from lslam.reports import evaluations, picture
 

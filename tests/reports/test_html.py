@@ -22,7 +22,7 @@ from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.results import Evaluation
+from lslam.evaluation.metric import Evaluation
 from lslam.reports.html import flatten, render_report, write_report
 
 MakeRecord = Callable[..., RunRecord]

@@ -16,7 +16,7 @@ from lslam.core.config.outputs import EvalConfig
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.results import Evaluation
+from lslam.evaluation.metric import Evaluation
 from lslam.reports.html import render_report, with_new_map
 from lslam.reports.page_data import cloud_data, scan_data
 from lslam.reports.png import palette

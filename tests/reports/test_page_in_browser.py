@@ -22,7 +22,7 @@ from reported_study import study_rows
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import evaluate
-from lslam.evaluation.results import Evaluation
+from lslam.evaluation.metric import Evaluation
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.compare_html import write_page
 from lslam.reports.html import write_report
