@@ -28,8 +28,7 @@ from lslam.core.types.building import (
 )
 from lslam.io.formats.osm_data import OsmData
 from lslam.io.formats.osm_files import write_osm
-from lslam.osm.buildings_geojson import write_corrected
-from lslam.osm.corrected_elements import corrected_osm
+from lslam.osm.buildings_geojson import corrected_osm, write_corrected
 from lslam.osm.kernels import wall_matching
 from lslam.osm.overlap import Untangled, remove_overlaps
 from lslam.osm.wall_match import LIKENESS

@@ -16,7 +16,7 @@ from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap
 from lslam.io.formats.osm_buildings import buildings_of
 from lslam.io.formats.osm_data import ATTRIBUTION, Member, OsmData, Way
 from lslam.io.formats.osm_files import read_osm, write_osm
-from lslam.osm.corrected_elements import corrected_osm
+from lslam.osm.buildings_geojson import corrected_osm
 from lslam.osm.overpass import from_overpass
 
 Floats = NDArray[np.float64]
