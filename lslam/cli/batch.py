@@ -137,8 +137,8 @@ def _print(rows: list[StudyRow], out: Path, as_json: bool) -> None:
 
         show(json.dumps({"folder": str(out), "results": str(out / "results.csv"), "runs": rows_document(rows)}) + "\n")
         return
-    from lslam.reports.grid_text import aligned
     from lslam.reports.study_table import batch_table
+    from lslam.reports.text import aligned
 
     show(aligned(batch_table(rows), 3) + "\n")
 

@@ -116,8 +116,8 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
 
 
 def _print(rows: list[StudyRow]) -> None:
-    from lslam.reports.grid_text import aligned
     from lslam.reports.study_table import best_table
+    from lslam.reports.text import aligned
 
     show(aligned(best_table(rows), 2) + "\n")
 

@@ -14,7 +14,7 @@ from lslam.core.types.comparison import Comparison, Metric, RunScore, Spread, Su
 from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.reports.evaluations import strict
-from lslam.reports.grid_text import Grid, aligned, comma_separated, latex, markdown
+from lslam.reports.text import Grid, aligned, comma_separated, latex, markdown
 
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "mean time per scan", "health": "scans and runs"}

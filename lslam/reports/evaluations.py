@@ -18,7 +18,7 @@ from lslam.core.version import __version__
 from lslam.evaluation.evaluate import METRICS, shown_metrics
 from lslam.evaluation.metric import Evaluation, MetricRow
 from lslam.evaluation.timing import StageTime, Timing
-from lslam.reports.grid_text import comma_separated, latex, markdown
+from lslam.reports.text import comma_separated, latex, markdown
 
 SCHEMA, VERSION = "lslam-evaluation", 1
 Document = dict[str, Any]

@@ -12,10 +12,10 @@ from lslam.core.printable import counted
 from lslam.core.types.study import StudyResult, StudyRow
 from lslam.io.formats.atomic import atomic_write
 from lslam.reports.compare_table import CompareTable, as_text
-from lslam.reports.grid_text import comma_separated
 from lslam.reports.shell import render
 from lslam.reports.study_figures import StudyFigure, study_figures
 from lslam.reports.study_table import means_grid, study_recipes, study_tables
+from lslam.reports.text import comma_separated
 
 
 @dataclass(frozen=True)

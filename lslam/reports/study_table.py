@@ -17,7 +17,7 @@ from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.curves import normalise
 from lslam.reports.compare_table import CompareTable
 from lslam.reports.evaluations import strict
-from lslam.reports.grid_text import Grid
+from lslam.reports.text import Grid
 
 UNKNOWN = "-"
 LABELS = {"ate_se3": "ATE se3", "ate_origin": "ATE origin", "thesis_rmse": "thesis_rmse"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +17,8 @@ from lslam.reports.facts import Failure, RunFacts, run_facts
 
 if TYPE_CHECKING:
     from lslam.evaluation.metric import Evaluation
+
+Grid = list[list[str]]
 
 
 def localization_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
@@ -180,3 +184,42 @@ def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
         each = ", ".join(f"{name} {s:.2f}" for name, s in later.items())
         rows.append(("back end", f"{sum(later.values()):.1f} s on {len(record.keyframe_scans)} keyframes: {each}"))
     return rows
+
+
+def markdown(grid: Grid, names: int = 1) -> str:
+    """A Markdown table; the first `names` columns are set flush left, the others right."""
+    head, *body = [[cell.strip().replace("|", "\\|") for cell in row] for row in grid]
+    rule = ["---"] * names + ["---:"] * (len(head) - names)
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *body])
+
+
+def comma_separated(grid: Grid, _: int = 1) -> str:
+    """CSV as spreadsheets read it."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([[cell.strip() for cell in row] for row in grid])
+    return out.getvalue().rstrip("\n")
+
+
+def latex(grid: Grid, names: int = 1) -> str:
+    """A LaTeX tabular that needs no package."""
+    head, *body = [" & ".join(_escaped(cell) for cell in row) + r" \\" for row in grid]
+    columns = "l" * names + "r" * (len(grid[0]) - names)
+    return "\n".join(
+        [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *body, r"\hline", r"\end{tabular}"]
+    )
+
+
+def aligned(grid: Grid, names: int = 1) -> str:
+    """Columns of equal width, two spaces between them."""
+    widths = [max(len(cell) for cell in column) for column in zip(*grid, strict=True)]
+    return "\n".join(
+        "  ".join(f"{c:<{w}}" if k < names else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=True)))
+        .rstrip()
+        for row in grid
+    )  # fmt: skip
+
+
+def _escaped(cell: str) -> str:
+    signs = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {"\\": "\\textbackslash{}"}
+    cell = cell.translate({ord(sign): word for sign, word in signs.items()})
+    return cell.strip().replace("±", "$\\pm$")
