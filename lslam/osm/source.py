@@ -234,6 +234,9 @@ class _Circle:
 class OsmBuffer:
     """Replies about the surroundings of a moving estimate; `replies` has them in the order of the requests.
 
+    Del Tufo, section 3.1: the buildings within `fetch_radius` of the estimate are requested; when the estimate is more than
+    `renew_radius` from that place, the next ones are. The caller never waits: a slow or unreachable server does not delay a run.
+
     Parameters
     ----------
     fetch : returns the Overpass reply for a box (`overpass.fetch_buildings`); called in a thread of the buffer

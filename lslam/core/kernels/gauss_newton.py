@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, extent, rotate_left
-from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Pose, Sums
+from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Floats, Pose, Sums
 from lslam.core.kernels.residuals import solve_on_surfaces
 
-Floats = NDArray[np.float64]
 Limits = tuple[float, float, float]
 
 # A degenerate direction is still estimated until its information is below this part of the threshold: errors of a degree in the

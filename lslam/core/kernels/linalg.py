@@ -173,6 +173,9 @@ def extent(values: NDArray[Any]) -> tuple[Any, Any]:
     return low, high
 
 
+# Cholesky factors with the same bits for any number of threads, unlike those of LAPACK. Rows and columns are first scaled to a
+# unit diagonal, since metres and radians differ. Inner loops run along rows and sum no terms, so that they are vectorised
+# without changing the order of sums. The result of a matrix that is not positive definite is NaN.
 @inline
 def _factorise(A: Floats, scale: Floats, L: Floats, column: Floats) -> None:
     """L (N, N) lower triangular with L L^T = S A S, S = diag(`scale`) (N,), which is found first."""

@@ -10,7 +10,7 @@ search : results kept from one iteration to the next, and from one map to the ne
 pose : R (3, 3) and t (3,), m, world from LiDAR
 width : width of the robust kernel, m; its final width, m; squared distance, m2, beyond which correspondences are rejected
 sums : H and S (6, 6), whose upper triangles are added to, g (6,) and `facts`. S is the information of the surfaces alone, for
-    residuals with full information matrices, see `surface_information`; the other residuals do not change it.
+    residuals with full information matrices, see `residuals.thin_information`; the other residuals do not change it.
 
 Pose update: t <- t + d[:3], R <- exp(d[3:]) R, so a residual n . (R s + t - m) has the Jacobian [n, (R s) x n].
 """
@@ -32,5 +32,10 @@ Search = tuple[Longs, Ints, Ints, Floats, Flags, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]
 Sums = tuple[Floats, Floats, Floats, Floats]
+
+# Indices in `facts`, an array of COUNT sums over the points beside the normal equations:
+# information of the correspondences, 1/m2; squared residuals times robust weights, m2; points within the kernel's width;
+# points with a correspondence; information times squared lever arm; robust weights; relative weights of the points, 0 for
+# residuals without them, see `gauss_newton.scale_by_population`.
 INFORMATION, SQUARED, INLIERS, MATCHED, LEVER, ROBUST, POPULATION = range(7)
 COUNT = 7

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.kernels.gaussians import BLOB, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
@@ -17,6 +16,9 @@ from lslam.core.kernels.linearisation import (
     MATCHED,
     ROBUST,
     SQUARED,
+    Floats,
+    Ints,
+    Longs,
     Pose,
     Search,
     Settings,
@@ -25,17 +27,16 @@ from lslam.core.kernels.linearisation import (
 )
 from lslam.core.kernels.voxel import index_of, pack
 
-Floats = NDArray[np.float64]
 # Rows of planes, keys and table, see `gaussians`.
-Voxels = tuple[Floats, NDArray[np.int64], NDArray[np.int32]]
+Voxels = tuple[Floats, Longs, Ints]
 
 # Factor on the variance of the normal, two sigma: the errors of neighbouring points of one ring are correlated.
 TILT = 4.0
 
 
 @inline
-def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: NDArray[np.int64],
-                 slots: NDArray[np.int32], keys: NDArray[np.int64], table: NDArray[np.int32]) -> bool:  # fmt: skip
+def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: Longs,
+                 slots: Ints, keys: Longs, table: Ints) -> bool:  # fmt: skip
     """Look up the slots (8,) of the voxels around point i at x, y, z, world, when it has left its octant cell; True then."""
     ix, iy, iz = (
         index_of(x - 0.5 / inverse, inverse),
@@ -56,7 +57,7 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: ND
 
 
 @inline
-def nearest(x: float, y: float, z: float, i: int, slots: NDArray[np.int32], chosen: NDArray[np.int32], asked: Floats,
+def nearest(x: float, y: float, z: float, i: int, slots: Ints, chosen: Ints, asked: Floats,
             planes: Floats) -> tuple[int, float, int, float]:  # fmt: skip
     """Nearest plane and nearest blob among the slots of point i: for each the slot, or -1, and its mean's squared distance, m2.
 
@@ -275,6 +276,9 @@ def add_information(H: Floats, g: Floats, w: float, xx: float, xy: float, xz: fl
     g[5] += rx * py - ry * px
 
 
+# The Gaussian of a plane voxel also has information within the plane, about the positions of the voxel's points. It is small,
+# but it is the only information along a corridor, and it pulls the pose towards where the map was measured. So degenerate
+# directions are found without it, and the pose keeps the motion prior along them.
 @inline
 def add_surface(S: Floats, unused: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float,
                 rz: float) -> None:  # fmt: skip
