@@ -119,6 +119,15 @@ def input_errors(place: object, *kinds: type[Exception], as_what: str = "") -> I
         raise InputError(f"{place} cannot be read{how}: {cause(error)}") from None
 
 
+@contextlib.contextmanager
+def output_errors(place: object) -> Iterator[None]:
+    """Turn an OSError of the block into an OutputError: `place` cannot be written, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"{place} cannot be written: {cause(error)}") from None
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Sentence fragment suggesting the known names nearest to `name`, or listing the known ones.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.errors import InputError, OutputError, cause
+from lslam.core.errors import InputError, OutputError, cause, output_errors
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Longs
 from lslam.core.types.state import State
@@ -125,12 +125,10 @@ class StoredRows:
 
     def append(self, rows: Rows) -> None:
         """Write rows behind those that are there."""
-        try:
-            with self._path.open("ab") as stream, self._path.with_suffix(".keys").open("ab") as keys:
-                stream.write(np.ascontiguousarray(rows).data)
-                keys.write(np.ascontiguousarray(rows[:, 0]).data)
-        except OSError as error:
-            raise OutputError(f"{self._path} cannot be written: {cause(error)}") from None
+        path = self._path
+        with output_errors(path), path.open("ab") as stream, path.with_suffix(".keys").open("ab") as keys:
+            stream.write(np.ascontiguousarray(rows).data)
+            keys.write(np.ascontiguousarray(rows[:, 0]).data)
         self._count += len(rows)
 
     def read(self, begin: int, end: int) -> Rows:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.core.errors import OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import OutputExistsError, UsageError, output_errors
 from lslam.core.geometry import se3
 from lslam.core.geometry.geodesy import frame_change
 from lslam.core.stopping import asking
@@ -123,10 +123,8 @@ def output_folder(folder: Path, overwrite: bool) -> Iterator[None]:
                 f"{folder / name} exists; name another folder with --changes or replace it with --overwrite"
             )
     is_new = not folder.exists()
-    try:
+    with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None
     try:
         yield
     except BaseException:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lslam.core.config.outputs import MapConfig
-from lslam.core.errors import OutputError, cause
+from lslam.core.errors import output_errors
 from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.trajectory import Trajectory
@@ -78,10 +78,8 @@ def drop_note(path: Path) -> None:
     if notes:
         write_json(target, _joined(notes))
         return
-    try:
+    with output_errors(target):
         target.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{target} cannot be written: {cause(error)}") from None
 
 
 def _notes(path: Path) -> dict[str, Note]:

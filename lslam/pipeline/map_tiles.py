@@ -11,7 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from lslam.core.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import (
+    InputError,
+    InterruptedRunError,
+    OutputError,
+    OutputExistsError,
+    UsageError,
+    output_errors,
+)
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.core.types.gnss import Georeference, OutputCrs
@@ -79,22 +86,20 @@ def write_tiles(
 
 def _publish(stage: Path, folder: Path, names: set[str]) -> None:
     """Give the tiles their place, those of an earlier map gone; the index follows, so that it never tells of tiles to come."""
-    try:
+    with output_errors(f"the tiles in {folder}"):
         (folder / INDEX).unlink(missing_ok=True)
         for file in folder.glob("tile_*_*.*"):
             if file.name not in names:
                 file.unlink()
         for name in sorted(names):
             os.replace(stage / name, folder / name)
-    except OSError as error:
-        raise OutputError(f"the tiles in {folder} cannot be written: {cause(error)}") from None
 
 
 def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple[int, int], ArrayCloud]]:
     """The points of each tile, tiles in order."""
     waiting: dict[tuple[int, int], list[Floats]] = {}
     held, keys = 0, set[tuple[int, int]]()
-    try:
+    with output_errors(f"the tiles in {spool.parent}"):
         for block in cloud.blocks():
             table = np.empty((len(block), 4))
             table[:, :3], table[:, 3] = block.points, 0.0 if block.intensity is None else block.intensity
@@ -112,8 +117,6 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
             table = np.fromfile(path, np.float64).reshape(-1, 4)
             path.unlink()
             yield key, ArrayCloud(table[:, :3], table[:, 3].astype(np.float32) if cloud.has_intensity else None)
-    except OSError as error:
-        raise OutputError(f"the tiles in {spool.parent} cannot be written: {cause(error)}") from None
 
 
 def _spill(waiting: dict[tuple[int, int], list[Floats]], spool: Path) -> set[tuple[int, int]]:
@@ -156,7 +159,5 @@ def check_tiles(folder: Path, size: float, overwrite: bool) -> None:
             raise OutputExistsError(f"{folder} exists; name another folder with --out or replace it with --overwrite")
         if not is_tiles(folder):
             raise OutputError(f"{folder} is something else than tiles: name another --out")
-    try:
+    with output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None

@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from lslam.core.config import Config, load_config
-from lslam.core.errors import InputError, InterruptedRunError, OutputError, OutputExistsError, UsageError, cause
+from lslam.core.errors import (
+    InputError,
+    InterruptedRunError,
+    OutputError,
+    OutputExistsError,
+    UsageError,
+    cause,
+    output_errors,
+)
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference, OutputCrs
@@ -250,10 +258,8 @@ def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> Ru
 @contextmanager
 def _staged(folder: Path) -> Iterator[Path]:
     """A folder within `folder` to write into, which is gone in the end."""
-    try:
+    with output_errors(folder):
         stage = tempfile.TemporaryDirectory(prefix=SPOOL, dir=folder, ignore_cleanup_errors=True)
-    except OSError as error:
-        raise OutputError(f"{folder} cannot be written: {cause(error)}") from None
     with stage as path:
         yield Path(path)
 
@@ -265,10 +271,8 @@ def _publish(stage: Path, path: Path) -> None:
     drop_note(path)
     first = [stage / path.name, note]
     for file in [*first, *sorted(file for file in stage.iterdir() if file not in first)]:
-        try:
+        with output_errors(path.with_name(file.name)):
             os.replace(file, path.with_name(file.name))
-        except OSError as error:
-            raise OutputError(f"{path.with_name(file.name)} cannot be written: {cause(error)}") from None
 
 
 def results_of(run: EarlierRun) -> list[ScanResult]:

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError, cause
+from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError, cause, output_errors
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.machine import lock
 from lslam.core.printable import file_safe
@@ -84,10 +84,8 @@ class RunFolder:
 
     def require_space(self, size: int, what: str) -> None:
         """Raise OutputError when the disk has not `size` bytes left for `what`."""
-        try:
+        with output_errors(f"output folder {self.path}"):
             left = shutil.disk_usage(self.path).free
-        except OSError as error:
-            raise OutputError(f"output folder {self.path} cannot be written: {cause(error)}") from None
         if left < size:
             raise OutputError(
                 f"the disk of {self.path} has {left / 1e6:.1f} MB left, {what} needs about {size / 1e6:.1f} MB; "
@@ -118,14 +116,12 @@ class RunFolder:
         source = run / KEYFRAMES
         if any((self.path / CHECKPOINT).glob("odometry-*.npz")):
             return  # the last of the files that are laid there
-        try:
+        with output_errors(f"output folder {self.path}"):
             for name in (KEYFRAMES, CHECKPOINT):
                 (self.path / name).mkdir(exist_ok=True)
             for file in sorted(source.glob("*.npz")):
                 place = {ODOMETRY: f"{CHECKPOINT}/odometry-{0:07d}.npz", IMU_START: f"{CHECKPOINT}/{IMU_START}"}
                 _share(file, self.path / place.get(file.name, f"{KEYFRAMES}/{file.name}"))
-        except OSError as error:
-            raise OutputError(f"output folder {self.path} cannot be written: {cause(error)}") from None
 
     def __enter__(self) -> RunFolder:
         """Copy lslam's log into log.txt while the folder is held."""
@@ -220,10 +216,8 @@ class _LogFile(logging.FileHandler):
 
 def check_target(path: Path, overwrite: bool) -> None:
     """Raise what `RunFolder` would for a folder that is there, before any work; nothing is held or written."""
-    try:
+    with output_errors(f"output folder {path}"):
         _require_free(path, overwrite)
-    except OSError as error:
-        raise OutputError(f"output folder {path} cannot be written: {cause(error)}") from None
 
 
 def require_run(path: Path) -> None:
@@ -298,10 +292,8 @@ def held(path: Path) -> Iterator[None]:
 
     What one that was killed left of a map is cleared away. Raises OutputError where nothing can be written.
     """
-    try:
+    with output_errors(path):
         stream = _hold(path)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {cause(error)}") from None
     try:
         _clear_spools(path)
         yield

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from lslam.core.errors import OutputError, UsageError, cause
+from lslam.core.errors import OutputError, UsageError, cause, output_errors
 from lslam.io.formats.bag_files import INFO_TOPIC, typestore
 
 # What belongs to the whole of a run.
@@ -31,12 +31,10 @@ class BagWriter:
         self.store = typestore("ros1" if kind == "bag" else "cdr")
         self._part = path.with_name(path.name + ".part")
         self._connections: dict[str, Any] = {}
-        try:
+        with output_errors(path):
             shutil.rmtree(self._part, ignore_errors=True)
             self._part.mkdir(parents=True)
             self._writer = _writer(self._part / path.name, kind, is_zstd)
-        except OSError as error:
-            raise OutputError(f"{path} cannot be written: {cause(error)}") from None
 
     def __enter__(self) -> BagWriter:
         return self
