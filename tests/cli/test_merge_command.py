@@ -122,7 +122,7 @@ def test_an_interrupted_merge_goes_on_to_the_same_bytes_by_any_number_of_threads
     config = load_config(None, ["input.threads=1"])
 
     def look() -> bool:
-        return sys._getframe(1).f_code.co_name == "_map"
+        return sys._getframe(1).f_code.co_name == "scans_again"
 
     with pytest.raises(InterruptedRunError):
         merge_into(folders, tmp_path / "town", config, Watch(should_stop=look))
