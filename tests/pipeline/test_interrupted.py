@@ -24,7 +24,7 @@ SPARSE, SCANS = ("input.skip_frames=2", "keyframes.distance=4", "registration.st
 # Who asks in a run that does everything: what takes long where a recording is long.
 ASKERS = (
     "estimate", "find", "floor_planes", "_voted_out", "solve", "marginal_blocks", "_along", "sightings",
-    "finish", "agreeing", "absent_buildings", "new_walls", "remove_overlaps", "build_map", "combined", "_pieces", "make_report",
+    "finish", "agreeing", "absent_buildings", "new_walls", "remove_overlaps", "scans_again", "combined", "_pieces", "make_report",
 )  # fmt: skip
 
 
@@ -90,8 +90,8 @@ def test_every_stage_checks_for_a_stop(whole: tuple[Path, list[str]]) -> None:
     out, looks = whole
     keyframes = json.loads((out / "manifest.json").read_text())["keyframes"]["count"]
     counts = Counter(looks)
-    assert {who: counts[who] for who in ("estimate", "find", "optimise_poses", "build_map", "make_report")} == {
-        "estimate": SCANS, "find": keyframes, "optimise_poses": 1, "build_map": SCANS, "make_report": 1,
+    assert {who: counts[who] for who in ("estimate", "find", "optimise_poses", "scans_again", "make_report")} == {
+        "estimate": SCANS, "find": keyframes, "optimise_poses": 1, "scans_again": SCANS, "make_report": 1,
     }  # fmt: skip
     assert counts["marginal_blocks"] == keyframes
     assert counts["solve"] >= 2, "before the first iteration and after it"
@@ -141,7 +141,7 @@ def test_a_stop_at_any_check_interrupts_and_resumes_to_the_same_bytes(
     """Before the first scan, on the way, before the last; in keyframes, graph and map; before the last word."""
     stops = [
         ("estimate", 0), ("estimate", 20), ("estimate", 24), ("find", 1), ("find", 17), ("solve", 1),
-        ("marginal_blocks", 5), ("build_map", 0), ("build_map", 24), ("build_map", 23), ("make_report", 0),
+        ("marginal_blocks", 5), ("scans_again", 0), ("scans_again", 24), ("scans_again", 23), ("make_report", 0),
     ]  # fmt: skip
     assert_goes_on(config, whole[0], tmp_path / "out", RESULTS, stops)
 
