@@ -72,6 +72,11 @@ def page(name: str) -> Page:
     return Page(name, (ROOT / name).read_text(encoding="utf-8"))
 
 
+def task_pages() -> list[Page]:
+    """The README and the pages that say how a task is done."""
+    return [shown for shown in every_page() if shown.name == "README.md" or shown.name.startswith("docs/tasks/")]
+
+
 def every_page() -> list[Page]:
     """The pages at the top and in docs/."""
     paths = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]

@@ -11,11 +11,11 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from pages import ROOT, Page, every_page, page, slug
+from pages import ROOT, Page, every_page, page, slug, task_pages
 from test_import_graph import LAYERS
 
-PAGES = every_page()
-COMMANDS, METHODS, ARCHITECTURE = (page(f"docs/{name}.md") for name in ("commands", "algorithms", "architecture"))
+PAGES, TASKS = every_page(), task_pages()
+STUDIES, METHODS, ARCHITECTURE = (page(f"docs/{name}.md") for name in ("tasks/comparing", "algorithms", "architecture"))
 PACKAGE = ROOT / "lslam"
 
 # -- links
@@ -90,8 +90,8 @@ def test_commands_exist_with_their_options(call: list[str]) -> None:
         command.make_context(command.name, list(words))
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/commands.md", "docs/conventions.md", "docs/architecture.md"])
-def test_flags_exist(name: str) -> None:
+@pytest.mark.parametrize("shown", [*TASKS, page("docs/conventions.md"), ARCHITECTURE], ids=lambda shown: shown.name)
+def test_flags_exist(shown: Page) -> None:
     from lslam.cli.main import COMMANDS as NAMES
     from lslam.cli.main import cli
 
@@ -101,7 +101,7 @@ def test_flags_exist(name: str) -> None:
         assert command is not None
         inner = list(command.commands.values()) if isinstance(command, click.Group) else []
         known |= {o for c in [command, *inner] for p in c.params for o in p.opts + p.secondary_opts}
-    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]+", page(name).text)) <= known
+    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]+", shown.text)) <= known
 
 
 def test_configuration_keys_exist() -> None:
@@ -136,11 +136,10 @@ def test_keys_in_the_text_exist() -> None:
                 assert key in sections[section].model_fields, f"{shown.name}: {section}.{key}"
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/commands.md"])
-def test_sequence_toml_is_understood(name: str, tmp_path: Path) -> None:
+def test_sequence_toml_is_understood(tmp_path: Path) -> None:
     from lslam.io.formats.sequence_toml import read_sequence_toml
 
-    (tmp_path / "sequence.toml").write_text(page(name).block("toml", "motion_compensated"))
+    (tmp_path / "sequence.toml").write_text(page("README.md").block("toml", "motion_compensated"))
     info = read_sequence_toml(tmp_path / "sequence.toml")
     assert (info.rows, info.cols, info.ground_truth_frame) == (64, 1024, "lidar")
 
@@ -160,14 +159,14 @@ def test_the_study_is_understood_and_says_what_was_printed() -> None:
 
     from lslam.core.config.study import parse_study
 
-    study = parse_study(tomllib.loads(COMMANDS.block("toml", "[parameters]")), "commands", "shares")
+    study = parse_study(tomllib.loads(STUDIES.block("toml", "[parameters]")), "commands", "shares")
     assert len(study.points()) == 8
-    shown = COMMANDS.block("text", "best at")
+    shown = STUDIES.block("text", "best at")
     assert all(finding.text in shown for finding in study.finding)
     assert {f"{study.methods[0]}+imu", f"{study.beside[0]}+imu"} <= set(shown.split())
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/commands.md"])
+@pytest.mark.parametrize("name", ["README.md", "docs/tasks/running.md"])
 def test_exit_codes_are_those_of_the_errors(name: str) -> None:
     from lslam.core import errors
 
@@ -176,9 +175,9 @@ def test_exit_codes_are_those_of_the_errors(name: str) -> None:
     assert listed == {0} | {c.exit_code for c in classes}
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/commands.md"])
-def test_files_in_the_text_exist(name: str) -> None:
-    for file in re.findall(r"`((?:sample_data|tests)/\S*|LICENSE|CITATION\.cff)`", page(name).prose):
+@pytest.mark.parametrize("shown", TASKS, ids=lambda shown: shown.name)
+def test_files_in_the_text_exist(shown: Page) -> None:
+    for file in re.findall(r"`((?:sample_data|tests)/\S*|LICENSE|CITATION\.cff)`", shown.prose):
         assert (ROOT / file).exists(), file
 
 

@@ -9,9 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pages import ROOT, page
+from pages import ROOT, page, task_pages
 
-README, COMMANDS = page("README.md"), page("docs/commands.md")
+README = page("README.md")
 # What runs elsewhere takes the tests' own lslam: the one that is installed would compile its kernels once more.
 HERE = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
 
@@ -42,7 +42,7 @@ def test_twelve_things_are_twelve() -> None:
 
 
 def test_no_benchmark_in_a_how_to() -> None:
-    for shown in (README, COMMANDS):
+    for shown in task_pages():
         assert not re.findall(r"medians? of|worst of|of five seeds", shown.prose)
         assert "<!-- table" not in shown.text
 
@@ -59,16 +59,16 @@ def test_output_of_the_readme_is_what_a_run_prints(tmp_path: Path) -> None:
         return [[row[0]] + row[1:] * (row[0] in {"status", "scans", "path"}) for row in rows]
 
     assert facts(shown) == facts(done.stdout)
-    section = COMMANDS.text.split("## The run folder")[1].split("\n## ")[0]
+    section = page("docs/tasks/run_folder.md").text.split("\n## ")[0]
     listed = {
         name for row in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE) for name in re.findall(r"`(\S+?)`", row)
     }
     assert {path.name for path in (tmp_path / "first").iterdir()} == listed
 
 
-def test_python_of_the_commands_page_runs(tmp_path: Path) -> None:
+def test_python_of_the_page_runs(tmp_path: Path) -> None:
     (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
-    call = [sys.executable, "-c", COMMANDS.block("python")]
+    call = [sys.executable, "-c", page("docs/tasks/python.md").block("python")]
     done = subprocess.run(call, cwd=tmp_path, capture_output=True, text=True, check=False, env=HERE)
     assert done.returncode == 0, done.stderr
     assert float(done.stdout.split()[0]) < 0.1
