@@ -20,8 +20,8 @@ from lslam.core.version import __version__
 from lslam.evaluation.timing import read_timing
 from lslam.io.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
 from lslam.io.formats.geojson import read_line
+from lslam.io.formats.kitti_layout import read_oxts
 from lslam.io.formats.osm_buildings import read_buildings
-from lslam.io.formats.oxts_files import read_oxts
 from lslam.io.formats.sequence_toml import read_sequence_toml
 from lslam.io.formats.stamped_csv import read_gnss_csv, read_imu_csv
 from lslam.io.formats.state_files import read_state, write_state

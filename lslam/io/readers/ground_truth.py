@@ -16,7 +16,7 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import whole_number
-from lslam.io.formats.oxts_files import POS_ACC, ROLL, YAW, Oxts
+from lslam.io.formats.kitti_layout import POS_ACC, ROLL, YAW, Oxts
 from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.io.formats.text_tables import read_table
 from lslam.io.formats.trajectory_files import fits_kitti, read_matrices, read_trajectory, scans_of, without_lost

@@ -25,7 +25,7 @@ from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration, Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.calibration_files import read_raw_cam0_lidar, read_rigid
-from lslam.io.formats.oxts_files import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
+from lslam.io.formats.kitti_layout import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
 from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.formats.time_columns import read_stamps
