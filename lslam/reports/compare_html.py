@@ -19,7 +19,7 @@ from lslam.io.formats.point_files import read_cloud
 from lslam.reports import svg
 from lslam.reports.compare_table import recipes, tables
 from lslam.reports.html import flatten
-from lslam.reports.map_view import Crop, choose_crops, crop_images
+from lslam.reports.page_data import Crop, choose_crops, crop_images
 from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.shell import render

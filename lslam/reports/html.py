@@ -19,8 +19,7 @@ from lslam.reports import plots, svg
 from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.reports.buildings import building_pages
 from lslam.reports.facts import RunFacts, run_facts
-from lslam.reports.map_view import MapFigure, feature_figures, map_figure
-from lslam.reports.page_data import cloud_data, scan_data
+from lslam.reports.page_data import MapFigure, cloud_data, feature_figures, map_figure, scan_data
 from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render, template

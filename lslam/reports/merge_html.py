@@ -14,8 +14,7 @@ from lslam.core.types.comparison import Table
 from lslam.io.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.reports.compare_html import style_of
-from lslam.reports.map_view import MapFigure, map_figure
-from lslam.reports.page_data import cloud_data, packed
+from lslam.reports.page_data import MapFigure, cloud_data, map_figure, packed
 from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render

@@ -17,7 +17,7 @@ from lslam.odometry.base import FeatureSource
 from lslam.odometry.frontend.register_scans import estimate
 from lslam.pipeline.map_pass import MOST_SCANS, view_features
 from lslam.pipeline.run import run
-from lslam.reports.map_view import feature_figures
+from lslam.reports.page_data import feature_figures
 
 CONFIG = load_config(None, ["odometry.method=floam", "map.write=false"], {})
 

@@ -19,7 +19,7 @@ from lslam.core.config.outputs import EvalConfig
 from lslam.core.types.comparison import Spread
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
-from lslam.reports.map_view import Crop, choose_crops, crop_images
+from lslam.reports.page_data import Crop, choose_crops, crop_images
 from lslam.studies.results import metrics_of
 
 
