@@ -58,7 +58,7 @@ def command(run: Path, **given: Any) -> None:
     options.require_there(given["loops_file"], given["control"], given["gt"])
     from lslam.cli.run import print_finished, print_result, read_truth, watch_of
     from lslam.core.stopping import heeded
-    from lslam.pipeline.regraph import open_again, read_for_graph, reading_of, require_another
+    from lslam.pipeline.resume import open_again, read_for_graph, reading_of, require_another
     from lslam.pipeline.run import run as main_job
     from lslam.pipeline.run_folder import check_target
 

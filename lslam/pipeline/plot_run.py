@@ -18,7 +18,7 @@ from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.job import choose_scans
 from lslam.pipeline.map_pass import view_features
 from lslam.pipeline.rebuild import is_gone, read_run, results_of, viewed_run
-from lslam.pipeline.regraph import open_again
+from lslam.pipeline.resume import open_again
 from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure
 from lslam.reports.picture import check_plot_path, house_style, picture
 
