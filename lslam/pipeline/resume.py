@@ -267,7 +267,8 @@ def _require_same_odometry(run: EarlierRun) -> None:
         changed = [key for key in type(known).model_fields if getattr(known, key) != getattr(now, key)]
         if section not in FREE_SECTIONS and changed:
             raise UsageError(
-                f"{section}.{changed[0]} is of the odometry, which is not run again: lslam graph takes keys of {', '.join(FREE_SECTIONS)}"
+                f"{section}.{changed[0]} is of the odometry, which is not run again: lslam graph takes "
+                f"keys of {', '.join(FREE_SECTIONS)}"
             )
 
 
