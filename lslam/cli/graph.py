@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lslam.cli import options
-from lslam.cli.console import log, setup_logging
-from lslam.core.errors import RunFinishedError, UsageError
+from lslam.cli.console import setup_logging
+from lslam.core.errors import UsageError
 
 
 @click.command(
@@ -56,10 +53,8 @@ def command(run: Path, **given: Any) -> None:
     if given["overwrite"] and given["resume"]:
         raise UsageError("--overwrite does everything anew and --resume keeps finished parts: give one of them")
     options.require_there(given["loops_file"], given["control"], given["gt"])
-    from lslam.cli.run import print_finished, print_result, read_truth, watch_of
-    from lslam.core.stopping import heeded
+    from lslam.cli.run import make_run, read_truth
     from lslam.pipeline.resume import open_again, read_for_graph, reading_of, require_another
-    from lslam.pipeline.run import run as main_job
     from lslam.pipeline.run_folder import check_target
 
     named = run if run.name not in ("", "..") else run.resolve()
@@ -71,17 +66,7 @@ def command(run: Path, **given: Any) -> None:
     opened = open_again(known, given["sequence"], **options.reading_of(given))
     truth = read_truth(given["gt"], opened)
     reading = reading_of(known, given["sequence"], **options.reading_of(given))
-    try:
-        with heeded() as stop, ExitStack() as stack:
-            main_job(
-                opened, known.config, out=out, earlier=known, reading=reading, ground_truth=truth,
-                overwrite=given["overwrite"], resume=given["resume"],
-                command=shlex.join(["lslam", *sys.argv[1:]]),
-                watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
-            )  # fmt: skip
-    except RunFinishedError as finished:
-        log.info("%s", finished)
-        print_finished(out, given["as_json"])
+    make_run(opened, known.config, out, given, earlier=known, reading=reading, ground_truth=truth)
 
 
 def _settings(given: dict[str, Any]) -> list[str]:

@@ -93,25 +93,35 @@ def command(sequence: str, **given: Any) -> None:
         _check_folder(given)
         opened, config = opened_with({**given, "sequence": sequence})
         truth = read_truth(given["gt"], opened)
-        from lslam.cli.profiling import profiled
-        from lslam.pipeline.run import plan, run
+        from lslam.pipeline.run import plan
         from lslam.pipeline.run_folder import default_folder
 
         out = given["out"] or default_folder(opened.name, _variant(config))
         if given["dry_run"]:
             _print_plan(plan(opened, config, truth), config, out, given["as_json"])
             return
-        try:
-            with heeded() as stop, profiled(given["profile"]), ExitStack() as stack:
-                run(
-                    opened, config, out=out, ground_truth=truth, overwrite=given["overwrite"], resume=given["resume"],
-                    command=shlex.join(["lslam", *sys.argv[1:]]),
-                    reading={name: text for name, text in options.reading_of(given).items() if text is not None},
-                    watch=watch_of(stack, stop, lambda outcome: print_result(outcome, out, given["as_json"])),
-                )  # fmt: skip
-        except RunFinishedError as finished:
-            log.info("%s", finished)
-            print_finished(out, given["as_json"])
+        reading = {name: text for name, text in options.reading_of(given).items() if text is not None}
+        make_run(opened, config, out, given, ground_truth=truth, reading=reading)
+
+
+def make_run(opened: Sequence, config: Config, out: Path, given: dict[str, Any], **more: Any) -> None:
+    """Make the run that the options describe, and print its result; of one that was finished before what is there.
+
+    more : further arguments of `lslam.pipeline.run.run`
+    """
+    from lslam.cli.profiling import profiled
+    from lslam.pipeline.run import run
+
+    try:
+        with heeded() as stop, profiled(given.get("profile")), ExitStack() as stack:
+            run(
+                opened, config, out=out, overwrite=given["overwrite"], resume=given["resume"],
+                command=shlex.join(["lslam", *sys.argv[1:]]),
+                watch=watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])), **more,
+            )  # fmt: skip
+    except RunFinishedError as finished:
+        log.info("%s", finished)
+        _print_finished(out, given["as_json"])
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
@@ -259,12 +269,10 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
     show("\n".join(lines) + "\n" + to_toml(config))
 
 
-def print_finished(out: Path, as_json: bool) -> None:
+def _print_finished(out: Path, as_json: bool) -> None:
     """Print the existing result for --json; the log states that nothing was done."""
     if not as_json:
         return
-    import json
-
     evaluation = out / "evaluation.json"
     score = parse_json(evaluation.read_text(encoding="utf-8")) if evaluation.exists() else None
     document = {
@@ -275,7 +283,7 @@ def print_finished(out: Path, as_json: bool) -> None:
     show(json.dumps(document, allow_nan=False) + "\n")
 
 
-def print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
+def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
     """The summary, or the document of --json."""
     if not as_json:
         from lslam.reports.text import summary
