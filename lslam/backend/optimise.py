@@ -40,9 +40,8 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import ControlPoint, LoopCandidate, Turn
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.imu import InertialChain
-from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.scan_result import KeyframeClocks, ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.core.types.stage_clock import KeyframeClocks
 from lslam.registration.preprocessing.ground import up_of, world_up_of
 
 log = logging.getLogger("lslam")

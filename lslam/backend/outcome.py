@@ -25,8 +25,7 @@ from lslam.core.types.building import CorrectedMap, OsmMatches
 from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, LoopCandidate, LoopStage, Verdict
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.run_record import LoopSurroundings, LoopView, RunRecord
-from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks, ScanResult
 
 log = logging.getLogger("lslam")
 

@@ -8,7 +8,7 @@ from lslam.core.config.config import Config
 from lslam.core.config.odometry import NO_RECOVERY
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.odometry.icp import Icp, registration_of
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, solve_on_scan
 from lslam.registration.alignment import upright_directions

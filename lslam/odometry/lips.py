@@ -16,8 +16,7 @@ from lslam.core.kernels.transform import transform
 from lslam.core.types.imu import SweepLink
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan
-from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.plane_association import associate

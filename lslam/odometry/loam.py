@@ -10,8 +10,7 @@ import numpy as np
 from lslam.core.config.config import Config
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.feature_policies import feature_policies

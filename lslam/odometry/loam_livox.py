@@ -11,7 +11,7 @@ from lslam.core.config.config import Config
 from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.loam import Loam, deskewed
 from lslam.registration.acceptance import correction, failed

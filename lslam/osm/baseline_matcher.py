@@ -22,7 +22,7 @@ from lslam.core.geometry import se2, se3
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
-from lslam.core.types.stage_clock import KeyframeClocks, StageClock
+from lslam.core.types.scan_result import KeyframeClocks, StageClock
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.corrections import place_buildings
 from lslam.osm.matcher import Laid, accepted_part

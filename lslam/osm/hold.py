@@ -19,7 +19,7 @@ from lslam.core.geometry import se2, se3
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm import matcher_named
 from lslam.osm.location import Located, finish, locate

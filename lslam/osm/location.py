@@ -25,7 +25,7 @@ from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.core.types.constraint import Verdict
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack

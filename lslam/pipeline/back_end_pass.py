@@ -26,9 +26,8 @@ from lslam.core.stopping import asking
 from lslam.core.types.constraint import LoopCandidate
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.run_record import RunRecord
-from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.scan_result import KeyframeClocks, ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.core.types.stage_clock import KeyframeClocks
 from lslam.core.version import __version__
 from lslam.io.formats.g2o import write_g2o
 from lslam.io.formats.state_files import Records

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.history import History

@@ -13,7 +13,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import failed
 from lslam.registration.attempt import Attempt, Policy, Target

@@ -10,7 +10,7 @@ import numpy as np
 
 from lslam.core.printable import counted, metres
 from lslam.core.types.run_record import RunRecord
-from lslam.core.types.stage_clock import summed
+from lslam.core.types.scan_result import summed
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.reports.back_end import back_end_rows, before_and_after
 from lslam.reports.facts import Failure, RunFacts, run_facts

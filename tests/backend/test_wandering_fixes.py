@@ -18,7 +18,7 @@ from lslam.backend.optimise import run_back_end
 from lslam.core.geometry import geodesy, se3
 from lslam.core.geometry.se3 import umeyama
 from lslam.core.types.constraint import LoopCandidate
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.pipeline import back_end_pass
 from lslam.simulation.sensors import GnssModel

@@ -13,7 +13,7 @@ from lslam.core.config.config import Config
 from lslam.core.config.odometry import LoamConfig, RecoveryConfig
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.odometry.all_points import ALL_POINTS, FED
 from lslam.odometry.feature_policies import LessPlanar, feature_policies
 from lslam.odometry.feature_scan import feature_scan

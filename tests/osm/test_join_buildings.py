@@ -11,7 +11,7 @@ from lslam.core.config import Config
 from lslam.core.geometry import se3
 from lslam.core.types.building import Building, Footprint
 from lslam.core.types.constraint import Constraint
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.baseline_matcher import run_baseline
 

@@ -18,7 +18,7 @@ from lslam.core.config import Config
 from lslam.core.config.config import load_config
 from lslam.core.geometry import geodesy, se2, se3
 from lslam.core.types.building import CorrectedMap, KeyframeMatch
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks
 from lslam.evaluation.timing import read_timing_rows
 from lslam.io.formats.osm_buildings import buildings_of, read_buildings
 from lslam.io.formats.osm_files import read_osm

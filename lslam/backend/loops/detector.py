@@ -31,7 +31,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.constraint import Constraint, KnownPair, LoopCandidate, LoopStage, Verdict
-from lslam.core.types.stage_clock import KeyframeClocks, StageClock
+from lslam.core.types.scan_result import KeyframeClocks, StageClock
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.preprocessing.ground import Z
 

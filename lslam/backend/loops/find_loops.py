@@ -20,7 +20,7 @@ from lslam.core.errors import InterruptedRunError
 from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.constraint import KnownPair, LoopCandidate, LoopStage
-from lslam.core.types.stage_clock import KeyframeClocks
+from lslam.core.types.scan_result import KeyframeClocks
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.preprocessing.ground import Z
 

@@ -1,7 +1,11 @@
-"""The outcome of one scan: its pose, what its points say of it, and the check by pairs of scans."""
+"""The outcome of one scan: its pose, what its points say of it, the check by pairs of scans, and how long each stage took."""
 
 from __future__ import annotations
 
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -11,6 +15,42 @@ from lslam.core.geometry import noise, portable, se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.scan import LEVER_M
+
+
+class StageClock:
+    """Seconds per stage of one scan, by name, in the order they ran; a stage that runs twice adds up."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure the block."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
+
+
+def summed(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Seconds per stage of several scans, in the order in which the stages come first."""
+    found: dict[str, float] = {}
+    for row in rows:
+        for name, seconds in row.items():
+            found[name] = found.get(name, 0.0) + seconds
+    return found
+
+
+class KeyframeClocks(defaultdict[int, StageClock]):
+    """A clock for each keyframe, by number: of what is done after odometry."""
+
+    def __init__(self) -> None:
+        super().__init__(StageClock)
+
+    def totals(self) -> dict[str, float]:
+        """Seconds per stage of all keyframes."""
+        return summed(self[number].seconds for number in sorted(self))
 
 
 @dataclass(frozen=True)

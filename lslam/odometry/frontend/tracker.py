@@ -12,8 +12,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
-from lslam.core.types.scan_result import ScanResult, Status
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import ScanResult, StageClock, Status
 from lslam.core.types.state import State
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.frontend import joint

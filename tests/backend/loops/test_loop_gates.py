@@ -19,7 +19,7 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import ConfigError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
-from lslam.core.types.stage_clock import StageClock
+from lslam.core.types.scan_result import StageClock
 from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
