@@ -24,9 +24,8 @@ from lslam.odometry.inertial.imu_cleaning import ImuFault, ImuRefusedError, clea
 from lslam.pipeline.doctor import Facts, Finding
 from lslam.pipeline.doctor.examine_imu import examine_imu
 from lslam.pipeline.doctor.examine_positions import examine_gnss
-from lslam.pipeline.doctor.examine_scans import examine_points, examine_stamps, examine_times
 from lslam.pipeline.doctor.examine_turns import compare, examine_turns
-from lslam.pipeline.doctor.inspect import inspect
+from lslam.pipeline.doctor.inspect import examine_points, examine_stamps, examine_times, inspect
 
 SAMPLE = Path(__file__).parents[3] / "sample_data"
 Spoil = Callable[[ImuStream], ImuStream]
