@@ -29,8 +29,7 @@ from lslam.io.formats.bag_chunks import LARGEST, Topic, damage, unpack, zstd
 from lslam.io.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, packing_of, suffix_of
 from lslam.io.formats.bag_records import ChunkedBag
 from lslam.io.formats.bag_sqlite import SqliteBag
-from lslam.io.formats.chunked_bags import McapFile
-from lslam.io.formats.ros1_records import Ros1Bag
+from lslam.io.formats.chunked_bags import McapFile, Ros1Bag
 from lslam.io.remote import RemotePath
 
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""The records of MCAP files."""
+"""Bags with records in chunks: ROS 1 bags (`#ROSBAG V2.0`) and MCAP files."""
 
 from __future__ import annotations
 
@@ -17,6 +17,78 @@ _FOOTER_SIZE = 29  # bytes of the record, its prefix included
 _PREFIX = 9  # bytes before the content of a record: op and length
 _STAMPS = 22  # bytes before the data of a message: channel, sequence, log time, publish time
 _CHUNK_HEAD = 64  # more than what stands before the records of a chunk
+_HEADER = 4096  # more than any record header but one with a message definition
+
+
+class Ros1Bag(ChunkedBag):
+    """One `.bag` file. The head of a record is its fields by name; channels are called connections."""
+
+    MAGIC = b"#ROSBAG V2.0\n"
+    MESSAGE, INDEX, CHUNK, CHUNK_INFO, NAMES = 2, 4, 5, 6, (7,)
+
+    def __init__(self, path: Path, unpacked: Path | None = None) -> None:
+        """Open `path`, or what it holds, where it was unpacked."""
+        self._connections: dict[int, Topic] = {}
+        super().__init__(path, unpacked)
+
+    def _misnomer(self, head: bytes) -> str:
+        is_old = head.startswith(b"#ROSBAG")
+        return "an old version, `rosbag fix` brings it to 2.0" if is_old else "no ROS 1 bag"
+
+    def _record(self, chunk: Chunk | None, offset: int, is_head: bool = False) -> Record:
+        head = self._file.part(chunk, offset, _HEADER, is_head)
+        (length,) = struct.unpack_from("<I", head)
+        if length + 8 > len(head):
+            head = self._file.part(chunk, offset, length + 8, is_head)
+        fields = _fields(head[4 : 4 + length])
+        (size,) = struct.unpack_from("<I", head, 4 + length)
+        return Record(fields[b"op"][0], fields, offset + length + 8, size)
+
+    def _summary(self) -> int:
+        return _number(self._record(None, len(self.MAGIC)).head[b"index_pos"])
+
+    def _near(self, info: Record) -> list[tuple[int, int]]:
+        # Before a chunk lie the indices of the one before.
+        return [(_number(info.head[b"chunk_pos"]) - INDICES, INDICES + _HEADER)]
+
+    def _chunk(self, record: Record) -> Chunk:
+        compression = record.head[b"compression"].decode(errors="replace").replace("none", "")
+        return Chunk(record.data, record.size, _number(record.head[b"size"]), compression)
+
+    def _index(self, record: Record) -> tuple[int, NDArray[np.unsignedinteger[Any]]]:
+        entries = np.frombuffer(self._file.read(record.data, record.size), "<u4").reshape(-1, 3).astype(np.uint64)
+        stamps = entries[:, 0] * 10**9 + entries[:, 1]
+        return _number(record.head[b"conn"]), np.column_stack([stamps, entries[:, 2]])
+
+    def _message(self, record: Record) -> tuple[int, int]:
+        seconds, nanoseconds = struct.unpack("<II", record.head[b"time"])
+        return _number(record.head[b"conn"]), seconds * 10**9 + nanoseconds
+
+    def _note_name(self, record: Record, data: bytes) -> None:
+        package, _, name = _fields(data).get(b"type", b"").decode(errors="replace").partition("/")
+        kind = f"{package}/msg/{name}" if name else ""
+        topic = Topic(record.head[b"topic"].decode(errors="replace"), kind, "ros1")
+        self._connections.setdefault(_number(record.head[b"conn"]), topic)
+
+    def _named(self) -> dict[int, Topic]:
+        return self._connections
+
+
+def _fields(block: bytes) -> dict[bytes, bytes]:
+    """The `name=value` fields of a record header."""
+    fields, at = {}, 0
+    while at < len(block):
+        (n,) = struct.unpack_from("<I", block, at)
+        name, _, value = block[at + 4 : at + 4 + n].partition(b"=")
+        fields[name] = value
+        at += 4 + n
+    return fields
+
+
+def _number(value: bytes) -> int:
+    """A field of 4 or 8 bytes."""
+    (number,) = struct.unpack("<Q" if len(value) == 8 else "<I", value)
+    return int(number)
 
 
 class McapFile(ChunkedBag):
