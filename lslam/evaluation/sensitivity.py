@@ -20,8 +20,17 @@ from lslam.core.types.study import (
     StudyResult,
     StudyRow,
 )
-from lslam.evaluation.curves import curves_of, divergence, lost_above, median_over_seeds, optimum, over_seeds
-from lslam.evaluation.laws import FEWEST, fit_law, law_over
+from lslam.evaluation.curves import (
+    FEWEST,
+    curves_of,
+    divergence,
+    fit_law,
+    law_over,
+    lost_above,
+    median_over_seeds,
+    optimum,
+    over_seeds,
+)
 from lslam.evaluation.verdicts import (
     judge_acts_only_on,
     judge_best_between,

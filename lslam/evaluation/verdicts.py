@@ -12,18 +12,20 @@ from lslam.core.config.study import ExpectedFinding
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.study import Curve, CurveResult, Judged, Law, Optimum, Outcome
 from lslam.evaluation.curves import (
+    FEWEST,
     NOT_REGISTRATION,
     Rise,
     contrast,
     divergence,
     elbow,
+    law_over,
     optimum,
     over_seeds,
     plateau,
     rise_at,
     rise_below,
+    rival,
 )
-from lslam.evaluation.laws import FEWEST, law_over, rival
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them

@@ -12,8 +12,7 @@ import numpy as np
 from lslam.core.config.config import unit_of, with_unit
 from lslam.core.types.arrays import Floats
 from lslam.core.types.study import CurveResult, Law, StudyResult, StudyRow
-from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, normalise, registration_ms
-from lslam.evaluation.laws import band
+from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, band, normalise, registration_ms
 from lslam.reports.picture import COLOURS, house_style, label, pictures
 
 POINTS = ("o", ".", "x")  # markers; lines without say nothing

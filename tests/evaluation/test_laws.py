@@ -9,7 +9,7 @@ import pytest
 
 from lslam.core.types.arrays import Floats
 from lslam.core.types.study import LawKind
-from lslam.evaluation.laws import band, fit_law, rival
+from lslam.evaluation.curves import band, fit_law, rival
 
 SKIPS = np.arange(1.0, 21.0)
 SHARES = np.arange(0.1, 1.01, 0.1)
