@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from lslam.io.formats.bag_chunks import Chunk, Topic
 from lslam.io.formats.bag_records import INDICES, ChunkedBag, Record
 
+# Of MCAP.
 _SCHEMA, _CHANNEL = 3, 4
 _FOOTER_SIZE = 29  # bytes of the record, its prefix included
 _PREFIX = 9  # bytes before the content of a record: op and length
 _STAMPS = 22  # bytes before the data of a message: channel, sequence, log time, publish time
 _CHUNK_HEAD = 64  # more than what stands before the records of a chunk
-_HEADER = 4096  # more than any record header but one with a message definition
+_HEADER = 4096  # of ROS 1: more than any record header but one with a message definition
 
 
 class Ros1Bag(ChunkedBag):
