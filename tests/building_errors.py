@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from lslam.core.geometry import geodesy, se2
 from lslam.core.types.arrays import Floats
-from lslam.core.types.building import BuildingCorrection, BuildingStatus, CorrectedMap
+from lslam.core.types.building import Building, BuildingCorrection, BuildingStatus, CorrectedMap
+from lslam.simulation.osm_perturb import Perturbation, join_outlines, perturb, simplify_outlines
 
 HELD = 0.6  # m; one sigma along an axis below which walls hold it: a building that nothing holds has 1 m
 
@@ -66,3 +67,20 @@ def _error(
         correction.building.osm_id, correction.status, int((np.sqrt(values) < HELD).sum()),
         float(np.linalg.norm(real[:2])), float(np.linalg.norm(away)), float(abs(away @ axes[:, 0])), turn,
     )  # fmt: skip
+
+
+def map_errors(buildings: Sequence[Building], perturbation: Perturbation) -> dict[str, Floats]:
+    """By number, what moves each building of the perturbed map to where it really stands: x, y (m), yaw (rad) about its middle.
+
+    buildings : the exact map. Buildings that are not built yet stand nowhere, and missing ones are on no map.
+    """
+    known, on_map = {b.osm_id: b for b in buildings}, {b.osm_id: b for b in perturb(buildings, perturbation)}
+    found = {}
+    for change in perturbation.changes:
+        if change.id not in on_map:
+            continue
+        real, drawn = join_outlines(known[change.id], change, known), on_map[change.id]
+        real = simplify_outlines(real, change.simplify_m) if change.simplify_m > 0 else real
+        moved = drawn.displaced(np.array([0.0, 0.0, -change.turn_rad]))
+        found[change.id] = np.array([*(real.middle - moved.middle), -change.turn_rad])
+    return found

@@ -12,7 +12,6 @@ import numpy as np
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprint_polygon, footprints_of
 from lslam.core.untrusted import MISFIT, parse_json
 from lslam.io.formats.atomic import write_text
@@ -75,23 +74,6 @@ def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[B
             R, middle = np.eye(2), np.zeros(2)
         found.append(building.moved(R, middle - portable.rotate(R, middle) + np.array(change.shift_m) + common))
     return found + [building.moved(np.eye(2), common) for building in perturbation.not_yet_built]
-
-
-def map_errors(buildings: Sequence[Building], perturbation: Perturbation) -> dict[str, Floats]:
-    """By number, what moves each building of the perturbed map to where it really stands: x, y (m), yaw (rad) about its middle.
-
-    buildings : the exact map. Buildings that are not built yet stand nowhere, and missing ones are on no map.
-    """
-    known, on_map = {b.osm_id: b for b in buildings}, {b.osm_id: b for b in perturb(buildings, perturbation)}
-    found = {}
-    for change in perturbation.changes:
-        if change.id not in on_map:
-            continue
-        real, drawn = join_outlines(known[change.id], change, known), on_map[change.id]
-        real = simplify_outlines(real, change.simplify_m) if change.simplify_m > 0 else real
-        moved = drawn.displaced(np.array([0.0, 0.0, -change.turn_rad]))
-        found[change.id] = np.array([*(real.middle - moved.middle), -change.turn_rad])
-    return found
 
 
 def join_outlines(building: Building, change: Change, known: dict[str, Building]) -> Building:

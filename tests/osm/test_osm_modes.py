@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from building_errors import BuildingError, building_errors
+from building_errors import BuildingError, building_errors, map_errors
 from numpy.typing import NDArray
 
 import lslam
@@ -26,7 +26,7 @@ from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm import location
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.osm.track import OsmTrack
-from lslam.simulation.osm_perturb import map_errors, read_perturbation
+from lslam.simulation.osm_perturb import read_perturbation
 
 Floats = NDArray[np.float64]
 

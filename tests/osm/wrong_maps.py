@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from building_errors import map_errors
 from numpy.typing import NDArray
 
 import lslam
@@ -19,7 +20,7 @@ from lslam.io.formats.osm_files import write_osm
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.simulation.osm_extract import osm_from_buildings
-from lslam.simulation.osm_perturb import Change, Perturbation, map_errors, perturb
+from lslam.simulation.osm_perturb import Change, Perturbation, perturb
 
 Floats = NDArray[np.float64]
 

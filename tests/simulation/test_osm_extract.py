@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from building_errors import map_errors
 from numpy.typing import NDArray
 from shapely import LineString, MultiPolygon, STRtree, affinity, get_num_coordinates, union_all
 
@@ -25,7 +26,6 @@ from lslam.simulation.osm_perturb import (
     Change,
     MapFaults,
     draw_perturbation,
-    map_errors,
     perturb,
     read_perturbation,
     write_perturbation,
