@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.core.errors import InputError, cause
+from lslam.core.errors import InputError, input_errors
 from lslam.core.types.arrays import Floats, Longs
 from lslam.io.remote import as_path
 
@@ -109,13 +109,11 @@ def read_timing_rows(path: Path) -> TimingRows:
 
 
 def _table(path: Path) -> tuple[list[str], Floats]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [
-                (n, row) for n, row in enumerate(csv.reader(stream), start=1) if row and not row[0].startswith("#")
-            ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"timing {path} cannot be read: {cause(error)}") from None
+    with (
+        input_errors(f"timing {path}", UnicodeDecodeError, csv.Error),
+        path.open(newline="", encoding="utf-8-sig") as stream,
+    ):
+        lines = [(n, row) for n, row in enumerate(csv.reader(stream), start=1) if row and not row[0].startswith("#")]
     if len(lines) < 2:
         raise InputError(f"timing {path} holds no scans")
     header = [name.strip() for name in lines[0][1]]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lslam.backend.georeferencing import require_crs
 from lslam.core.config import Config
 from lslam.core.config.backend import OsmConfig
-from lslam.core.errors import InputError, LslamError, UsageError, cause
+from lslam.core.errors import InputError, LslamError, UsageError, input_errors
 from lslam.core.geometry import se2
 from lslam.core.geometry.geodesy import from_local, to_local
 from lslam.core.types.arrays import Floats, Longs
@@ -204,11 +204,9 @@ def extract_digest(config: OsmConfig) -> str:
     if config.extract in ("", AUTO):
         return config.extract
     path = Path(config.extract)
-    try:
+    with input_errors(config.extract):
         files = sorted(path.glob("*.json")) if path.is_dir() else [path]
         return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
-    except OSError as error:
-        raise InputError(f"{config.extract} cannot be read: {cause(error)}") from None
 
 
 @dataclass(frozen=True)

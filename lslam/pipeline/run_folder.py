@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError, cause, output_errors
+from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError, cause, input_errors, output_errors
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.machine import lock
 from lslam.core.printable import file_safe
@@ -224,10 +224,8 @@ def require_run(path: Path) -> None:
     """Raise InputError unless `path` is the folder of a run."""
     if not path.is_dir():
         raise InputError(f"{path} is no folder of a run: name what `lslam run` wrote")
-    try:
+    with input_errors(f"{path} is no folder of a run: {MANIFEST}"):
         (path / MANIFEST).stat()
-    except OSError as error:
-        raise InputError(f"{path} is no folder of a run: {MANIFEST} cannot be read: {cause(error)}") from None
 
 
 def require_odometry(path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.errors import InputError, UsageError, cause, nearest
+from lslam.core.errors import InputError, UsageError, input_errors, nearest
 from lslam.core.geometry import portable
 from lslam.core.geometry.geodesy import to_local
 from lslam.core.types.arrays import Floats
@@ -216,10 +216,8 @@ def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints
 
 
 def _text(path: Path) -> str:
-    try:
+    with input_errors(path, UnicodeDecodeError):
         return path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 def _from_toml(path: Path) -> WayPoints:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lslam.core.config.study import StudyMetric
-from lslam.core.errors import InputError, cause
+from lslam.core.errors import InputError, input_errors
 from lslam.core.printable import printable_tree
 from lslam.core.types.study import StudyRow, Value
 from lslam.core.untrusted import MISFIT, parse_json
@@ -113,11 +113,11 @@ def write_study_csv(path: Path, rows: Sequence[StudyRow]) -> None:
 
 def read_study_csv(path: Path) -> list[StudyRow]:
     """All rows. Raises InputError naming file and line for what is missing, of another version or not what it should be."""
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [line for line in csv.reader(stream) if line]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"study {path} cannot be read: {cause(error)}") from None
+    with (
+        input_errors(f"study {path}", UnicodeDecodeError, csv.Error),
+        path.open(newline="", encoding="utf-8-sig") as stream,
+    ):
+        lines = [line for line in csv.reader(stream) if line]
     header = lines[0] if lines else []
     if SCHEMA not in header:
         raise InputError(f"{path} is no results.csv of a study: it has no column {SCHEMA}")

@@ -19,7 +19,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.errors import InputError, cause
+from lslam.core.errors import InputError, input_errors
 from lslam.core.types.arrays import Longs
 from lslam.io.remote import RemotePath
 
@@ -134,11 +134,9 @@ class ChunkFile:
     def __init__(self, path: Path, unpacked: Path | None = None) -> None:
         """Open `path`, or what it holds, where it was unpacked."""
         self.path = path
-        try:
+        with input_errors(path):
             self._ranged = RangedFile(path) if isinstance(path, RemotePath) else None
             self._file = None if self._ranged else (unpacked or path).open("rb")
-        except OSError as error:
-            raise InputError(f"{path} cannot be read: {cause(error)}") from None
         self.size = os.fstat(self._file.fileno()).st_size if self._file else self._ranged.size if self._ranged else 0
         self._kept: tuple[int, bytes] = (-1, b"")
 

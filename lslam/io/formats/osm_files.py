@@ -13,7 +13,7 @@ from typing import IO, Any
 from xml.etree.ElementTree import Element, ParseError
 from xml.sax.saxutils import quoteattr
 
-from lslam.core.errors import InputError, cause
+from lslam.core.errors import InputError, input_errors
 from lslam.core.untrusted import JsonItems
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.osm_data import ATTRIBUTION, DECIMALS, AreaMaker, OsmData, Place, is_on_earth
@@ -39,7 +39,7 @@ def read_osm(path: Path) -> OsmData:
 
     Raises InputError naming the file: missing, cut short, none of the three, with entities, with positions off the Earth.
     """
-    try:
+    with input_errors(path):
         with path.open("rb") as stream:
             start = stream.read(64)
         if start.startswith(_COMPRESSED) or b"OSMHeader" in start:
@@ -51,8 +51,6 @@ def read_osm(path: Path) -> OsmData:
             what = "is neither XML nor JSON" if first else "is empty"
             raise InputError(f"{path} {what}, so it is no OpenStreetMap extract: {WAY_OUT}")
         return _read_xml(path, start.startswith(_UTF16)) if first == b"<" else _read_json(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
 
 
 class GaveUpError(ValueError):

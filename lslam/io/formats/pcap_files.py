@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.errors import InputError, UsageError, cause
+from lslam.core.errors import InputError, UsageError, input_errors
 from lslam.core.types.arrays import Bools, Longs
 from lslam.io.remote import RemotePath
 
@@ -87,12 +87,10 @@ def read_datagrams(path: Path) -> Datagrams:
     """
     if isinstance(path, RemotePath):
         raise UsageError(f"{path}: captures are read from a disk: copy it there")
-    try:
+    with input_errors(path, ValueError):
         if path.stat().st_size < 24:
             raise InputError(f"{path} is no capture: it has {path.stat().st_size} bytes")
         data = np.memmap(path, np.uint8, "r")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read: {cause(error)}") from None
     frames, loss = _frames(path, np.asarray(data).data)
     return _assemble(data, frames, loss)
 
