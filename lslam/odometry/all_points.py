@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt
@@ -45,7 +43,7 @@ class AllPoints(Stateful):
         icp = self._of_recent(attempt.history)
         return icp.locate(prepare_points(attempt.points.cloud, icp.preprocess), attempt.T_prior)
 
-    def held(self, attempt: Attempt, T_start: NDArray[np.float64], result: RegistrationResult) -> RegistrationResult:
+    def held(self, attempt: Attempt, T_start: Floats, result: RegistrationResult) -> RegistrationResult:
         """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
         icp = self._of_recent(attempt.history)
         points = prepare_points(attempt.points.cloud, icp.preprocess)

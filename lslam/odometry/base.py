@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanEquations, ScanResult
@@ -103,11 +101,11 @@ class Windowed(Deskewing, Protocol):
         """What the points of a scan say of its pose where `register` found it; nothing where that failed."""
         ...
 
-    def equations_at(self, poses: Mapping[int, NDArray[np.float64]]) -> tuple[ScanEquations, ...]:
+    def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
         """Likewise of scans at other poses (4, 4), by their stamps; nothing of those that are no longer open."""
         ...
 
-    def settle(self, poses: Mapping[int, NDArray[np.float64]]) -> None:
+    def settle(self, poses: Mapping[int, Floats]) -> None:
         """Learn the poses (4, 4) of the scans that are estimated together, by their stamps; all others are closed."""
         ...
 

@@ -7,11 +7,9 @@ is kept in the frame of a sensor that saw it, its anchor.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
-
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats
 
 
 def split(cp: Floats) -> tuple[Floats, Floats]:

@@ -12,13 +12,11 @@ a (L^2 / 6 + (T^2 - L^2) / 24 + L (T - L) / 4), and that of the prediction of th
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import noise, se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
-
-Floats = NDArray[np.float64]
 
 # Scans over which the change of the motion is averaged: a second.
 MEMORY = 10

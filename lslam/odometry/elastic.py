@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.elastic_sweep import ElasticSweep
@@ -32,8 +32,6 @@ from lslam.registration.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import voxel_terms
-
-Floats = NDArray[np.float64]
 
 # Parts of a sweep whose points are linearised together. Within an eighth, what a point tells of begin and end differs from
 # the mean of its part by 1/28 rms: of the information 2 % are lost, and nothing is biased.

@@ -10,16 +10,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import noise, se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
 from lslam.odometry.deskew_uncertainty import USUAL
 from lslam.odometry.elastic_sweep import ElasticSweep
 from lslam.odometry.inertial.constant_velocity import middle_of
-
-Floats = NDArray[np.float64]
 
 # Of the covariance of a change of motion, what stays from scan to scan: a memory of five.
 FORGETTING = 0.8

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.icp import Icp, registration_of
 
@@ -25,6 +25,6 @@ class FastLio2(Icp):
 
     deskew = "by back propagation of the filter"
 
-    def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
+    def information_of(self, prior: MotionPrior) -> Floats | None:
         """The inverse of the filter's covariance."""
         return None if prior.covariance is None else np.asarray(np.linalg.inv(prior.covariance))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.kernels import voxel
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
@@ -44,7 +44,7 @@ class FeatureMap(Stateful):
         self._lines = _lines_for(self.edges)
 
     @property
-    def lines(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    def lines(self) -> tuple[Floats, Longs, Floats]:
         """Rows of `kernels.lines` for the edge voxels, the keys and sums they were computed at; kept up to date by it."""
         if len(self._lines[0]) != len(self.edges.keys):
             self._lines = _lines_for(self.edges)
@@ -54,7 +54,7 @@ class FeatureMap(Stateful):
         """Voxels that hold points."""
         return len(self.planes) + len(self.edges)
 
-    def insert(self, features: Features, T_world_lidar: NDArray[np.float64]) -> None:
+    def insert(self, features: Features, T_world_lidar: Floats) -> None:
         """Add the less sharp edges and the less planar points of a scan."""
         self.edges.insert(features.less_edges.points.astype(np.float32), T_world_lidar)
         flat = features.less_planes.points.astype(np.float32)
@@ -75,17 +75,17 @@ class FeatureMap(Stateful):
 class FeatureKeyframes(LastKeyframes):
     """Keeps the features of the newest keyframes in a feature map, and no others'."""
 
-    def insert(self, target: FeatureMap, cloud: Features, T_world_lidar: NDArray[np.float64]) -> None:
+    def insert(self, target: FeatureMap, cloud: Features, T_world_lidar: Floats) -> None:
         """Add the features of one scan."""
         target.insert(cloud, T_world_lidar)
 
 
-def thinned(features: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def thinned(features: Features) -> tuple[Floats, Floats]:
     """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
     points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, WIDE_GRID)
     return points.astype(np.float64), scatter.astype(np.float64)
 
 
-def _lines_for(edges: GaussianMap) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+def _lines_for(edges: GaussianMap) -> tuple[Floats, Longs, Floats]:
     capacity = len(edges.keys)
     return np.zeros((capacity, 8)), np.full(capacity, -1, np.int64), np.zeros(capacity)

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.odometry.kernels.feature_grid import build
 from lslam.odometry.kernels.feature_residuals import add_normals
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.features import FeaturePoints, Features
 
 Grid = tuple[
-    NDArray[np.float64], NDArray[np.uint16], NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]
+    Floats, NDArray[np.uint16], NDArray[np.int32], Longs, NDArray[np.int32]
 ]  # fmt: skip
 
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
@@ -32,10 +33,10 @@ class FeatureScan:
     """
 
     features: Features
-    T_world_lidar: NDArray[np.float64]
+    T_world_lidar: Floats
     edges: Grid
     planes: Grid
-    normals: NDArray[np.float64]
+    normals: Floats
     size: float
     reach: float
 
@@ -45,7 +46,7 @@ def surface_size(size: float, grid_step: float) -> float:
     return max(size, 1.5 * grid_step)
 
 
-def feature_scan(features: Features, T_world_lidar: NDArray[np.float64], grid_step: float = 0.0) -> FeatureScan:
+def feature_scan(features: Features, T_world_lidar: Floats, grid_step: float = 0.0) -> FeatureScan:
     """Index the features of a scan, thinned by a grid of `grid_step`, m, at its pose (4, 4)."""
     R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
     reach = surface_size(REACH, grid_step)
@@ -58,7 +59,7 @@ def feature_scan(features: Features, T_world_lidar: NDArray[np.float64], grid_st
     return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, _normals(planes[0]), size, reach)
 
 
-def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normals(points: Floats) -> Floats:
     """(N, 3) normals of the surfaces around points (N, 3), zero where none is found.
 
     Voxels of half the reach tell them, and before these voxels twice as large, for two rings of a sparse sensor.

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.odometry.kernels.feature_residuals import linearise_edges, linearise_planes
@@ -19,7 +19,6 @@ from lslam.registration.residuals import PLANE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
 
-Floats = NDArray[np.float64]
 NONE: Floats = np.zeros((0, 3))
 # Scan-to-scan errors persist as velocity, without a map to correct them: the threshold of degeneracy is twice as high there.
 # Higher ones would call sparse scans degenerate in every direction.

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_scan import FeatureScan
 from lslam.odometry.feature_solver import NONE, FeatureNoise, solve_on_scan
@@ -15,9 +15,6 @@ from lslam.registration.alignment import upright_directions
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
-
 
 ScanStep = Callable[[FeatureScan, Features, Floats, Annealing, FeatureNoise, bool, StageClock], RegistrationResult]
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.odometry import LoamConfig, RegistrationConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, thinned
 from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
@@ -22,8 +23,6 @@ from lslam.registration.preprocessing.ground import Z
 from lslam.registration.robust import Annealing, is_more
 from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.start_search import MUCH, START_STEP, start_offsets
-
-Floats = NDArray[np.float64]
 
 # Fewer inliers, ten per degree of freedom, are insignificant.
 MIN_FEATURES = 60

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan, Span
 from lslam.core.types.scan_result import ScanResult
@@ -23,7 +23,6 @@ from lslam.registration.preprocessing.deskew import knots_over
 if TYPE_CHECKING:
     from lslam.core.config.config import Config
 
-Floats = NDArray[np.float64]
 
 # Between poses farther apart than so many typical steps there is a gap; beyond the ends one scan's sweep may reach.
 GAP_STEPS, GAP_S = 2.5, 0.25

@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import UsageError
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -122,7 +122,7 @@ class Icp(Traits, Stateful):
         """Mean age, in scans, of the points of the map."""
         return self._uncertainty.map_age
 
-    def information_of(self, prior: MotionPrior) -> NDArray[np.float64] | None:
+    def information_of(self, prior: MotionPrior) -> Floats | None:
         """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
         return None
 

@@ -14,6 +14,7 @@ from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -24,8 +25,6 @@ from lslam.registration.optimiser import STEP_M, STEP_RAD
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-
-Floats = NDArray[np.float64]
 
 # Distances beyond the median plus this many median deviations are outliers (the X84 rule, Hampel et al. 1986).
 X84 = 5.2
@@ -135,7 +134,7 @@ def align_closed_form(
     )  # fmt: skip
 
 
-def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> NDArray[np.int64]:
+def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> Longs:
     """Indices of the inlier pairs by their distance (S,), m, infinite where there is none; increasing."""
     near = np.flatnonzero(np.isfinite(distance))
     if inlier_distance is None and len(near):

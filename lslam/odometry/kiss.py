@@ -6,20 +6,18 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.extras import importing
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
 from lslam.registration.preprocessing.prepare import gate_points
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-
-Floats = NDArray[np.float64]
 
 
 def create(config: Config) -> Kiss:

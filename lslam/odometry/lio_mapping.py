@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
 from lslam.core.geometry import normal_equations
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio2 import FastLio2
@@ -17,8 +15,6 @@ from lslam.odometry.icp import registration_of
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 
 def create(config: Config) -> LioMapping:

@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.errors import UsageError
 from lslam.core.geometry import noise, normal_equations, se3
 from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import SweepLink
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan
@@ -29,9 +29,6 @@ from lslam.registration.acceptance import correction
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 # Share of the points on planes that known planes must take; where it is less, the scan is elsewhere.
 LEAST_SHARE = 0.1

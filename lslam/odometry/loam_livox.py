@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
@@ -18,8 +18,6 @@ from lslam.registration.acceptance import correction, failed
 from lslam.registration.preprocessing.features import FeaturePoints, Features
 from lslam.registration.preprocessing.petals import petal_features
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 # Of the correspondences, the nearest, that have a say: a fifth is dropped as outliers (section IV-C).
 INLIERS = 0.8

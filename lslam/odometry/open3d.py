@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.extras import importing_open3d
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -22,8 +22,6 @@ from lslam.odometry.scan_outcome import judged
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-
-Floats = NDArray[np.float64]
 
 # Centroids of this grid, covariances of this many neighbours, correspondences within this distance, m.
 LEAF = 0.3

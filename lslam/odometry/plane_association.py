@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.odometry import closest_point
 from lslam.odometry.plane_factors import Sightings, sighting_residuals
 from lslam.odometry.plane_segmentation import Planes, turned
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE
 from lslam.odometry.plane_window import PlaneWindow
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 # Cosine of 10 deg between normals, and m between planes, along the normal at what the scan saw.
 ALIKE, CLOSE = 0.985, 0.5

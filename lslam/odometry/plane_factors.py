@@ -5,16 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
 from lslam.core.geometry.normal_equations import Normal
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import PreintegratedStep
 from lslam.odometry import closest_point
 from lslam.odometry.plane_values import PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 # Mahalanobis length beyond which a plane counts less (Huber): the square root of the 95 % quantile of chi-square, three degrees.
 HUBER = 2.8
@@ -50,7 +47,7 @@ class Sightings:
     def __len__(self) -> int:
         return len(self.states)
 
-    def only(self, which: NDArray[np.bool_]) -> Sightings:
+    def only(self, which: Bools) -> Sightings:
         """Some of them."""
         return Sightings(self.states[which], self.planes[which], self.cp[which], self.information[which])
 

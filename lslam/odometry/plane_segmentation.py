@@ -12,12 +12,10 @@ from scipy.spatial import cKDTree
 
 from lslam.core.kernels import gaussians
 from lslam.core.kernels.voxel import MASK, OFFSET
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.odometry import closest_point
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import BREADTH
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 # m, edge of the voxels: at 15 m two rings of a 16-beam sensor fall into one.
 VOXEL = 1.0
@@ -201,7 +199,7 @@ class _Cells:
         touching = csr_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(mean), len(mean)))
         return cls(count, mean, scatter, voxels.planes[slots, 3:6], voxels.planes[slots, 7], tree, touching)
 
-    def grown(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: NDArray[np.bool_]) -> Longs:
+    def grown(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: Bools) -> Longs:
         """The voxels, sorted, of the plane through `mean` (3,) with normal n (3,) that touch the cell `seed`; of the `free`."""
         d, alone = float(n @ mean), np.array([seed])
         region = alone
@@ -220,7 +218,7 @@ class _Cells:
         _, label = connected_components(self.touching[region][:, region], directed=False)
         return np.asarray(region[label == label[at[0]]])
 
-    def _on(self, some: Longs, n: Floats, d: float) -> NDArray[np.bool_]:
+    def _on(self, some: Longs, n: Floats, d: float) -> Bools:
         """Which of some voxels have their points on the plane n . x = d, and do not face elsewhere."""
         is_alike = (self.tilts[some] <= 0) | (np.abs(np.einsum("vi,i->v", self.normals[some], n)) > ALIKE)
         return np.asarray((self._off(some, n, d) < NEAR**2) & is_alike)

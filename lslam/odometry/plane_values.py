@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.imu import MotionState
-
-Floats = NDArray[np.float64]
 
 # An update: gravity and the gyroscope's axes, which all states share; each state; each plane.
 SHARED, STATE_SIZE, PLANE_SIZE = 12, 15, 3
@@ -77,7 +75,7 @@ class WindowValues:
             (self.planes - before.planes).ravel(),
         ])  # fmt: skip
 
-    def cut(self, states: slice, planes: slice | NDArray[np.bool_] = slice(None)) -> WindowValues:
+    def cut(self, states: slice, planes: slice | Bools = slice(None)) -> WindowValues:
         """Some of the states and planes."""
         return replace(
             self, poses=self.poses[states], velocities=self.velocities[states], accel_biases=self.accel_biases[states],

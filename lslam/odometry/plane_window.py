@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
 from lslam.core.geometry.normal_equations import Normal
 from lslam.core.kernels import linalg
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry.plane_factors import Sightings, WindowPrior, normal_equations, step_residual
 from lslam.odometry.plane_values import ORDER, PLANE_SIZE, SHARED, STATE_SIZE, WindowValues
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
 
 # States in the window: a second of most sensors.
 LAG = 10
@@ -41,7 +38,7 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.unseen)
 
-    def only(self, which: NDArray[np.bool_]) -> Landmarks:
+    def only(self, which: Bools) -> Landmarks:
         """Some of them."""
         return Landmarks(self.anchors[which], self.lows[which], self.highs[which], self.unseen[which])
 
@@ -156,7 +153,7 @@ class PlaneWindow:
         return linalg.inverse(left.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
 
     @property
-    def _older(self) -> NDArray[np.bool_]:
+    def _older(self) -> Bools:
         """(N,) the states but the newest."""
         out = np.zeros(self.values.size, bool)
         out[SHARED : self.values.first_plane - STATE_SIZE] = True
@@ -182,7 +179,7 @@ class PlaneWindow:
             seen=replace(rest, states=rest.states - 1),
         )  # fmt: skip
 
-    def _without_planes(self, gone: NDArray[np.bool_]) -> PlaneWindow:
+    def _without_planes(self, gone: Bools) -> PlaneWindow:
         gone = gone & ~np.isin(np.arange(len(gone)), self.seen.planes)
         if not gone.any():
             return self

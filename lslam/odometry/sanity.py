@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import voxel
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import ScanResult
-
-Floats = NDArray[np.float64]
 
 # m/s and rad/s: trains and small aircraft are slower, and racing drones turn less. Over a shorter time than so many seconds a
 # registration may err by as much.

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.registration.acceptance import Acceptance, failed
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-
-Floats = NDArray[np.float64]
 
 
 def recorded(scan: Scan, found: RegistrationResult, covariance: Floats | None, own: Floats | None) -> ScanResult:

@@ -6,13 +6,13 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -21,8 +21,6 @@ from lslam.odometry.scan_outcome import judged
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-
-Floats = NDArray[np.float64]
 
 # The recipe: the package's own centroids and covariances, correspondences within a metre, and a map of the last ten
 # keyframes, a new one every 2 m or 15 deg.

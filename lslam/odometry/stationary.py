@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful
@@ -18,8 +18,6 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
-
-Floats = NDArray[np.float64]
 
 # Steps beyond these, m and deg, need no test of the next scan: it is not stationary.
 SLOW_M, SLOW_DEG = 0.1, 1.0

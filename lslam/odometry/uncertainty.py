@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import noise
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
 from lslam.odometry.deskew_uncertainty import DeskewUncertainty
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 # Factor on the first sweep's variance: its velocity is that at its end, off by a T, twice the error of later ones.
 FIRST = 4.0

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.registration.history import History
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 
-Floats = NDArray[np.float64]
 Test = Literal["solution", "directions", "rmse", "overlap", "inliers", "agreement", "jump"]
 
 # Of a pose from the motion prior alone: sigmas of half a metre and two degrees.

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
 from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, normal_equations, optimise
@@ -17,8 +17,6 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, prior_term, result_of, solve, voxel_terms
-
-Floats = NDArray[np.float64]
 
 
 class MapAlignment:

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.history import History
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 # The kernel opens so many times its end width around a pose that is nearly right.
 NEAR_KERNEL = 2.0

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.kernels import gaussians
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
@@ -44,7 +45,7 @@ class GaussianMap(Stateful):
         """Voxels that hold points."""
         return int(self.pool[gaussians.LIVE])
 
-    def insert(self, points: NDArray[np.float32], T_world_lidar: NDArray[np.float64]) -> int:
+    def insert(self, points: NDArray[np.float32], T_world_lidar: Floats) -> int:
         """Add points (N, 3), m, LiDAR frame; returns how many lie too far from the origin to have a voxel.
 
         The pool grows before it can overflow: every point might open a voxel of its own.
@@ -64,7 +65,7 @@ class GaussianMap(Stateful):
         self.pool[:] = 0
         self._shapes[:, 10] = 0.0
 
-    def shapes(self) -> NDArray[np.float64]:
+    def shapes(self) -> Floats:
         """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
         from lslam.registration.kernels.discs import EXTENT2
         from lslam.registration.kernels.ndt_residual import describe

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.rest import Rest
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 
 class History(Stateful):

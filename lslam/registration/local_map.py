@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap
 
@@ -52,9 +53,7 @@ class LocalMap(Stateful):
         """Fine voxels that hold points."""
         return len(self.fine)
 
-    def insert(
-        self, map_points: NDArray[np.float32], source: NDArray[np.float64], T_world_lidar: NDArray[np.float64]
-    ) -> None:
+    def insert(self, map_points: NDArray[np.float32], source: Floats, T_world_lidar: Floats) -> None:
         """Enter a scan: its small centroids (M, 3) into fine voxels, its source points (S, 3) into all others."""
         self.changes += 1
         self.fine.insert(map_points, T_world_lidar)

@@ -6,16 +6,14 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.local_map import LocalMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
-
-Floats = NDArray[np.float64]
 
 
 class MapScans(Stateful, ABC):

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from lslam.core.geometry import se3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.registration.robust import Annealing
-
-Floats = NDArray[np.float64]
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is of a turn.
 STEP_M = 1e-3
@@ -56,7 +55,7 @@ class Correspondences:
         return *self._looked_up[target], self.is_done, self.away2
 
 
-def slots_of(count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def slots_of(count: int) -> tuple[Longs, NDArray[np.int32]]:
     """Octant cells and slots of so many points, nothing looked up yet."""
     return np.full(count, -1, np.int64), np.full((count, 8), -1, np.int32)
 

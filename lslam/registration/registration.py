@@ -13,6 +13,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import failed
@@ -25,8 +26,6 @@ from lslam.registration.rest_detector import RestDetector
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import VoxelTarget
-
-Floats = NDArray[np.float64]
 
 
 class Registration(Stateful):

@@ -9,15 +9,12 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import State, Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR
 from lslam.registration.local_map import BREADTH
 from lslam.registration.preprocessing.ground import ground_of, up_of
-
-Floats = NDArray[np.float64]
-Longs = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 # Voxels between surfaces of different things.
 THINGS_APART_VOXELS = 2.5
@@ -95,7 +92,7 @@ class PlanWalls:
         sums = np.bincount(things, gain[telling])
         return Votes(*(int(np.count_nonzero(sign * sums > MOST_CHI2)) for sign in (1, -1)))
 
-    def _cost(self, points: Floats) -> tuple[Floats, Flags]:
+    def _cost(self, points: Floats) -> tuple[Floats, Bools]:
         """(N,) squared sigmas of levelled points from their wall, NaN where none is known, and whether anything is near."""
         away, near = self._tree.query(points[:, :2], distance_upper_bound=self._voxel_size)
         is_near = np.isfinite(away)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.solver import RegistrationResult
 
@@ -31,7 +31,7 @@ class RestDetector(Stateful):
 
     def __init__(self, sigma: float) -> None:
         self.sigma = sigma
-        self._reference: NDArray[np.float64] | None = None
+        self._reference: Floats | None = None
         # Scans near the reference; scans that it took to leave the one before.
         self._stayed = self._last_stay = 0
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import MotionState
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.registration.gaussian_map import GaussianMap
@@ -26,8 +26,6 @@ from lslam.registration.optimiser import (
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.robust import Annealing
-
-Floats = NDArray[np.float64]
 
 # Planar points of one normal that constrain a direction well enough, as many as LOAM asks for a plane.
 ENOUGH = 5
@@ -55,17 +53,17 @@ class RegistrationResult:
     stages : seconds per stage
     """
 
-    T_world_lidar: NDArray[np.float64]
+    T_world_lidar: Floats
     ok: bool = True
     reason: str = ""
-    covariance: NDArray[np.float64] | None = None
+    covariance: Floats | None = None
     converged: bool = True
     iterations: int = 0
     source_points: int = 0
     matched: int = 0
     inliers: int = 0
     rmse: float = 0.0
-    degenerate: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 6)))
+    degenerate: Floats = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     lever_arm: float = 1.0
     is_rejected: bool = False
@@ -84,13 +82,11 @@ class RegistrationResult:
         """Whether the pose is a registration's that nothing contradicts."""
         return self.ok and not self.is_rejected
 
-    def moved(self, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> RegistrationResult:
+    def moved(self, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
         """The same registration at another pose."""
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
-    def rejected(
-        self, reason: str, T_world_lidar: NDArray[np.float64], covariance: NDArray[np.float64] | None
-    ) -> RegistrationResult:
+    def rejected(self, reason: str, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
         """The scan at another pose, since something contradicts the registration."""
         moved = self.moved(T_world_lidar, covariance)
         return replace(moved, is_rejected=True, reason=reason, converged=False)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.kernels.discs import EXTENT2, source_discs
 
@@ -20,8 +21,8 @@ Neighbourhood = Literal["voxel", "knn"]
 
 
 def source_covariance(
-    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float, neighbourhood: Neighbourhood = "voxel"
-) -> NDArray[np.float64]:
+    source: Floats, map_points: NDArray[np.float32], thin: float, neighbourhood: Neighbourhood = "voxel"
+) -> Floats:
     """Covariances (S, 6), m2, LiDAR frame, of source points (S, 3): discs of variance `thin` along their normal.
 
     neighbourhood : of which of the scan's own points (M, 3): `_of_voxels` or `_of_neighbours`
@@ -30,8 +31,8 @@ def source_covariance(
 
 
 def _of_neighbours(
-    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float
-) -> NDArray[np.float64]:  # fmt: skip
+    source: Floats, map_points: NDArray[np.float32], thin: float
+) -> Floats:  # fmt: skip
     """As generalized ICP has it: the normal of the nearest points, whether these are of several rings or of one."""
     from scipy.spatial import cKDTree
 
@@ -44,8 +45,8 @@ def _of_neighbours(
 
 
 def _of_voxels(
-    source: NDArray[np.float64], map_points: NDArray[np.float32], thin: float
-) -> NDArray[np.float64]:  # fmt: skip
+    source: Floats, map_points: NDArray[np.float32], thin: float
+) -> Floats:  # fmt: skip
     """The normal is that of the scan's own points in the cell around. A ring by itself has none: a disc across it would be
     a guess that holds the sensor to where the ring was. Such points get no normal but their noise, `thin` in all
     directions, and the map's normal alone decides.

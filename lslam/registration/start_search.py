@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Bools, Floats, Points
 from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
 from lslam.registration.attempt import NEAR_KERNEL, Attempt
@@ -21,10 +21,6 @@ from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thi
 from lslam.registration.residuals import MEANS
 from lslam.registration.robust import Annealing, is_more
 from lslam.registration.solver import RegistrationResult, solve, voxel_terms
-
-Floats = NDArray[np.float64]
-Points = NDArray[np.float32]
-Flags = NDArray[np.bool_]
 
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
@@ -59,7 +55,7 @@ class NonGroundPoints:
             index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance, self._up)
             self._cells.insert(points[index], T_world_lidar)
 
-    def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Flags:
+    def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Bools:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
         matches = Correspondences(len(seen.source))
         terms = voxel_terms(MEANS, MEANS.points(seen, NEAR), (self._cells,), matches, NEAR, 1.0)
@@ -142,7 +138,7 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
         aligned: RegistrationResult = target.refine(flat, pose, width, c.start_iterations, coarser, directions)
         return aligned.T_world_lidar
 
-    def agreeing(at: RegistrationResult) -> Flags:
+    def agreeing(at: RegistrationResult) -> Bools:
         return non_ground.agreeing(seen, at.T_world_lidar)
 
     starts = [T_prior]
@@ -207,7 +203,7 @@ def is_at_rest(pose: Floats, last: Floats) -> bool:
     return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(TURN_STEP_DEG))
 
 
-def is_much_more(ours: Flags, others: Flags, margin: float = MUCH) -> bool:
+def is_much_more(ours: Bools, others: Bools, margin: float = MUCH) -> bool:
     """Whether `margin` times as many points agree at one pose as at the other, and not by chance: flags (S,) of the same.
 
     McNemar's test of paired shares at two sigma, on the points that agree at one of the poses only.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.types.arrays import Floats
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
@@ -22,8 +23,6 @@ from lslam.registration.residuals import residual_named
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.source_covariance import source_covariance
-
-Floats = NDArray[np.float64]
 
 MIN_SOURCE_POINTS = 30
 # Share of points with a ring spacing above a voxel from which on the coarse level is searched, too.

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.graph.drift import drift_covariance
 from lslam.backend.graph.odometry_constraints import growth
@@ -14,6 +13,7 @@ from lslam.backend.localization.prior_map import LocalView
 from lslam.core.config.config import Config
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.geometry.noise import quantile
+from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import FixStatus, MapFix
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import ScanResult
@@ -25,8 +25,6 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
-
-Floats = NDArray[np.float64]
 
 # Sigmas that the kernel spans, and the chance that the innovation of a scan that the map holds lies beyond its gate.
 SIGMAS, CHANCE = 3.0, 1e-4

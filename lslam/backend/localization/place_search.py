@@ -10,15 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.localization.prior_map import PriorMap
 from lslam.backend.loops.bev_correlation import CELL, BevGrid, Image, Spectrum, blurred, correlate, spectrum
 from lslam.backend.loops.level_submap import LevelSubmap, make_level_submap
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
-
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats
 
 # m about the sensor that is compared, and rad between two headings: a cell's width at half of it.
 WINDOW, TURN_STEP = 60.0, np.deg2rad(3.0)

@@ -7,21 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.loops.level_submap import find_up, level_rotation
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.gnss import Georeference
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
 from lslam.registration.preprocessing.ground import Z
-
-Floats = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 # m, edge of the blocks that points are sorted into; the local map is made anew where the sensor enters another.
 BLOCK = 32.0

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.backend.graph.odometry_constraints import positive
 from lslam.backend.keyframes.store import KeyframeStore
@@ -19,15 +18,13 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import geodesy, noise, se3
 from lslam.core.kernels import voxel
 from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.constraint import Constraint
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.preprocessing.prepare import NO_TIMES
 from lslam.registration.preprocessing.up import ahead_of
-
-Floats = NDArray[np.float64]
-Points = NDArray[np.float32]
 
 # m, voxels of the cloud that further sessions are searched in.
 FINE = 0.2

@@ -15,14 +15,13 @@ from lslam.backend.loops.level_submap import LevelSubmap, find_up, level_rotatio
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats
 from lslam.registration.acceptance import MAP_MIN_INLIERS, Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.preprocessing.up import ahead_of
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
-
-Floats = NDArray[np.float64]
 
 # m between two keyframes that are tried.
 SPACING = 6.0

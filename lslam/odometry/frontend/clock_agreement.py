@@ -8,13 +8,13 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
@@ -24,8 +24,6 @@ from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import gate_points
 from lslam.registration.preprocessing.sweep_clock import SweepClock
-
-Floats = NDArray[np.float64]
 
 # Scans of a window. The speed is not known before the second scan: those before are not judged.
 SCANS, SKIPPED, FEWEST_SCANS = 13, 3, 8
@@ -167,7 +165,7 @@ class ClockWindow:
                 return False
         return True
 
-    def _split(self, scan: Scan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _split(self, scan: Scan) -> tuple[Longs, Longs]:
         """Indices of the points for odometry and of those that are kept out, in their order, by chance."""
         usable = gate_points(np.ascontiguousarray(scan.points, np.float32), self._config.preprocess)
         order = np.random.default_rng((len(usable), scan.index)).permutation(usable)
@@ -207,7 +205,7 @@ def _deskewed(scan: Scan, sweep: MotionPrior) -> Floats:
     return np.asarray(deskew_points(scan.points, scan.times, sweep), np.float64)
 
 
-def _thinned(count: int, most: int) -> NDArray[np.int64]:
+def _thinned(count: int, most: int) -> Longs:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
@@ -221,7 +219,7 @@ def _distances(scans: list[_Placed]) -> Floats:
     return np.array([_distance(tree, cloud, owner, number, scan.kept_out) for number, scan in enumerate(scans)])
 
 
-def _distance(tree: Any, cloud: Floats, owner: NDArray[np.int64], number: int, points: Floats) -> float:
+def _distance(tree: Any, cloud: Floats, owner: Longs, number: int, points: Floats) -> float:
     away, near = tree.query(points, k=_NEIGHBOURS, distance_upper_bound=_RADIUS_M)
     is_there = np.isfinite(away)
     near = np.where(is_there, near, 0)

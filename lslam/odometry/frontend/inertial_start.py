@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config import Config
 from lslam.core.config.odometry import TIGHTLY_COUPLED
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Selection, Sequence, select
@@ -116,7 +116,7 @@ def load_start(path: Path, config: Config) -> Inertial | None:
     return part
 
 
-def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: NDArray[np.float64], config: Config) -> InertialStart:
+def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, config: Config) -> InertialStart:
     """The start by scans registered without the IMU; again by scans that it then deskewed, where that matters."""
     last_ns = int(sequence.stamps_ns[-1])
     first = first_poses(sequence, config, None)
@@ -159,10 +159,10 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     odometry = create_odometry(in_scale(Config.model_validate({"preprocess": gate}), few))
     tracker = Tracker(odometry, motion=motion)
     stamps: list[int] = []
-    poses: list[NDArray[np.float64]] = []
+    poses: list[Floats] = []
     instants: list[int] = []
-    middles: list[NDArray[np.float64]] = []
-    covariances: list[NDArray[np.float64]] = []
+    middles: list[Floats] = []
+    covariances: list[Floats] = []
     for loaded in read_ahead(few, odometry.prepare, config.input.workers):
         result = tracker.track(loaded)
         if result.status == "skipped":
@@ -186,7 +186,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     )  # fmt: skip
 
 
-def first_heard_ns(imu: ImuStream | None, stamps_ns: NDArray[np.int64], config: Config) -> int:
+def first_heard_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int:
     """Since when the IMU tells of the scans: from the first on, unless it begins among the later ones."""
     first_ns = int(stamps_ns[0])
     if imu is None:
@@ -254,5 +254,5 @@ def _savings(results: list[ScanResult]) -> dict[str, Any]:
     }
 
 
-def _rounded(values: NDArray[np.float64], digits: int) -> list[float]:
+def _rounded(values: Floats, digits: int) -> list[float]:
     return [round(float(v), digits) for v in values]

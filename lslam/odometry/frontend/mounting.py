@@ -5,16 +5,14 @@ from __future__ import annotations
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config import Config
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Sequence, readable
 from lslam.odometry.inertial.imu_cleaning import gravity_unit
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.preprocessing.up import Up, find_up
-
-Floats = NDArray[np.float64]
 
 # Scans of which the largest serves: the first message may be a sliver.
 SCANS = 3

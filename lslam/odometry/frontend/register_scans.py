@@ -12,12 +12,12 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import poses_at
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan, Span
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Selection, Sequence
@@ -33,8 +33,6 @@ from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.sanity import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
-
-Floats = NDArray[np.float64]
 
 # Of a pose in a frame of which nobody knows where it lies, m2 and rad2.
 UNBOUNDED = np.diag(np.full(6, np.inf))
@@ -155,7 +153,7 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
     A skipped scan adds `PRIOR_COVARIANCE` to the last; that of a scan in another frame is `UNBOUNDED`.
     """
     known = any(r.covariance is not None for r in results)
-    covariances: list[NDArray[np.float64]] = []
+    covariances: list[Floats] = []
     for result in results if known else ():
         before = covariances[-1] if covariances else np.zeros((6, 6))
         covariances.append(before + PRIOR_COVARIANCE if result.covariance is None else result.covariance)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State
@@ -18,7 +16,6 @@ from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.registration.robust import UsualAgreement
 
-Floats = NDArray[np.float64]
 # Begins an empty map: the tracker of a scan that is expected at a pose (4, 4).
 Begin = Callable[[Floats], Tracker]
 

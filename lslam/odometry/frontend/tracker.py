@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
@@ -60,7 +60,7 @@ class Tracker:
         # The newest accepted result.
         self._last: ScanResult | None = None
         # The first scan, until a second one tells how fast it was taken.
-        self._first: tuple[Scan, Any, NDArray[np.float64]] | None = None
+        self._first: tuple[Scan, Any, Floats] | None = None
 
     def track(self, loaded: Loaded) -> ScanResult:
         """Pose of the next scan."""
@@ -182,7 +182,7 @@ class Tracker:
         self.middle = (instant_ns, middle)
 
     def _recorded(
-        self, result: ScanResult, expected: MotionPrior, steady: NDArray[np.float64] | None,
+        self, result: ScanResult, expected: MotionPrior, steady: Floats | None,
         trial: RegistrationResult | None, clock: StageClock,
     ) -> ScanResult:  # fmt: skip
         """The result beside its predictions, and beside what registration from constant velocity took.
@@ -251,7 +251,7 @@ class Tracker:
         return _both(located, moved)
 
     def _begin_again(
-        self, odometry: Deskewing, first: Scan, prepared: Any, pose: NDArray[np.float64], second: Scan,
+        self, odometry: Deskewing, first: Scan, prepared: Any, pose: Floats, second: Scan,
         located: RegistrationResult,
     ) -> MotionPrior:  # fmt: skip
         """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
@@ -272,7 +272,7 @@ def _both(first: RegistrationResult, second: RegistrationResult) -> Registration
     return replace(second, iterations=first.iterations + second.iterations, stages=stages)
 
 
-def _matrix_norm(prior: NDArray[np.float64], pose: NDArray[np.float64]) -> float:
+def _matrix_norm(prior: Floats, pose: Floats) -> float:
     """Error of the motion prior, (4, 4), against registration: the largest singular value of inv(prior) pose - I.
 
     Girolimetto, equation 5.1.
@@ -285,7 +285,7 @@ def _distance(before: MotionPrior, after: MotionPrior) -> float:
     return _apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
 
 
-def _apart(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+def _apart(a: Floats, b: Floats) -> float:
     """How far two poses (4, 4) are apart, m, at a lever arm of `LEVER_M`."""
     change = se3.relative(a, b)
     return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))

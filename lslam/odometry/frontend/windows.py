@@ -8,9 +8,9 @@ from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.frontend.look_back import first_pose
@@ -20,8 +20,6 @@ from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import NEIGHBOURS, Course
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.registration.robust import is_more
-
-Floats = NDArray[np.float64]
 
 # Scans: two seconds, which are held in memory.
 WINDOW = 20

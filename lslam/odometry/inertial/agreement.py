@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.imu_cleaning import ImuFault, ImuRefusedError
-
-Floats = NDArray[np.float64]
 
 # rad/s, rms of rotation rates below which registration's noise dominates and nothing is observable.
 LEAST_TURNING = np.deg2rad(0.6)
@@ -50,7 +48,7 @@ class Agreement:
 def check_agreement(
     imu: ImuStream,
     T_lidar_imu: Floats,
-    stamps_ns: NDArray[np.int64],
+    stamps_ns: Longs,
     poses: Floats,
     offset_s: float | None,
     least_offset_s: float = LEAST_OFFSET_S,
@@ -93,7 +91,7 @@ def check_agreement(
 
 
 def turns(
-    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offset_s: float
+    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, offset_s: float
 ) -> tuple[Floats, Floats]:
     """Rates by registration and by the gyroscope, (M, 3) rad/s in LiDAR axes, each about its mean.
 
@@ -103,7 +101,7 @@ def turns(
     return _centred(_seen(stamps_ns, poses), _Felt(imu, T_lidar_imu, stamps_ns).rates(offset_s))
 
 
-def _seen(stamps_ns: NDArray[np.int64], poses: Floats, width: int = 1) -> Floats:
+def _seen(stamps_ns: Longs, poses: Floats, width: int = 1) -> Floats:
     """(N - width, 3) rad/s in LiDAR axes, each from a scan to the one `width` later."""
     seconds = (stamps_ns[width:] - stamps_ns[:-width])[:, None] * 1e-9
     return np.asarray(so3.log(np.swapaxes(poses[:-width, :3, :3], -1, -2) @ poses[width:, :3, :3]) / seconds)
@@ -112,7 +110,7 @@ def _seen(stamps_ns: NDArray[np.int64], poses: Floats, width: int = 1) -> Floats
 class _Felt:
     """Mean angular rates from scan to scan, or to the one `width` later, in LiDAR axes, for any offset of the clocks."""
 
-    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], width: int = 1) -> None:
+    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: Longs, width: int = 1) -> None:
         self.width = width
         self.origin = int(stamps_ns[0])
         self.times = (imu.stamps_ns - self.origin) * 1e-9
@@ -129,7 +127,7 @@ class _Felt:
         return np.asarray((at[w:] - at[:-w]) / (query[w:] - query[:-w])[:, None])
 
 
-def _width(felt: _Felt, seen: Floats, stamps_ns: NDArray[np.int64], poses: Floats, offsets: Floats) -> int | None:
+def _width(felt: _Felt, seen: Floats, stamps_ns: Longs, poses: Floats, offsets: Floats) -> int | None:
     """Over how many scans turns must be compared for registration's noise to be a small part of them; None over any.
 
     felt, seen : from scan to scan; offsets : of the clocks that are possible, s

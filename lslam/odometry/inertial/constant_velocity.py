@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GravityDirection, ImuState
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
@@ -16,8 +16,6 @@ from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.course import Course, motion_covariance
 from lslam.registration.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 
 class MotionModel(Protocol):

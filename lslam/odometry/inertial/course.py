@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
-
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats, Longs
 
 # Middles on each side of a sweep. From one to the next its influence on a natural spline falls by 3.7.
 NEIGHBOURS = 3
@@ -21,7 +19,7 @@ class Course:
     instants_ns : (N,); poses : (N, 4, 4). A middle no later than one before it, as of a sliver of a sweep, is left out.
     """
 
-    def __init__(self, instants_ns: NDArray[np.int64], poses: Floats) -> None:
+    def __init__(self, instants_ns: Longs, poses: Floats) -> None:
         is_later = np.append(True, instants_ns[1:] > np.maximum.accumulate(instants_ns)[:-1])
         self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
 

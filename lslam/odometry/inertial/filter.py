@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import noise
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
@@ -18,8 +18,6 @@ from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.imu_estimate import PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.odometry.inertial.navigation_state import POSE, NavigationState
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 
 class FilterMotion(InertialMotion):

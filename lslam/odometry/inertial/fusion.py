@@ -6,10 +6,10 @@ import logging
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GravityDirection, ImuState, ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
@@ -25,7 +25,6 @@ from lslam.odometry.kernels.rotation import apart, vector_between
 from lslam.registration.preprocessing.deskew import knots_over
 from lslam.registration.solver import RegistrationResult
 
-Floats = NDArray[np.float64]
 log = logging.getLogger("lslam")
 
 

@@ -11,15 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
+from lslam.core.types.arrays import Floats
 from lslam.odometry.inertial.imu_noise import RATE_NOISE, USUAL, ImuNoise
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.inertial.kalman import OUTLIER, update
 from lslam.odometry.kernels import kalman
-
-Floats = NDArray[np.float64]
 
 # One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
 AXES_SIGMA = 0.025

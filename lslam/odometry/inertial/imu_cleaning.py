@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.saturation import with_hidden
 from lslam.odometry.kernels.strapdown import overlaps
@@ -103,14 +103,14 @@ def gravity_unit(imu: ImuStream) -> tuple[float, str | None]:
     return calm, "m/s2" if lo <= calm / GRAVITY <= hi else "g" if lo <= calm <= hi else None
 
 
-def mean_forces(imu: ImuStream) -> NDArray[np.float64]:
+def mean_forces(imu: ImuStream) -> Floats:
     """(W, 3) specific force averaged over `CALM_S` each, W >= 1: what shakes does not look like more or less gravity."""
     step = float(np.median(np.diff(imu.stamps_ns))) * 1e-9
     width = min(max(round(CALM_S / step), 1) if step > 0 else 1, len(imu))
     return np.asarray(imu.accel[: len(imu) // width * width].reshape(-1, width, 3).mean(axis=1))
 
 
-def gaps(imu: ImuStream, longest_s: float) -> NDArray[np.int64]:
+def gaps(imu: ImuStream, longest_s: float) -> Longs:
     """(G, 2) ns: begin and end of every stretch that no sample tells of, before and after all included.
 
     In a pause longer than `longest_s` half of that after the last sample and before the next is still known as well as in
@@ -126,7 +126,7 @@ def gaps(imu: ImuStream, longest_s: float) -> NDArray[np.int64]:
     return np.concatenate([before, inner, after])
 
 
-def covers(silent: NDArray[np.int64], begin_ns: int, end_ns: int) -> bool:
+def covers(silent: Longs, begin_ns: int, end_ns: int) -> bool:
     """Whether there are samples all the way from one instant to the other; silent : (G, 2) ns, the stream's `gaps`."""
     return not overlaps(silent, begin_ns, end_ns)
 
@@ -149,7 +149,7 @@ def _ordered(imu: ImuStream, notes: list[str]) -> ImuStream:
     return ImuStream(imu.stamps_ns[good], imu.accel[good], imu.gyro[good], hidden)
 
 
-def _in_si(imu: ImuStream, notes: list[str]) -> NDArray[np.float64]:
+def _in_si(imu: ImuStream, notes: list[str]) -> Floats:
     norm, unit = gravity_unit(imu)
     if unit is None:
         raise ImuRefusedError(
@@ -162,5 +162,5 @@ def _in_si(imu: ImuStream, notes: list[str]) -> NDArray[np.float64]:
     return imu.accel
 
 
-def _text(values: NDArray[np.float64]) -> str:
+def _text(values: Floats) -> str:
     return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"

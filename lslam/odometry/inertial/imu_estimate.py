@@ -10,16 +10,14 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuState, ImuStream
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.inertial.kalman import OUTLIER
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import vector_between
-
-Floats = NDArray[np.float64]
 
 GRAVITY = 9.80665
 # Registration from scan to scan, at the least: m and rad, one sigma.
@@ -70,11 +68,11 @@ class ImuEstimate:
             values[12], variances[12] = g.offset_s, g.covariance[12, 12]
         return ImuState(values, np.sqrt(np.maximum(variances, 0.0)))
 
-    def over(self, imu: ImuStream, instants_ns: NDArray[np.int64]) -> Increments:
+    def over(self, imu: ImuStream, instants_ns: Longs) -> Increments:
         """What the IMU felt between increasing instants, biases taken off."""
         return self._integrated(imu, instants_ns, self.gyroscope.bias)
 
-    def _integrated(self, imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats) -> Increments:
+    def _integrated(self, imu: ImuStream, instants_ns: Longs, gyro_bias: Floats) -> Increments:
         g = self.gyroscope
         return integrate(imu, instants_ns, gyro_bias, self.accel_bias, g.axes, g.mounting, g.offset_ns)
 

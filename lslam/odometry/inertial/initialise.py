@@ -6,17 +6,15 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
 from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, GRAVITY, ImuEstimate
 from lslam.odometry.inertial.imu_noise import ImuNoise
-
-Floats = NDArray[np.float64]
 
 # Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
@@ -46,9 +44,9 @@ class FirstPoses:
     covariances : (M, 6, 6) of the registrations, world axes; None when they say nothing of their quality
     """
 
-    stamps_ns: NDArray[np.int64]
+    stamps_ns: Longs
     poses: Floats
-    instants_ns: NDArray[np.int64]
+    instants_ns: Longs
     middles: Floats
     covariances: Floats | None = None
 
@@ -189,7 +187,7 @@ def _bias_sigma(given: Floats, seen: Gyroscope) -> float:
 
 
 def _first_guess(
-    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: NDArray[np.int64], poses: Floats, config: ImuConfig,
+    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, config: ImuConfig,
     mean_bias: Floats | None,
 ) -> tuple[ImuEstimate, bool]:  # fmt: skip
     """Biases as given, or of a standing sensor, or by the mean turn; gravity as the scans' path and the forces need it."""
@@ -213,7 +211,7 @@ def _first_guess(
     return replace(guess, gravity=GRAVITY * gravity / max(float(np.linalg.norm(gravity)), 1e-9)), stands
 
 
-def _is_stationary(imu: ImuStream, stamps_ns: NDArray[np.int64], poses: Floats) -> tuple[bool, Floats]:
+def _is_stationary(imu: ImuStream, stamps_ns: Longs, poses: Floats) -> tuple[bool, Floats]:
     """Whether the first second is one of standing still, and the mean rates (3,) in it."""
     end_ns = stamps_ns[0] + 1_000_000_000
     i, j = (int(k) for k in np.searchsorted(imu.stamps_ns, [stamps_ns[0], end_ns]))
@@ -254,7 +252,7 @@ def _learnt(
 
 
 def _path_of_force(
-    imu: ImuStream, T_world_imu: Floats, stamps_ns: NDArray[np.int64], known: ImuEstimate, seconds: float
+    imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, known: ImuEstimate, seconds: float
 ) -> tuple[Floats, Floats, float]:
     """Velocity at the first pose (3,), gravity (3,) and the velocity's sigma that lead along the poses of some seconds.
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.kernels import strapdown
-
-Floats = NDArray[np.float64]
 
 PERFECT = np.eye(3)
 
@@ -26,7 +24,7 @@ class Increments:
     hidden : (6,) one sigma of the mean force and rate, to the last instant, that the range of the IMU cut off; None for none
     """
 
-    instants_ns: NDArray[np.int64]
+    instants_ns: Longs
     rotations: Floats
     velocities: Floats
     positions: Floats
@@ -79,7 +77,7 @@ class Increments:
 
 
 def integrate(
-    imu: ImuStream, instants_ns: NDArray[np.int64], gyro_bias: Floats, accel_bias: Floats,
+    imu: ImuStream, instants_ns: Longs, gyro_bias: Floats, accel_bias: Floats,
     gyro_axes: Floats | None = None, mounting: Floats | None = None, offset_ns: int = 0,
 ) -> Increments:  # fmt: skip
     """Integrate the stream over increasing `instants_ns` (K,), K >= 1, with the biases (3,) taken off.
@@ -103,7 +101,7 @@ def integrate(
     return Increments(instants_ns, *felt, _readings(imu, at[[0, -1]]), _hidden(imu, int(at[0]), int(at[-1])))
 
 
-def _readings(imu: ImuStream, instants_ns: NDArray[np.int64]) -> Floats:
+def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:
     """(K, 3) of the gyroscope at instants (K,), linear between samples and constant beyond them."""
     after = np.clip(np.searchsorted(imu.stamps_ns, instants_ns), 1, max(len(imu) - 1, 1))
     before, after = after - 1, np.minimum(after, len(imu) - 1)

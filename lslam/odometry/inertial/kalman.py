@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from lslam.core.types.arrays import Floats
 from lslam.odometry.kernels import kalman
-
-Floats = NDArray[np.float64]
 
 # Innovations beyond so many sigma are outliers and count accordingly less.
 OUTLIER = 4.0

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream, MotionState, PreintegratedStep, SweepLink
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
@@ -29,8 +29,6 @@ from lslam.odometry.inertial.navigation_state import (
 )
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 # m/s2, change of velocity over a gap of the IMU, one sigma: a car brakes.
 BRAKING = 3.0

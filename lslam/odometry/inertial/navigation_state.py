@@ -9,16 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.odometry.inertial.gyroscope import MOUNTING, OFFSET_WALK, Gyroscope
 from lslam.odometry.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.imu_noise import USUAL, ImuNoise
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.inertial.kalman import update
-
-Floats = NDArray[np.float64]
 
 PLACE, TURN, SPEED, DOWN, FORCE = (slice(3 * k, 3 * k + 3) for k in range(5))
 POSE, REST, GYRO = slice(0, 6), slice(6, 15), slice(15, 27)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.imu import ImuStream
-
-Floats = NDArray[np.float64]
 
 # The narrowest ranges sold: a device of less than 2 g cannot hold gravity and a push, one of 125 deg/s is made for cars.
 LEAST_FORCE, LEAST_RATE = 13.0, np.deg2rad(100)
@@ -58,7 +56,7 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
     return replace(imu, accel=parts[0], gyro=parts[1], hidden=np.hstack(hidden))
 
 
-def _cuts(values: Floats, least: float) -> NDArray[np.bool_]:
+def _cuts(values: Floats, least: float) -> Bools:
     """(M, 3) where readings (M, 3) sit at an end of the range, which is `least` or more either way.
 
     Every axis has an upper and a lower end of its own: 16 bits read from -32768 to +32767, and scales differ. An extreme is an
@@ -79,7 +77,7 @@ def _cuts(values: Floats, least: float) -> NDArray[np.bool_]:
     return np.asarray(at[:, :3] | at[:, 3:])
 
 
-def _excess(seconds: Floats, values: Floats, cut: NDArray[np.bool_]) -> Floats:
+def _excess(seconds: Floats, values: Floats, cut: Bools) -> Floats:
     """(2, M) by how much readings (M,) at an end of the range were likely beyond it, and one sigma of that."""
     beyond = np.zeros((2, len(values)))
     size = np.abs(values)

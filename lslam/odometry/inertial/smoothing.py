@@ -8,11 +8,11 @@ from itertools import pairwise
 from typing import ClassVar, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream, InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
@@ -24,7 +24,6 @@ from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.solver import RegistrationResult
 
-Floats = NDArray[np.float64]
 log = logging.getLogger("lslam")
 
 # Velocity, gravity and accelerometer bias of an `ImuEstimate` among the 18 of an `InertialState`.

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.normal_equations import Normal
 from lslam.core.kernels import linalg
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import Gyroscope
@@ -30,8 +30,6 @@ from lslam.odometry.inertial.navigation_state import (
     transition,
 )
 from lslam.odometry.kernels.rotation import vector_between
-
-Floats = NDArray[np.float64]
 
 # Of the filter's error state what all moments have in common: gravity and the gyroscope's axes.
 COMMON = np.r_[9:12, 18:27]

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import noise, se3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
@@ -21,8 +21,6 @@ from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.navigation_state import POSE
 from lslam.odometry.inertial.window import Window, moment_of, off_by
 from lslam.registration.solver import RegistrationResult
-
-Floats = NDArray[np.float64]
 
 # m, of a point at `LEVER_M`: a scan whose pose moved farther from where its points were linearised is linearised again.
 STALE_M = 0.005

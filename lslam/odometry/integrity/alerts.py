@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan_result import SAME_M, USUAL, MotionCheck
 from lslam.odometry.integrity.directions import MOST_EMPTIED
 from lslam.odometry.integrity.pair_registration import SAME_SIGMAS, is_within
-
-Floats = NDArray[np.float64]
 
 # Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
@@ -37,7 +35,7 @@ class Alert:
     why: str
 
 
-def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
+def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: Longs) -> list[Alert]:
     """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
     rules = (_unconfirmed, _inconsistent, _ambiguous, _open, _foreign)
     of_checks = [alert for rule in rules for alert in rule(checks)]
@@ -177,7 +175,7 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
     ]
 
 
-def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
+def _jumps(positions: Floats, stamps_ns: Longs) -> list[Alert]:
     """Where poses jump as nothing that carries a sensor does."""
     steps = np.diff(stamps_ns) * 1e-9
     if len(steps) < 2 or np.any(steps <= 0):
@@ -196,7 +194,7 @@ def _jumps(positions: Floats, stamps_ns: NDArray[np.int64]) -> list[Alert]:
     ]
 
 
-def stamp_faults(positions: Floats, stamps_ns: NDArray[np.int64]) -> tuple[list[int], float]:
+def stamp_faults(positions: Floats, stamps_ns: Longs) -> tuple[list[int], float]:
     """Scans whose stamps alone make the poses jump, by their positions in the run, and by how much a step is wrong, s."""
     steps = np.diff(stamps_ns) * 1e-9
     if len(steps) < 2 or np.any(steps <= 0):
@@ -214,12 +212,12 @@ def _velocity_changes(positions: Floats, steps: Floats) -> tuple[Floats, Floats]
     return np.linalg.norm(np.diff(velocity, axis=0), axis=1), (steps[1:] + steps[:-1]) / 2
 
 
-def _is_jump(change: Floats, between: Floats) -> NDArray[np.bool_]:
+def _is_jump(change: Floats, between: Floats) -> Bools:
     """Whether nothing that carries a sensor changes its velocity so much, m/s, in such a time, s."""
     return np.asarray((change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M))
 
 
-def _is_by_stamps(positions: Floats, steps: Floats) -> NDArray[np.bool_]:
+def _is_by_stamps(positions: Floats, steps: Floats) -> Bools:
     """(N - 2,) whether three poses would not jump had their scans followed each other at the period of the sensor.
 
     A rotor keeps its period to a thousandth; stamps that a computer gives when packets arrive do not. A wrong place, or scans
@@ -228,7 +226,7 @@ def _is_by_stamps(positions: Floats, steps: Floats) -> NDArray[np.bool_]:
     return ~_is_jump(*_velocity_changes(positions, np.full(len(steps), np.median(steps))))
 
 
-def _groups(at: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+def _groups(at: Longs) -> list[Longs]:
     """Jumps less than three scans apart are one."""
     return np.split(at, np.flatnonzero(np.diff(at) > 3) + 1) if len(at) else []
 

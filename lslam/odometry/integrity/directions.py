@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats, Longs
 
 # Edge of a cell of directions, rad: two rings of sixteen beams, a hundred shots.
 CELL_RAD = float(np.deg2rad(5.0))
@@ -18,7 +18,7 @@ _ROWS = round(np.pi / CELL_RAD)
 _COLUMNS = 2 * _ROWS
 
 
-def directions(points: Floats) -> NDArray[np.int64]:
+def directions(points: Floats) -> Longs:
     """(N,) numbers of the cells of directions, of about the same size, in which points (N, 3), m, lie as seen from 0."""
     ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
     row = np.minimum((np.arcsin(points[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
@@ -29,7 +29,7 @@ def directions(points: Floats) -> NDArray[np.int64]:
     return np.asarray(row * _COLUMNS + column)
 
 
-def filled_directions(points: NDArray[np.floating]) -> NDArray[np.int64]:
+def filled_directions(points: NDArray[np.floating]) -> Longs:
     """Numbers of the cells of `directions` that hold some of the points (N, 3), m."""
     few = points[:: 1 + len(points) // POINTS, :3].astype(np.float64)
     ranges = np.linalg.norm(few, axis=1)
@@ -37,7 +37,7 @@ def filled_directions(points: NDArray[np.floating]) -> NDArray[np.int64]:
     return np.asarray(cells[filling >= FILLING])
 
 
-def emptied(before: NDArray[np.int64], now: NDArray[np.int64]) -> float:
+def emptied(before: Longs, now: Longs) -> float:
     """Share of the directions that were filled before and are empty now, in that half of them, lower or upper, where it is less.
 
     What leaves in front of the sky empties directions, what leaves in front of the ground, or below a ceiling, does not.

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import MotionCheck, ScanResult
@@ -18,8 +18,6 @@ from lslam.odometry.integrity.pair_registration import PairRegistration, best_of
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, thin
 from lslam.registration.robust import UsualAgreement
-
-Floats = NDArray[np.float64]
 
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
@@ -80,7 +78,7 @@ class IntegrityMonitor(Stateful):
         # The motion (4, 4) that the last conclusive check found, and the seconds it took.
         self._motion: tuple[Floats, float] | None = None
         # Where the poses stand, if they do, and the directions that were filled then.
-        self._stand: tuple[Floats, NDArray[np.int64]] | None = None
+        self._stand: tuple[Floats, Longs] | None = None
         # Whether no motion was its rival.
         self._may_stand = False
         self._usual = UsualAgreement(0.0)

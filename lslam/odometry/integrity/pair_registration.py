@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import SAME_M, motion_apart
 from lslam.odometry.integrity.directions import directions, filled_directions
@@ -21,8 +21,6 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
-
-Floats = NDArray[np.float64]
 
 SETTINGS = RegistrationConfig(blob_weight=0.0)
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
@@ -44,7 +42,7 @@ class MotionHypothesis:
     """
 
     result: RegistrationResult
-    on_planes: NDArray[np.bool_]
+    on_planes: Bools
     in_view: int
 
     @property
@@ -91,7 +89,7 @@ class PairRegistration:
         self._edge = LARGEST_M
         self._terms: list[Term] = []
         self._matches = Correspondences(0)
-        self._view: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._view: Longs = np.zeros(0, np.int64)
         self._source: Floats = np.zeros((0, 3))
 
     def begin(self, first: Floats, last: PreparedPoints) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats
 
 _BIN_DEG = 0.01
 _WIDTHS_DEG = (0.02, 0.04, 0.08, 0.16, 0.32)  # smoothing that is tried, the finest first

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import Scan
 from lslam.registration.preprocessing.firing_order import follow_rings, follow_sweep
 from lslam.registration.preprocessing.rings import organised_rows, ring_seam
 from lslam.registration.preprocessing.sweep_clock import SweepClock, azimuths, even_begin
-
-Floats = NDArray[np.float64]
 
 # Share of the azimuths that the points of a sensor that turns lie in, at least, in bins of ten degrees.
 _COVERED, _BINS = 0.5, 36

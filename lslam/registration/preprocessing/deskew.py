@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.kernels import transform
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.registration.preprocessing.prepare import PreparedPoints
-
-Floats = NDArray[np.float64]
 
 # At 200 deg/s one of 32 steps of a 0.1 s sweep turns by 0.6 deg: blending two matrices errs by 4e-6 of the range.
 KNOTS = 33

@@ -11,6 +11,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import so3
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import curvature
 from lslam.registration.preprocessing.ground import Z
@@ -41,7 +42,7 @@ class FeaturePoints:
     times : (M,) float32, s from the scan's stamp, None when the scan has none
     """
 
-    points: NDArray[np.float64]
+    points: Floats
     rings: NDArray[np.uint16]
     times: NDArray[np.float32] | None = None
 
@@ -82,11 +83,11 @@ class RingWalk:
     step : their median, rad
     """
 
-    order: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    points: NDArray[np.float64]
-    ranges: NDArray[np.float64]
-    steps: NDArray[np.float64]
+    order: Longs
+    starts: Longs
+    points: Floats
+    ranges: Floats
+    steps: Floats
     step: float
 
 
@@ -130,7 +131,7 @@ def features_along(
     return gather_features(scan, walk, labels, config.grid_step)
 
 
-def curvature_noise(ranges: NDArray[np.float64], side: int = curvature.SIDE) -> float:
+def curvature_noise(ranges: Floats, side: int = curvature.SIDE) -> float:
     """Standard deviation, m, of curvature times range that the noise of `ranges` (K,), m, along the rings makes.
 
     side : neighbours on either side that the curvature takes
@@ -170,7 +171,7 @@ def walk_rings(scan: Scan, gate: PreprocessConfig) -> RingWalk:
     return RingWalk(order, starts, points, ranges, steps, min(step, WIDEST_STEP))
 
 
-def _spin_axis(directions: NDArray[np.float64], starts: NDArray[np.int64]) -> NDArray[np.float64]:
+def _spin_axis(directions: Floats, starts: Longs) -> Floats:
     """(3,) unit vector about which rings of directions (K, 3) are circles; z where there is none, or within 45 deg of it.
 
     A circle about an axis has no extent along it, and errors of elevation are far smaller than the widest step.
@@ -188,7 +189,7 @@ def gather_features(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_s
     assert scan.rings is not None
     rings, times = scan.rings[walk.order], None if scan.times is None else scan.times[walk.order]
 
-    def those(mask: NDArray[np.bool_]) -> FeaturePoints:
+    def those(mask: Bools) -> FeaturePoints:
         at = np.flatnonzero(mask)
         return FeaturePoints(walk.points[at], rings[at], None if times is None else times[at])
 
@@ -206,7 +207,7 @@ def gather_features(scan: Scan, walk: RingWalk, labels: NDArray[np.int8], grid_s
 
 def _thinned(
     walk: RingWalk,
-    mask: NDArray[np.bool_],
+    mask: Bools,
     rings: NDArray[np.uint16],
     times: NDArray[np.float32] | None,
     grid_step: float,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats
 
 _FULL = 2 * np.pi
 # Blocks of a sweep, about a degree each, and points in a block of rings, at least.

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import so3
 from lslam.core.kernels import ground
-
-Floats = NDArray[np.float64]
+from lslam.core.types.arrays import Floats, Longs
 
 # m; cells of the grid, and the farthest that ground is looked for.
 CELL = 0.5
@@ -48,14 +47,14 @@ class Ground:
     half: int
     top: Floats
 
-    def above(self, points: NDArray[np.float32], height: float) -> NDArray[np.int64]:
+    def above(self, points: NDArray[np.float32], height: float) -> Longs:
         """Indices of those of the scan's points (N, 3), m, that lie higher above it than `height`, m, increasing."""
         return ground.above(points, self.R, CELL, self.half, self.top, height)
 
 
 def above_ground(
     points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z
-) -> NDArray[np.int64]:  # fmt: skip
+) -> Longs:  # fmt: skip
     """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground (`ground_of`), increasing."""
     return ground_of(points, slope, tolerance, up).above(points, tolerance)
 

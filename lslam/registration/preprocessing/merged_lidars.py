@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Bools, Longs
 from lslam.core.types.scan import NO_RING, Scan, Span
 from lslam.core.types.sequence import Sequence, SequenceView, readable
 from lslam.registration.preprocessing.views import with_rings
@@ -48,8 +49,8 @@ class _Reading:
 
     lidar: FurtherLidar
     sweep: Span | None
-    begins: NDArray[np.int64]
-    ends: NDArray[np.int64]
+    begins: Longs
+    ends: Longs
     held: dict[int, Scan | None]
 
 
@@ -159,7 +160,7 @@ def _period_ns(sequence: Sequence) -> int:
     return round(float(np.median(steps))) if len(steps) else round(1e9 / sequence.rate_hz)
 
 
-def _apart_ns(stamps: NDArray[np.int64], others: NDArray[np.int64]) -> float:
+def _apart_ns(stamps: Longs, others: Longs) -> float:
     """Median distance from stamps (M,) to the nearest of `others` (N,), ns."""
     nearest = np.interp(stamps, others, np.arange(len(others))).round().astype(int)
     return float(np.median(np.abs(stamps - others[nearest])))
@@ -174,16 +175,14 @@ def _read(lidar: FurtherLidar, index: int) -> Scan | None:
         return None
 
 
-def _is_far(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _is_far(points: NDArray[np.float32]) -> Bools:
     """Which points (N, 3) are finite and neither at the sensor nor on what carries it; elsewhere (0, 0, 0) would be a place."""
     with np.errstate(invalid="ignore", over="ignore"):
         squared = points[:, 0] ** 2 + points[:, 1] ** 2 + points[:, 2] ** 2
         return np.asarray((squared >= np.float32(_NEAREST_M**2)) & np.isfinite(squared))
 
 
-def _moved(
-    scan: Scan, kept: NDArray[np.bool_], at_ns: NDArray[np.int64], stamp_ns: int, T: Matrix, number: int
-) -> Scan:
+def _moved(scan: Scan, kept: Bools, at_ns: Longs, stamp_ns: int, T: Matrix, number: int) -> Scan:
     """The points `kept`, of the `number`-th further LiDAR, in the frame of the leading one, with times from `stamp_ns`."""
     from lslam.core.kernels.transform import transform
 

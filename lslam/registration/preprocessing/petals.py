@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
+from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import curvature, petals
 from lslam.registration.preprocessing.features import (
@@ -21,8 +21,6 @@ from lslam.registration.preprocessing.features import (
     gather_features,
 )
 from lslam.registration.preprocessing.prepare import gate_points
-
-Floats = NDArray[np.float64]
 
 # A line goes on over so many usual steps: one lost return is bridged where two prisms move the beam fastest.
 _GAP_STEPS = 4.0
@@ -104,7 +102,7 @@ def _brightness(scan: Scan, walk: RingWalk) -> Floats:
     return found if found.max() > found.min() else np.zeros(0)
 
 
-def _left_out(walk: RingWalk, brightness: Floats) -> NDArray[np.bool_]:
+def _left_out(walk: RingWalk, brightness: Floats) -> Bools:
     """Which points (K,) lie near the fringe of the view, or are too bright or too dark for a good range."""
     out = np.zeros(len(walk.order), np.bool_)
     if not len(out):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.kernels import voxel
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.registration.preprocessing.ground import above_ground, up_of
 from lslam.registration.preprocessing.weather_filter import on_surfaces
 
@@ -34,13 +35,13 @@ class PreparedPoints:
     """
 
     map_points: NDArray[np.float32]
-    source: NDArray[np.float64]
-    scatter: NDArray[np.float64]
+    source: Floats
+    scatter: Floats
     used: int
     map_times: NDArray[np.float32] | None = None
     source_times: NDArray[np.float32] | None = None
-    covariance: NDArray[np.float64] | None = None
-    gaps: NDArray[np.float64] | None = None
+    covariance: Floats | None = None
+    gaps: Floats | None = None
 
 
 def prepare_points(
@@ -77,7 +78,7 @@ def thin(points: PreparedPoints, step: int) -> PreparedPoints:
     return subset(points, slice(None, None, step))
 
 
-def subset(points: PreparedPoints, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> PreparedPoints:
+def subset(points: PreparedPoints, which: slice | Bools | Longs) -> PreparedPoints:
     """Some of the source points, or all in another order, with what goes with each; the map points stay."""
     times, covariance, gaps = points.source_times, points.covariance, points.gaps
     return replace(
@@ -107,7 +108,7 @@ def as_cloud(points: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(array[:, :3], np.float32)
 
 
-def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArray[np.int64]:
+def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> Longs:
     """Indices of the points (N, 3), m, that are finite, non-zero, within range and outside the ego box.
 
     With `remove_ground` and `denoise` also neither on the ground nor, among the rest, an outlier. Every method's points
@@ -123,7 +124,7 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> NDArra
     return kept
 
 
-def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, NDArray[np.float64]]:
+def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, Floats]:
     """Range gate and ego box as the kernels take them."""
     box = np.array(config.ego_box if config.ego_box is not None else (), np.float64)
     return config.range_min, config.range_max, config.range_shape == "cylinder", box

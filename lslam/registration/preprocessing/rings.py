@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import RINGS
 from lslam.core.errors import InputError, UsageError
+from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import ring_order
 from lslam.registration.preprocessing.beams import elevation_borders
 
 Kind = Literal["field", "rows", "order", "elevation"]
-Floats = NDArray[np.float64]
 
 FEWEST, MOST = 4, 300  # rings of any LiDAR that LOAM is meant for
 _USUAL_ROWS = (256, 192, 128, 96, 80, 64, 48, 40, 32, 20, 16)  # more first: half of the rows are rows as well

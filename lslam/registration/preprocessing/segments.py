@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import range_image
 from lslam.registration.preprocessing.features import (
@@ -46,7 +47,7 @@ class Segments:
     ground, for clusters that are too small, and for points outside the range gate
     """
 
-    ground: NDArray[np.bool_]
+    ground: Bools
     labels: NDArray[np.int32]
 
     @property
@@ -71,7 +72,7 @@ def lego_features(
     return features_along(scan, walk, config, allowed), segments
 
 
-def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: NDArray[np.float64]) -> Segments:
+def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: Floats) -> Segments:
     slopes = range_image.row_slopes(walk.points, walk.starts) * (1.0 if vertical[2] >= 0 else -1.0)
     known = np.flatnonzero(np.isfinite(slopes))
     row = np.zeros(len(slopes), np.int64)
@@ -94,8 +95,8 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: NDArray[n
 
 
 def _floor(
-    walk: RingWalk, lowest: NDArray[np.int64], vertical: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:  # fmt: skip
+    walk: RingWalk, lowest: Longs, vertical: Floats
+) -> tuple[Floats, float]:  # fmt: skip
     """The upward direction (3,) and the height of the dominant plane along it, m.
 
     It is looked for where the vehicle stands or the drone hovers: within a few times the range at which the `lowest` rings

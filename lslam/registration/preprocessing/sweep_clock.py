@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.types.arrays import Floats
 from lslam.registration.preprocessing.firing_order import follow_sweep
 
 Kind = Literal["columns", "order", "azimuth"]
-Floats = NDArray[np.float64]
 
 _FULL = 2 * np.pi
 # Share of a turn by which the first point of a scan may lie before the azimuth at which sweeps begin.

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
 from lslam.core.kernels import ground
+from lslam.core.types.arrays import Floats
 from lslam.registration.preprocessing.ground import CELL, Z, levelling
-
-Floats = NDArray[np.float64]
 
 # Cosine of 45 deg: within it z is close enough to up for everything that looks for the ground.
 NEAR_Z = float(np.cos(np.deg2rad(45.0)))

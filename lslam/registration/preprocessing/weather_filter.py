@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.kernels import voxel
+from lslam.core.types.arrays import Longs
 
 # The field of view of a spinning scanner, 360 x 45 deg. With a smaller one the test is more lenient.
 FIELD_OF_VIEW_SR = 4.8
@@ -21,9 +22,7 @@ CLEAR = 0.25
 MOSTLY = 0.5
 
 
-def on_surfaces(
-    centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf: float, least_line: float
-) -> NDArray[np.int64]:
+def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf: float, least_line: float) -> Longs:
     """Indices of the centroids (M, 3), m, LiDAR frame, of cells of edge `leaf`, m, that a surface may lie in.
 
     A drop occupies a cell of its own where a surface has many returns per cell: a tenth of the returns can be two thirds of
@@ -40,7 +39,7 @@ def on_surfaces(
     return np.arange(len(counts)) if is_clear or int(counts[kept].sum()) < MOSTLY * pulses else kept
 
 
-def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float) -> NDArray[np.int64]:
+def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float) -> Longs:
     """Indices of the points (N, 3), m, that are no outliers, increasing.
 
     As Rusu et al. (2008), with the counting of Open3D: a point's mean distance to its `neighbours` nearest, itself
