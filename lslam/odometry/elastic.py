@@ -16,8 +16,7 @@ from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.odometry.elastic_constraints import ElasticConstraints
-from lslam.odometry.elastic_sweep import ElasticSweep
+from lslam.odometry.elastic_constraints import ElasticConstraints, ElasticSweep
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import (
     LEAST_MATCHED,

@@ -11,10 +11,8 @@ from lslam.core.config.odometry import LoamConfig, RegistrationConfig
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.odometry.all_points import AllPoints
-from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, thinned
-from lslam.odometry.feature_scan import FeatureScan, feature_scan, surface_size
-from lslam.odometry.feature_solver import NONE, FeatureNoise, map_problem, remap_solution, solve_on_map
-from lslam.odometry.feature_steps import ScanStep
+from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, FeatureScan, feature_scan, surface_size, thinned
+from lslam.odometry.feature_solver import NONE, FeatureNoise, ScanStep, map_problem, remap_solution, solve_on_map
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
 from lslam.registration.optimiser import optimise

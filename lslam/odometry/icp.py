@@ -22,7 +22,7 @@ from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.keyframe_submap import KeyframeSubmap
 from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.registration.map_scans import make_map_scans
+from lslam.registration.local_map import make_map_scans
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration

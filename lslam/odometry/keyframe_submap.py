@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
-from lslam.registration.local_map import LocalMap
-from lslam.registration.map_scans import MapScans
+from lslam.registration.local_map import LocalMap, MapScans
 from lslam.registration.preprocessing.prepare import PreparedPoints
 
 # Median range beyond which keyframes stand so far apart, m, and how far they do where it is less.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from lslam.core.config.config import Config
 from lslam.core.types.scan import Scan
-from lslam.odometry.feature_steps import two_steps
+from lslam.odometry.feature_solver import two_steps
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.loam import Loam
 from lslam.registration.preprocessing.features import Features

@@ -19,11 +19,9 @@ from lslam.core.types.scan import LEVER_M, Scan
 from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
-from lslam.odometry.plane_association import associate
-from lslam.odometry.plane_factors import sighting_residuals
+from lslam.odometry.plane_factors import SHARED, sighting_residuals
 from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
-from lslam.odometry.plane_values import SHARED
-from lslam.odometry.plane_window import PlaneWindow
+from lslam.odometry.plane_window import PlaneWindow, associate
 from lslam.odometry.scan_outcome import recorded
 from lslam.registration.acceptance import correction
 from lslam.registration.preprocessing.deskew import deskew_points

@@ -14,7 +14,7 @@ from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.feature_policies import feature_policies
-from lslam.odometry.feature_steps import joint_step
+from lslam.odometry.feature_solver import joint_step
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty

@@ -1,4 +1,7 @@
-"""The record of a scan, from its registration or from that of a package."""
+"""The record of a scan, from its registration or from that of a package, and what every method is held to.
+
+Points that a LiDAR can measure go in, poses of a vehicle come out, whoever wrote the method.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.geometry import se3
+from lslam.core.geometry import se3, so3
+from lslam.core.kernels import voxel
 from lslam.core.types.arrays import Floats
-from lslam.core.types.scan import Scan
+from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.registration.acceptance import Acceptance, failed
 from lslam.registration.solver import RegistrationResult
@@ -48,3 +52,50 @@ def judged(
         pose = se3.normalise(found.T_world_lidar)
         result = limits.accepted(replace(found, T_world_lidar=pose, matched=found.inliers), T_prior)
     return recorded(scan, replace(result, stages=stages), None, None)
+
+
+# m/s and rad/s: trains and small aircraft are slower, and racing drones turn less. Over a shorter time than so many seconds a
+# registration may err by as much.
+FASTEST_M_S, FASTEST_RAD_S, LEAST_S = 150.0, 20.0, 0.1
+# Of R^T R: what float32 and rounding leave of a rotation is nearer.
+RIGID = 1e-3
+
+
+def measurable(scan: Scan) -> Scan:
+    """The scan with the points that are finite and within `FARTHEST_M`; itself where all of them are."""
+    if voxel.count_within(np.ascontiguousarray(scan.points, np.float32), FARTHEST_M) == len(scan):
+        return scan
+    # NaN is not smaller.
+    return scan.select(np.asarray((np.abs(scan.points) < FARTHEST_M).all(axis=1)))
+
+
+def fault(pose: Floats, stamp_ns: int, last: ScanResult | None) -> str:
+    """The reason why a pose (4, 4) at `stamp_ns` is none, or one that no vehicle reaches; empty where there is none.
+
+    last : the newest accepted result; a pose is tested by the time since then, so that a method which jumped once is
+        accepted again as soon as it may have got there
+    """
+    pose = np.asarray(pose)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        return "the pose is not finite"
+    if not so3.is_rotation(pose[:3, :3], RIGID) or not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
+        return "the pose is no rigid transform"
+    if last is None:
+        return ""
+    step = se3.relative(last.T_world_lidar, pose)
+    move, turn = float(np.linalg.norm(step[:3, 3])), float(so3.angle(step[:3, :3]))
+    seconds = (stamp_ns - last.stamp_ns) * 1e-9
+    if move <= FASTEST_M_S * max(seconds, LEAST_S) and turn <= FASTEST_RAD_S * max(seconds, LEAST_S):
+        return ""
+    return f"impossible jump of {move:.4g} m and {np.rad2deg(turn):.0f} deg since scan {last.index}, {seconds:.3g} s before"
+
+
+def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> ScanResult:
+    """The result, or one `bridged` by the motion prior (4, 4) where its pose has a `fault`."""
+    reason = fault(result.T_world_lidar, result.stamp_ns, last) if result.status == "ok" else ""
+    if not reason:
+        return result
+    return replace(
+        result, T_world_lidar=T_prior.copy(), status="bridged", reason=reason, converged=False, inliers=0, rmse=0.0,
+        overlap=0.0, covariance=None, registration_covariance=None,
+    )  # fmt: skip

@@ -41,7 +41,7 @@ from lslam.odometry.given import GivenPoses
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.odometry.inertial.smoothing import SmootherMotion
 from lslam.odometry.integrity.monitor import IntegrityMonitor
-from lslam.odometry.sanity import measurable
+from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.osm import wall_match
 from lslam.pipeline.job import PreparedRun

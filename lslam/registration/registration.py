@@ -22,7 +22,7 @@ from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
 from lslam.registration.policies import policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
-from lslam.registration.rest_detector import RestDetector
+from lslam.registration.rest import RestDetector
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import VoxelTarget

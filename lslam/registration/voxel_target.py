@@ -14,8 +14,7 @@ from lslam.core.types.arrays import Floats
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
-from lslam.registration.local_map import LocalMap
-from lslam.registration.map_scans import MapScans, make_map_scans
+from lslam.registration.local_map import LocalMap, MapScans, make_map_scans
 from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.beams import ring_gap
 from lslam.registration.preprocessing.prepare import PreparedPoints

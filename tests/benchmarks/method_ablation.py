@@ -23,7 +23,7 @@ from traced import Traced
 from lslam.core.geometry import se3
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.trajectory import Trajectory
-from lslam.odometry import elastic_constraints, lips, loam_livox, plane_association, plane_factors, plane_segmentation
+from lslam.odometry import elastic_constraints, lips, loam_livox, plane_factors, plane_segmentation, plane_window
 from lslam.odometry.elastic_constraints import NOTHING, LastSweep
 from lslam.odometry.inertial import imu_cleaning, saturation
 from lslam.odometry.inertial.course import Course
@@ -142,10 +142,10 @@ ABLATIONS = {
         {
             "LEAST_SHARE": ((lips, "LEAST_SHARE", 0.0),),
             "HUBER": ((plane_factors, "HUBER", 1e9),),
-            "GATE": ((plane_association, "GATE", 1e9),),
-            "ALIKE 20 deg": ((plane_association, "ALIKE", 0.94),),
-            "CLOSE 2 m": ((plane_association, "CLOSE", 2.0),),
-            "APART": ((plane_association, "APART", 1e9),),
+            "GATE": ((plane_window, "GATE", 1e9),),
+            "ALIKE 20 deg": ((plane_window, "ALIKE", 0.94),),
+            "CLOSE 2 m": ((plane_window, "CLOSE", 2.0),),
+            "APART": ((plane_window, "APART", 1e9),),
             "wide voxels": ((plane_segmentation.PlaneExtractor, "_regions", small_voxels_only),),
             "MIXED": ((plane_segmentation, "MIXED", 1e9),),
             "COMMON": ((lips, "PlaneExtractor", lambda: plane_segmentation.PlaneExtractor(common_m=0.0, common_rad=0.0)),),

@@ -29,7 +29,7 @@ from lslam.odometry import create_odometry, small_gicp
 from lslam.odometry import open3d as open3d_method
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.odometry.sanity import measurable
+from lslam.odometry.scan_outcome import measurable
 from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.preprocessing.rings import decide_rings
 

@@ -20,7 +20,7 @@ from lslam.io.formats.osm_files import read_osm
 from lslam.io.formats.point_files import read_cloud
 from lslam.io.formats.state_files import read_state
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 
 # What is appended to: a log, the lock, and rows of which a checkpoint says how many count.
 GROWING = ("log.txt", ".lock", *(f"checkpoint/{part}/" for part in ("map", "occupancy", "edges", "planes")))

@@ -28,12 +28,12 @@ from lslam.odometry.elastic_constraints import (
     LEAST_SKEW,
     MISS,
     ElasticConstraints,
+    ElasticSweep,
     LastSweep,
 )
-from lslam.odometry.elastic_sweep import ElasticSweep
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import begin_inertial
 from lslam.odometry.frontend.register_scans import estimate, read_ahead
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.config import load_config
 from lslam.core.geometry import se3, so3
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.odometry.deskew_uncertainty import DeskewUncertainty
-from lslam.odometry.uncertainty import PoseUncertainty
+from lslam.odometry.uncertainty import DeskewUncertainty, PoseUncertainty
 from lslam.pipeline.run import run
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate

@@ -104,9 +104,9 @@ def test_fast_lio2_resumes_to_the_last_bit(tmp_path: Path) -> None:
     """The states of the filter are part of the checkpoint; see `tests/odometry/frontend/test_resumable_state.py`."""
     from lslam.io.formats.state_files import read_state, write_state
     from lslam.odometry import create_odometry
+    from lslam.odometry.frontend.checkpoints import STATE_CLASSES
     from lslam.odometry.frontend.inertial_start import begin_inertial
     from lslam.odometry.frontend.register_scans import read_ahead
-    from lslam.odometry.frontend.state_classes import STATE_CLASSES
     from lslam.odometry.frontend.tracker import Tracker
 
     sequence, config = walk(16), config_of("fast-lio2")

@@ -15,10 +15,18 @@ from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
 from lslam.odometry.all_points import ALL_POINTS, FED
+from lslam.odometry.feature_map import feature_scan
 from lslam.odometry.feature_policies import LessPlanar, feature_policies
-from lslam.odometry.feature_scan import feature_scan
-from lslam.odometry.feature_solver import NONE, FeatureNoise, remap_solution, solve_on_scan
-from lslam.odometry.feature_steps import ScanStep, joint_step, two_steps, upright_directions
+from lslam.odometry.feature_solver import (
+    NONE,
+    FeatureNoise,
+    ScanStep,
+    joint_step,
+    remap_solution,
+    solve_on_scan,
+    two_steps,
+    upright_directions,
+)
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.registration.preprocessing.features import Features, extract_features
 from lslam.registration.registration import Registration

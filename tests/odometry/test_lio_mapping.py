@@ -18,9 +18,9 @@ from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.odometry.lio_mapping import LioMapping

@@ -24,9 +24,9 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.lio_sam import LioSam, LioSamOfPoints
 from lslam.pipeline import back_end_pass

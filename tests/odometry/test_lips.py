@@ -24,14 +24,14 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import Inertial, begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.linked_motion import LinkedMotion
 from lslam.odometry.lips import Lips
-from lslam.odometry.sanity import fault
+from lslam.odometry.scan_outcome import fault
 from lslam.simulation.scenarios import simulate
 
 COUNT = 20

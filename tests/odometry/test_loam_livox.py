@@ -21,8 +21,8 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import estimate
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.loam_livox import TRUST, joined, line_weights
 from lslam.registration.solver import RegistrationResult

@@ -11,11 +11,9 @@ from analytic_scenes import random_pose
 from lslam.core.geometry import se3
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry import closest_point, plane_window
-from lslam.odometry.plane_association import associate
-from lslam.odometry.plane_factors import sighting_residuals, step_residual
+from lslam.odometry.plane_factors import SHARED, STATE_SIZE, sighting_residuals, step_residual
 from lslam.odometry.plane_segmentation import Planes
-from lslam.odometry.plane_values import SHARED, STATE_SIZE
-from lslam.odometry.plane_window import PlaneWindow
+from lslam.odometry.plane_window import PlaneWindow, associate
 
 # A room round the way, in the world.
 WALLS = np.array([[0, 0, -1.7], [12, 0, 0.1], [-8, 0.3, 0], [0, 7, 0], [0.2, -6, 0]])

@@ -13,7 +13,7 @@ from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
 from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.sanity import measurable, plausible
+from lslam.odometry.scan_outcome import measurable, plausible
 
 Floats = NDArray[np.float64]
 PERIOD_NS = 100_000_000

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import UsageError
-from lslam.registration.map_scans import LastKeyframes
+from lslam.registration.local_map import LastKeyframes
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 

@@ -12,7 +12,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.rest_detector import RestDetector
+from lslam.registration.rest import RestDetector
 from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 

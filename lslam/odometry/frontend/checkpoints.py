@@ -10,14 +10,43 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core.errors import InputError
-from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.constraint import Constraint, LoopCandidate, MapFix
+from lslam.core.types.imu import (
+    GravityDirection,
+    ImuDiagnostics,
+    ImuState,
+    ImuStream,
+    InertialState,
+    InertialStep,
+    MotionState,
+    PreintegratedStep,
+)
+from lslam.core.types.scan_result import MotionCheck, ScanEquations, ScanResult
 from lslam.core.types.state import State
 from lslam.core.types.warned import warnings_so_far
 from lslam.io.formats.state_files import Records, read_state, write_state
 from lslam.odometry.base import Resumable
+from lslam.odometry.feature_map import FeatureScan
 from lslam.odometry.frontend.keyframing import Keyframing
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.windows import WindowTracker
+from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
+from lslam.odometry.inertial.initialise import InertialStart
+from lslam.odometry.inertial.navigation_state import NavigationState
+from lslam.odometry.inertial.window import Moment, Past, Window
+from lslam.odometry.integrity.monitor import Seen
+from lslam.odometry.plane_factors import Sightings, WindowPrior, WindowValues
+from lslam.odometry.plane_window import Landmarks, PlaneWindow
+from lslam.registration.preprocessing.features import FeaturePoints, Features
+from lslam.registration.preprocessing.prepare import PreparedPoints
+
+STATE_CLASSES = (
+    Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuDiagnostics, ImuNoise,
+    ImuState, ImuStream, InertialState, InertialStep, Landmarks, LoopCandidate, MapFix, Moment, MotionCheck, MotionState,
+    NavigationState, Past, PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings,
+    InertialStart, Window, WindowPrior, WindowValues,
+)  # fmt: skip
+
 
 log = logging.getLogger("lslam")
 

@@ -13,8 +13,8 @@ from lslam.core.config import Config
 from lslam.core.types.imu import SmootherNoise
 from lslam.odometry.inertial.filter import FilterMotion
 from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.odometry.inertial.gyroscope import ImuNoise
 from lslam.odometry.inertial.imu_estimate import GRAVITY_WALK
-from lslam.odometry.inertial.imu_noise import ImuNoise
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.linked_motion import LinkedMotion
 from lslam.odometry.inertial.smoothing import SmootherMotion

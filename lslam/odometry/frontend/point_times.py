@@ -1,8 +1,12 @@
-"""Times for the points of a recording: its own field, what is stated, or a clock that the agreement of scans decides on."""
+"""Times for the points of a recording: its own field, what is stated, or a clock that the agreement of scans decides on.
+
+Scans further on are asked whether that clock goes on to fit, and decide again where it does not.
+"""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +19,8 @@ from lslam.core.machine import one_at_a_time
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence, SequenceView, StatedTimes, select
 from lslam.odometry import create_odometry
-from lslam.odometry.frontend.clock_agreement import FEWEST_SCANS
-from lslam.odometry.frontend.clock_changes import later_choices
-from lslam.odometry.frontend.clock_choice import ClockChoice, choose_clock
+from lslam.odometry.frontend.clock_agreement import FEWEST_SCANS, ClockWindow, compare_clocks, read_window
+from lslam.odometry.frontend.clock_choice import TURNS, ClockChoice, choose_clock
 from lslam.registration.preprocessing.clock_proposals import (
     Proposal,
     azimuth_proposal,
@@ -26,7 +29,7 @@ from lslam.registration.preprocessing.clock_proposals import (
     propose_clock,
 )
 from lslam.registration.preprocessing.merged_lidars import MergedLidars
-from lslam.registration.preprocessing.sweep_clock import SweepClock
+from lslam.registration.preprocessing.sweep_clock import SweepClock, is_same_motion
 from lslam.registration.preprocessing.views import Clocked
 
 log = logging.getLogger("lslam")
@@ -162,3 +165,62 @@ def _samples(sequence: Sequence) -> list[Scan]:
         if scans and scans[0].times is not None:
             break
     return scans
+
+
+# Scans from one place that is asked to the next: ten times what is registered there.
+_EVERY = 400
+# Scans within which a change is found.
+_NEARLY = 4
+
+
+def later_choices(
+    sequence: Sequence, clock: SweepClock, decide: Callable[[int], ClockChoice], preprocess: PreprocessConfig
+) -> list[tuple[int, ClockChoice]]:
+    """The scans from which on another clock than the one before was chosen, and the choices.
+
+    clock : what the first scans chose; decide : the choice of the scans from this one on
+    """
+    later: list[tuple[int, ClockChoice]] = []
+    rivals = _candidates(clock)
+    now: SweepClock | None = clock
+    fitting = 0
+    for place in range(_EVERY, len(sequence) - FEWEST_SCANS + 1, _EVERY):
+        window = _refuting(sequence, place, now, rivals, preprocess)
+        if window is None:
+            fitting = place
+            continue
+        first = place
+        while first - fitting > _NEARLY:
+            middle = (fitting + first) // 2
+            if _refuting(sequence, middle, now, rivals, preprocess) is None:
+                fitting = middle
+            else:
+                first = middle
+        choice = decide(first)
+        if not _is_same(choice.clock, now, window.scans[0]):
+            later.append((first, choice))
+            now = choice.clock
+            rivals = rivals if now is None else _candidates(now)
+        fitting = place
+    return later
+
+
+def _is_same(a: SweepClock | None, b: SweepClock | None, sample: Scan) -> bool:
+    return a == b or (a is not None and b is not None and is_same_motion(a, b, sample.points))
+
+
+def _candidates(clock: SweepClock) -> tuple[SweepClock | None, ...]:
+    turned = (replace(clock, turn=(clock.turn + turn) % 1.0) for turn in TURNS)
+    return None, clock, replace(clock, is_reversed=not clock.is_reversed), *turned
+
+
+def _refuting(
+    sequence: Sequence, first: int, clock: SweepClock | None, rivals: tuple[SweepClock | None, ...],
+    preprocess: PreprocessConfig,
+) -> ClockWindow | None:  # fmt: skip
+    """The scans from `first` on where they agree beyond doubt better under a rival of the clock; else None."""
+    window = read_window(sequence, first, preprocess)
+    if window is None or not window.is_moving or window.is_astray(None) or window.is_astray(clock):
+        return None
+    others = [rival for rival in rivals if rival != clock]
+    return window if any(compare_clocks([window], rival, clock).is_clear for rival in others) else None

@@ -30,7 +30,7 @@ from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.frontend.windows import WindowTracker
 from lslam.odometry.inertial.constant_velocity import MotionModel
 from lslam.odometry.integrity.monitor import IntegrityMonitor
-from lslam.odometry.sanity import measurable
+from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 

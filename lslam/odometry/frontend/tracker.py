@@ -17,7 +17,7 @@ from lslam.core.types.state import State
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.frontend import joint
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
-from lslam.odometry.sanity import fault, plausible
+from lslam.odometry.scan_outcome import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.solver import RegistrationResult
 

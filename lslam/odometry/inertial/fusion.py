@@ -15,11 +15,10 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
-from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
 from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
-from lslam.odometry.inertial.kalman import surprise
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import apart, vector_between
 from lslam.registration.preprocessing.deskew import knots_over
@@ -123,7 +122,7 @@ class InertialMotion(Stateful):
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ vector_between(R_felt, end[:3, :3])])
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
-        if surprise(rest, P + 2 * C) > 1:
+        if float(kalman.square(rest, P + 2 * C)) / (len(rest) * OUTLIER**2) > 1:
             return self._rejected(stamp_ns, result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.

@@ -13,9 +13,8 @@ import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuState, ImuStream
-from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
-from lslam.odometry.inertial.kalman import OUTLIER
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import vector_between
 

@@ -11,10 +11,9 @@ from lslam.core.config.odometry import ImuConfig
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
-from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
 from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, GRAVITY, ImuEstimate
-from lslam.odometry.inertial.imu_noise import ImuNoise
 
 # Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02

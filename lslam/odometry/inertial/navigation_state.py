@@ -12,11 +12,10 @@ import numpy as np
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
-from lslam.odometry.inertial.gyroscope import MOUNTING, OFFSET_WALK, Gyroscope
+from lslam.odometry.inertial.gyroscope import MOUNTING, OFFSET_WALK, OUTLIER, USUAL_NOISE, Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
-from lslam.odometry.inertial.imu_noise import USUAL, ImuNoise
 from lslam.odometry.inertial.integrate import Increments
-from lslam.odometry.inertial.kalman import update
+from lslam.odometry.kernels import kalman
 
 PLACE, TURN, SPEED, DOWN, FORCE = (slice(3 * k, 3 * k + 3) for k in range(5))
 POSE, REST, GYRO = slice(0, 6), slice(6, 15), slice(15, 27)
@@ -55,7 +54,7 @@ def transition(step: Increments, R: Floats, R_end: Floats, gyroscope: Gyroscope)
     return F
 
 
-def process_noise(t: float, rate_variance: float, noise: ImuNoise = USUAL) -> Floats:
+def process_noise(t: float, rate_variance: float, noise: ImuNoise = USUAL_NOISE) -> Floats:
     """(27, 27) that `t` seconds add; rate_variance : (rad/s)^2 per Hz of the gyroscope."""
     Q = np.zeros((SIZE, SIZE))
     force = noise.force**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
@@ -153,7 +152,8 @@ class NavigationState:
         size = len(self.covariance)
         H = np.zeros((1, size))
         H[0, DOWN] = self.estimate.gravity / norm
-        x, P = update(np.zeros(size), self.covariance, H, np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]]))
+        rest, noise = np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]])
+        x, P = kalman.update(np.zeros(size), self.covariance, H, rest, noise, OUTLIER)
         return self._shifted(x, P)
 
     def _shared(self) -> NavigationState:

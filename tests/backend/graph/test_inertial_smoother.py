@@ -14,7 +14,7 @@ from lslam.core.errors import GraphError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import InertialState, InertialStep, SmootherNoise
 from lslam.io.formats.state_files import read_state, write_state
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 
 Floats = NDArray[np.float64]
 

@@ -16,9 +16,8 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import SequenceView, StatedTimes
-from lslam.odometry.frontend.clock_changes import later_choices
 from lslam.odometry.frontend.clock_choice import ClockChoice
-from lslam.odometry.frontend.point_times import with_point_times
+from lslam.odometry.frontend.point_times import later_choices, with_point_times
 from lslam.registration.preprocessing.clock_proposals import Proposal
 from lslam.registration.preprocessing.merged_lidars import MergedLidars
 from lslam.registration.preprocessing.sweep_clock import SweepClock
@@ -215,7 +214,7 @@ def test_a_clock_that_no_longer_fits_is_decided_again_from_there(monkeypatch: py
         right = next(clock for end, clock in true if first + 5 < end)
         return ClockChoice(right, "clear", "")
 
-    monkeypatch.setattr("lslam.odometry.frontend.clock_changes.read_window", read)
+    monkeypatch.setattr("lslam.odometry.frontend.point_times.read_window", read)
     later = later_choices(range(3000), clock, decide, PREPROCESS)  # type: ignore[arg-type]
     assert [choice.clock for _, choice in later] == [None, reverse, elsewhere]
     assert [first for first, _ in later] == pytest.approx([950, 1700, 2300], abs=8)

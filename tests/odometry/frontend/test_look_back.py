@@ -22,12 +22,11 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Deskewing
-from lslam.odometry.frontend.look_back import first_pose
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.frontend.windows import WINDOW, WindowTracker
+from lslam.odometry.frontend.windows import WINDOW, WindowTracker, first_pose
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate

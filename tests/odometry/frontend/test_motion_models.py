@@ -13,7 +13,7 @@ from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.core.geometry import so3
 from lslam.core.types.imu import ImuStream
 from lslam.odometry import METHODS
-from lslam.odometry.frontend.inertial_calibration import mounting_problem
+from lslam.odometry.frontend.inertial_start import mounting_problem
 from lslam.odometry.frontend.motion_models import MOTION_MODELS, motion_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import AXES_SIGMA, Gyroscope

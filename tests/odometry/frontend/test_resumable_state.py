@@ -19,9 +19,9 @@ from lslam.core.types.sequence import Sequence
 from lslam.io.formats.state_files import Records, read_state, write_state
 from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.base import Resumable
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import Inertial, begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.stationary import StationaryDetector

@@ -18,9 +18,9 @@ from lslam.core.config import Config, load_config
 from lslam.core.geometry import se3, so3
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
+from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.state_classes import STATE_CLASSES
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.frontend.windows import WINDOW, WindowTracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity

@@ -12,9 +12,8 @@ from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanEquations
-from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
 from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
-from lslam.odometry.inertial.imu_noise import USUAL
 from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA, SIZE, NavigationState
 from lslam.odometry.inertial.window import (
     EACH,
@@ -93,7 +92,7 @@ def test_increments_agree_with_the_truth() -> None:
 
 def test_jacobians_are_derivatives() -> None:
     imu, (a, b) = stream(), disturbed(true_window(2)).moments
-    window = Window((a, b), DOWN, np.eye(3) + 0.01, 1e-6, USUAL, true_window(1).past)
+    window = Window((a, b), DOWN, np.eye(3) + 0.01, 1e-6, USUAL_NOISE, true_window(1).past)
     _, J = window.residual(a, b, imu)
     numerical = np.zeros_like(J)
     step = 1e-6

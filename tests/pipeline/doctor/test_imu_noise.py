@@ -9,7 +9,7 @@ import pytest
 
 from lslam.core.config import load_config
 from lslam.core.types.imu import ImuStream
-from lslam.odometry.inertial.imu_noise import USUAL, ImuNoise
+from lslam.odometry.inertial.gyroscope import USUAL_NOISE, ImuNoise
 from lslam.pipeline.doctor.examine_imu import allan_deviation, examine_noise, imu_toml
 from lslam.simulation.imu import GRAVITY, Triad, measure
 
@@ -75,7 +75,9 @@ def test_what_is_written_is_a_configuration_that_the_filters_take(tmp_path: Path
     moving = examine_noise(device(30, is_moving=True))
     assert moving is not None
     path.write_text(imu_toml(moving, "drive"))
-    assert ImuNoise.of(load_config(path, [], {}).imu).accel_walk == USUAL.accel_walk, "what is not seen stays as it is"
+    assert ImuNoise.of(load_config(path, [], {}).imu).accel_walk == USUAL_NOISE.accel_walk, (
+        "what is not seen stays as it is"
+    )
 
 
 def test_short_streams_and_streams_of_unknown_unit_have_no_noise_estimate() -> None:
