@@ -33,10 +33,12 @@ def first_pose(decided: list[Tracked], initial_scans: int, create: Callable[[], 
 
     create : makes the method with an empty map
     The pose stays where fewer than `initial_scans` later ones make a map, that does not hold the first in all directions, or an
-    initial one was not registered, or taken at rest: their poses are one.
+    initial one was not registered, or taken at rest: their poses are one. So it does where a smoother links each scan to the one
+    before.
     """
     first, later = decided[0], [k for k in range(initial_scans, len(decided)) if _is_placed(decided[k])]
-    if len(later) < initial_scans or not all(_is_placed(tracked) for tracked in decided[:initial_scans]):
+    is_linked = any(tracked.sweep.link is not None for tracked in decided)
+    if is_linked or len(later) < initial_scans or not all(_is_placed(tracked) for tracked in decided[:initial_scans]):
         return first.result.T_world_lidar
     priors, empty, target = _priors(decided), create(), create()
     # Backwards, so that a map of the last scans alone has the nearest ones.

@@ -16,6 +16,7 @@ from stub_sequences import Stub
 
 from lslam.core.config import Config, load_config
 from lslam.core.geometry import se3, so3
+from lslam.core.types.imu import MotionState, SweepLink
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -143,6 +144,13 @@ def test_it_stays_where_the_first_scans_are_not_one_registered_drive(change: dic
 
 def test_it_stays_where_too_few_scans_follow() -> None:
     run = off_by_5_cm()[: 2 * FIRST - 1]
+    assert first_pose(run, FIRST, create) is run[0].result.T_world_lidar
+
+
+def test_it_stays_where_a_smoother_links_each_scan_to_the_one_before() -> None:
+    run = off_by_5_cm()
+    state = MotionState(np.eye(4), *np.zeros((4, 3)), np.eye(3), np.eye(27))
+    run[3] = replace(run[3], sweep=replace(run[3].sweep, link=SweepLink(np.eye(4), np.eye(4), state)))
     assert first_pose(run, FIRST, create) is run[0].result.T_world_lidar
 
 
