@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lslam.core.config.config import Config
@@ -18,7 +17,7 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.state import State, Stateful
+from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
 from lslam.registration.optimiser import STEP_M, STEP_RAD
@@ -32,11 +31,15 @@ X84 = 5.2
 
 @dataclass(frozen=True)
 class Partners:
-    """The last scan that was registered: its points (M, 3), m, in its own LiDAR frame, their tree, and its pose."""
+    """The last scan that was registered: its points (M, 3), m, in its own LiDAR frame, and its pose."""
 
     points: Floats
-    tree: cKDTree
     T_world_lidar: Floats
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Of the points, to be asked for neighbours."""
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
 def create(config: Config) -> IcpSvd:
@@ -51,6 +54,8 @@ class IcpSvd(Traits, Stateful):
     not accepted; it gives no covariance. It follows the sensor's start only when that is slow, and on sparse rings it lags:
     a ring's nearest neighbour is the ring of the scan before. Trimming makes that worse.
     """
+
+    STATE = ("_last", "_failed")
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess, self._config = preprocess, registration
@@ -76,30 +81,14 @@ class IcpSvd(Traits, Stateful):
         result = judged(scan, found, prior.pose, c, {})
         self._failed = 0 if result.status == "ok" else self._failed + 1
         if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
-            self._last = as_partners(prepared.map_points, result.T_world_lidar)
+            self._last = Partners(prepared.map_points.astype(np.float64), result.T_world_lidar)
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
         return result
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here; the tree grows again from its points."""
-        last = self._last
-        return {"last": None if last is None else (last.points, last.T_world_lidar), "failed": self._failed}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        self._last = None if state["last"] is None else as_partners(*state["last"])
-        self._failed = state["failed"]
 
     def warm_up(self) -> None:
         """Compile or load the kernels of preprocessing."""
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
         self.prepare(Scan(room, 0, 0))
-
-
-def as_partners(points: NDArray[Any], T_world_lidar: Floats) -> Partners:
-    """Points (M, 3), m, LiDAR frame, ready to be asked for neighbours."""
-    cloud = points.astype(np.float64)
-    return Partners(cloud, cKDTree(cloud, balanced_tree=False, compact_nodes=False), T_world_lidar)
 
 
 def align_closed_form(

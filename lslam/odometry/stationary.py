@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lslam.core.config.input import PreprocessConfig
@@ -12,7 +10,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.state import State, Stateful
+from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
@@ -26,14 +24,6 @@ MATCHED, AGREEING = 0.3, 0.7
 LIMITS = Acceptance(MATCHED, AGREEING, needs_covariance=True, needs_all_directions=True)
 
 
-@dataclass(frozen=True)
-class ReferenceScan:
-    """The reference scan: its planes, and the pose of its own points on them after one step."""
-
-    planes: GaussianMap
-    T_own: Floats
-
-
 class StationaryDetector(Stateful):
     """Tests scans against the last registered one, the reference.
 
@@ -43,16 +33,25 @@ class StationaryDetector(Stateful):
     inliers is not stationary.
     """
 
+    STATE = ("_planes", "_T_own", "_last")
+
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess = preprocess
         self._config = registration.model_copy(update={"blob_weight": 0.0})
         self._limit_m, self._limit_rad = preprocess.standing_m, float(np.deg2rad(preprocess.standing_deg))
-        self._reference: ReferenceScan | None = None
+        c = self._config
+        # Of the reference, in voxels as coarse as those of a map's first scans: a ring is no plane.
+        self._planes = GaussianMap(
+            c.voxel_size * c.coarse_factor, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
+            reach=1.2 * preprocess.range_max,
+        )  # fmt: skip
+        # The pose of its own points on them after one step; None: there is no reference.
+        self._T_own: Floats | None = None
         self._last: ScanResult | None = None
 
     def result_of(self, scan: Scan) -> ScanResult | None:
         """The result of a stationary scan: pose and covariance of the reference; None when the sensor has moved."""
-        if self._reference is None or self._last is None or not self._is_stationary(scan, self._reference):
+        if self._last is None or not self._is_stationary(scan):
             return None
         return ScanResult(
             scan.index, scan.stamp_ns, self._last.T_world_lidar.copy(),
@@ -63,61 +62,45 @@ class StationaryDetector(Stateful):
 
     def observe(self, scan: Scan, result: ScanResult) -> None:
         """Take a registered scan as the reference if the sensor was slow."""
+        self._T_own = None
         if result.status != "ok":
-            self._reference = None
             return
         before, self._last = self._last, result
         step = np.eye(4) if before is None else se3.relative(before.T_world_lidar, result.T_world_lidar)
         turn = float(np.rad2deg(so3.angle(step[:3, :3])))
         is_slow = float(np.linalg.norm(step[:3, 3])) < SLOW_M and turn < SLOW_DEG
-        self._reference = self._reference_of(scan) if is_slow else None
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here."""
-        reference = self._reference
-        of_it = None if reference is None else {"planes": reference.planes.state(), "T_own": reference.T_own}
-        return {"reference": of_it, "last": self._last}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        of_it, self._last = state["reference"], state["last"]
-        self._reference = None
-        if of_it is not None:
-            self._reference = ReferenceScan(self._new_planes(), of_it["T_own"])
-            self._reference.planes.restore(of_it["planes"])
+        if is_slow:
+            self._refer_to(scan)
 
     def warm_up(self) -> None:
         """Compile or load the kernels with a small room."""
         room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
         room[:, 2] = np.where(room[:, 2] > 0, 8.0, -8.0)
         scan = Scan(room, 0, 0)
-        self._is_stationary(scan, self._reference_of(scan))
+        trial = StationaryDetector(self._preprocess, self._config)
+        trial._refer_to(scan)
+        trial._is_stationary(scan)
 
-    def _reference_of(self, scan: Scan) -> ReferenceScan:
-        """Planes of one scan alone. Its voxels are coarse, as those of a map's first scans: a ring is no plane."""
-        planes = self._new_planes()
+    def _refer_to(self, scan: Scan) -> None:
+        """Planes of one scan alone."""
         points = prepare_points(scan.points, self._preprocess, scan.index)
-        planes.insert(points.map_points, np.eye(4))
-        return ReferenceScan(planes, self._step(points, planes).T_world_lidar)
+        self._planes.clear()
+        self._planes.insert(points.map_points, np.eye(4))
+        self._T_own = self._step(points).T_world_lidar
 
-    def _new_planes(self) -> GaussianMap:
-        c = self._config
-        return GaussianMap(
-            c.voxel_size * c.coarse_factor, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
-            reach=1.2 * self._preprocess.range_max,
-        )  # fmt: skip
-
-    def _step(self, points: PreparedPoints, planes: GaussianMap) -> RegistrationResult:
+    def _step(self, points: PreparedPoints) -> RegistrationResult:
         c = self._config
         once = Annealing(c.kernel_max, c.kernel_max, c.kernel_decay, 1)
-        return solve((planes,), points, np.eye(4), once, c)
+        return solve((self._planes,), points, np.eye(4), once, c)
 
-    def _is_stationary(self, scan: Scan, reference: ReferenceScan) -> bool:
-        found = self._step(prepare_points(scan.points, self._preprocess, scan.index), reference.planes)
-        C = found.covariance
-        if C is None or LIMITS.rejection(found) is not None:
+    def _is_stationary(self, scan: Scan) -> bool:
+        if self._T_own is None:
+            return False
+        result = self._step(prepare_points(scan.points, self._preprocess, scan.index))
+        C = result.covariance
+        if C is None or LIMITS.rejection(result) is not None:
             return False
         if np.trace(C[:3, :3]) > self._limit_m**2 or np.trace(C[3:, 3:]) > self._limit_rad**2:
             return False
-        moved = se3.relative(reference.T_own, found.T_world_lidar)
+        moved = se3.relative(self._T_own, result.T_world_lidar)
         return float(np.linalg.norm(moved[:3, 3])) < self._limit_m and float(so3.angle(moved[:3, :3])) < self._limit_rad

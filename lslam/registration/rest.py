@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Longs
-from lslam.core.types.state import State, Stateful
+from lslam.core.types.state import Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR
 from lslam.registration.local_map import BREADTH
@@ -172,6 +172,7 @@ class Rest(Stateful):
     """
 
     STATE = ("scans", "T_world_lidar", "_cloud", "_squares")
+    CLEARED = ("_walls",)
 
     def __init__(self, preprocess: PreprocessConfig, sigma: float, voxel_size: float) -> None:
         self.preprocess, self.sigma, self.voxel_size, self.scans = preprocess, sigma, voxel_size, 0
@@ -206,11 +207,6 @@ class Rest(Stateful):
         else:
             self._cloud, self.T_world_lidar, self._walls = cloud, T_world_lidar.copy(), None
             self.scans, self._squares = 1, 0.0
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        super().restore(state)
-        self._walls = None
 
     def votes(self, cloud: NDArray[np.float32], T_world_lidar: Floats) -> Votes:
         """Of a scan (N, 3) for the spot, and for the pose (4, 4)."""

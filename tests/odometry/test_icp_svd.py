@@ -16,7 +16,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.odometry.frontend.register_scans import estimate
-from lslam.odometry.icp_svd import align_closed_form, as_partners, create, keep_pairs
+from lslam.odometry.icp_svd import Partners, align_closed_form, create, keep_pairs
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -34,8 +34,8 @@ def test_one_round_is_the_least_squares_solution_of_scipy(seed: int) -> None:
     target = scattered(rng).astype(np.float32)
     true = random_pose(rng, 0.3, 2.0)
     source = se3.apply(se3.inverse(true), target) + rng.normal(0, 0.02, target.shape)
-    found = align_closed_form(source, as_partners(target, np.eye(4)), np.eye(4), inlier_distance=5.0, max_iterations=1)
     world = target.astype(np.float64)
+    found = align_closed_form(source, Partners(world, np.eye(4)), np.eye(4), inlier_distance=5.0, max_iterations=1)
     rotation, _ = Rotation.align_vectors(world - world.mean(0), source - source.mean(0))
     R = rotation.as_matrix()
     expected = se3.make(R, world.mean(0) - R @ source.mean(0))
@@ -49,7 +49,7 @@ def test_a_known_motion_is_found_in_any_world(seed: int) -> None:
     target = scattered(rng).astype(np.float32)
     at, true = random_pose(rng, 50, 180), random_pose(rng, 0.4, 2.0)
     source = se3.apply(se3.inverse(true), target)
-    found = align_closed_form(source, as_partners(target, at), at)
+    found = align_closed_form(source, Partners(target.astype(np.float64), at), at)
     np.testing.assert_allclose(found.T_world_lidar, at @ true, atol=1e-6)
     assert found.converged
     assert found.rmse < 1e-5
@@ -58,7 +58,7 @@ def test_a_known_motion_is_found_in_any_world(seed: int) -> None:
 def test_a_room_sampled_anew_is_found() -> None:
     rng = np.random.default_rng(0)
     true = random_pose(rng, 0.3, 3.0)
-    partners = as_partners(seen_from(room(rng, 3000), np.eye(4)), np.eye(4))
+    partners = Partners(seen_from(room(rng, 3000), np.eye(4)).astype(np.float64), np.eye(4))
     source = seen_from(room(rng, 1500), true).astype(np.float64)
     found = align_closed_form(source, partners, np.eye(4), max_iterations=100)
     metres, degrees = distance(found.T_world_lidar, true)
@@ -74,7 +74,7 @@ def test_trimming_and_the_distance_leave_outliers_out() -> None:
     source = se3.apply(se3.inverse(true), target)
     # A bus that drove on: a third of the points moved 1.6 m, still nearest to where they were.
     source[:66] += [0.0, 0.0, 1.6]
-    partners = as_partners(target, np.eye(4))
+    partners = Partners(target.astype(np.float64), np.eye(4))
     options: tuple[dict[str, Any], ...] = ({"inlier_ratio": 0.6, "inlier_distance": 9.0}, {"inlier_distance": 1.0}, {})
     for option in options:
         found = align_closed_form(source, partners, np.eye(4), **option)
@@ -96,7 +96,7 @@ def test_pairs_are_kept_nearest_first_and_deterministically() -> None:
 def test_without_partners_or_on_a_line_the_prior_stays() -> None:
     prior = random_pose(np.random.default_rng(2), 1.0, 5.0)
     line = np.column_stack([np.arange(50.0), np.zeros((50, 2))])
-    partners = as_partners(line.astype(np.float32), np.eye(4))
+    partners = Partners(line, np.eye(4))
     for source, option in ((line + 500.0, {"inlier_distance": 1.0}), (line, {})):
         found = align_closed_form(source, partners, prior, **option)
         np.testing.assert_array_equal(found.T_world_lidar, prior)

@@ -16,7 +16,7 @@ from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import InertialState, InertialStep, SmootherNoise
-from lslam.core.types.state import State
+from lslam.core.types.state import State, Stateful
 from lslam.io.formats.state_files import Records
 
 GRAVITY_KEY = 1 << 40
@@ -24,7 +24,7 @@ GRAVITY_KEY = 1 << 40
 POSE, SPEED, BIASES, DOWN = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18)
 
 
-class InertialSmoother:
+class InertialSmoother(Stateful):
     """The newest state after each step, from all steps since the graph began; it begins anew after `reset` of them.
 
     A new graph begins with the joint marginal of the newest state as its prior, as in the paper's implementation, which takes

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.types.arrays import Points
+from lslam.core.types.state import Stateful
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import pack_npz, read_npz, write_npz
 
@@ -22,7 +23,7 @@ INDEX = "index.npz"
 CACHED = 32
 
 
-class KeyframeStore:
+class KeyframeStore(Stateful):
     """Keyframes in order; their clouds in a folder, the last used ones in memory.
 
     The folder holds `index.npz`, everything but the clouds, once `save` was called, and `000000.npz`, `000001.npz`, ...

@@ -29,6 +29,7 @@ from lslam.odometry.base import Resumable
 from lslam.odometry.feature_map import FeatureScan
 from lslam.odometry.frontend.keyframing import Keyframing
 from lslam.odometry.frontend.windows import WindowTracker
+from lslam.odometry.icp_svd import Partners
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.initialise import InertialStart
@@ -43,7 +44,7 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuDiagnostics, ImuNoise,
     ImuState, ImuStream, InertialState, InertialStep, Landmarks, LoopCandidate, MapFix, Moment, MotionCheck, MotionState,
-    NavigationState, Past, PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings,
+    NavigationState, Partners, Past, PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings,
     InertialStart, Window, WindowPrior, WindowValues,
 )  # fmt: skip
 

@@ -13,7 +13,7 @@ from lslam.core.config import Config
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.state import State
+from lslam.core.types.state import State, Stateful
 from lslam.core.types.trajectory import Keyframe
 
 # Scans that wait for their cloud at most, so that a slow disk does not fill the memory.
@@ -26,12 +26,14 @@ class _Due:
     scan: Scan
 
 
-class Keyframing:
+class Keyframing(Stateful):
     """Feeds the store with the scans that become keyframes, whatever the method.
 
     A scan registered before the speed was known takes the motion within its sweep from the first scan that knows it.
     `threads` below 2 does everything at once. To be closed, which waits for what is on its way: a `with` block does.
     """
+
+    STATE = ("store", "_selector")
 
     def __init__(self, store: KeyframeStore, config: Config) -> None:
         self.store = store
@@ -71,12 +73,7 @@ class Keyframing:
     def state(self) -> State:
         """What `restore` needs to go on from here; waits for the clouds on their way."""
         self._wait(0)
-        return {"selector": self._selector.state(), "store": self.store.state()}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken; raises InputError when a cloud is missing."""
-        self.store.restore(state["store"])
-        self._selector.restore(state["selector"])
+        return super().state()
 
     def __enter__(self) -> Keyframing:
         """Nothing to begin."""

@@ -10,7 +10,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.state import State
+from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Odometry
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
@@ -44,7 +44,7 @@ class Tracked:
         return self.moved(pose @ se3.inverse(self.result.T_world_lidar))
 
 
-class SegmentTracker:
+class SegmentTracker(Stateful):
     """Tracks the scans of a run, each segment of them in a local map of its own.
 
     A scan that is not registered is a bad one, or the map ends before it. Both hypotheses are followed: a second tracker begins
@@ -54,6 +54,8 @@ class SegmentTracker:
 
     begin : None for a method that has one map only; initial_scans : that initialise a map
     """
+
+    STATE = ("_tracker", "_segment", "_usual")
 
     def __init__(self, tracker: Tracker, begin: Begin | None = None, initial_scans: int = 5) -> None:
         self._tracker, self._begin, self.initial_scans = tracker, begin, initial_scans
@@ -124,14 +126,9 @@ class SegmentTracker:
         """Whether nothing waits for the next scan, so that `state` is complete."""
         return self._other is None and self._tracker.is_settled
 
-    def state(self) -> State:
-        """What `restore` needs to go on from here."""
-        return {**self._tracker.state(), "segment": self._segment, "usual": self._usual.usual}
-
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
-        self._tracker.restore(state)
-        self._segment, self._usual.usual = int(state["segment"]), float(state["usual"])
+        super().restore(state)
         self._other, self._open = None, []
 
     def _new_segment(self) -> list[Tracked]:

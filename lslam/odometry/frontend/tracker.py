@@ -12,8 +12,9 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
-from lslam.core.types.scan_result import ScanResult, StageClock, Status
-from lslam.core.types.state import State
+from lslam.core.types.scan_result import ScanResult, Status
+from lslam.core.types.scan_result import StageClock
+from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.frontend import joint
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
@@ -40,7 +41,7 @@ class Loaded:
     status: Status = "skipped"
 
 
-class Tracker:
+class Tracker(Stateful):
     """Poses of scans, one after the other.
 
     sweep : motion of the sensor within the last scan, as used by its registration
@@ -49,6 +50,7 @@ class Tracker:
 
     # A change of the motion within the sweep that moves no point by more is not worth a second registration.
     REFINE_M = 0.01
+    STATE = ("motion", "stationary", "middle", "_last")
 
     def __init__(
         self, odometry: Odometry, stationary: StationaryDetector | None = None, motion: MotionModel | None = None
@@ -113,22 +115,13 @@ class Tracker:
 
     def state(self) -> State:
         """What `restore` needs to go on from here; of a method that is not `Resumable`, only what is around it."""
-        return {
-            "odometry": self.odometry.state() if isinstance(self.odometry, Resumable) else None,
-            "motion": self.motion.state(),
-            "stationary": None if self.stationary is None else self.stationary.state(),
-            "middle": self.middle,
-            "last": self._last,
-        }
+        return {**super().state(), "odometry": self.odometry.state() if isinstance(self.odometry, Resumable) else None}
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         if isinstance(self.odometry, Resumable) and state["odometry"] is not None:
             self.odometry.restore(state["odometry"])
-        self.motion.restore(state["motion"])
-        if self.stationary is not None:
-            self.stationary.restore(state["stationary"])
-        self.middle, self._last = state["middle"], state["last"]
+        super().restore(state)
 
     def _standing(self, scan: Scan | None, clock: StageClock) -> ScanResult | None:
         """The result of a scan taken while the sensor stood; None where it has moved."""

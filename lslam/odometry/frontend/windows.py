@@ -15,7 +15,7 @@ import numpy as np
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.core.types.state import State
+from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
 from lslam.odometry.frontend.tracker import Loaded
@@ -79,7 +79,7 @@ def _is_placed(tracked: Tracked) -> bool:
 WINDOW = 20
 
 
-class WindowTracker:
+class WindowTracker(Stateful):
     """Tracks scans window by window where their method follows a course and their sweeps take time, and others as they come.
 
     A window is tracked with constant velocity first. Where its points are displaced by more than their noise, it is tracked
@@ -90,6 +90,8 @@ class WindowTracker:
 
     monitor : sees the scans that are decided; noise_m : of a point
     """
+
+    STATE = ("_tracker", "_before", "_world", "_monitor")
 
     def __init__(self, tracker: SegmentTracker, monitor: IntegrityMonitor | None, noise_m: float) -> None:
         self._tracker, self._monitor, self._noise_m = tracker, monitor, noise_m
@@ -143,17 +145,8 @@ class WindowTracker:
             yield self._close() if is_full or loaded is None else []
 
     def state(self) -> State:
-        """What `restore` needs to go on from here."""
-        state = self._start if self._scans else self._tracker.state()
-        monitor = None if self._monitor is None else self._monitor.state()
-        return {**state, "before": self._before, "world": self._world, "monitor": monitor}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        self._tracker.restore(state)
-        self._before, self._world = list(state["before"]), state["world"]
-        if self._monitor is not None:
-            self._monitor.restore(state["monitor"])
+        """What `restore` needs to go on from where the open window begins."""
+        return {**super().state(), **({"_tracker": self._start} if self._scans else {})}
 
     def _is_begin(self, loaded: Loaded | None) -> bool:
         """Whether a window begins with the scan."""

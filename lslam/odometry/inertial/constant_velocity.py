@@ -99,6 +99,7 @@ class ConstantVelocity(Stateful, MotionModel):
     # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
     MAX_ACCELERATION = 20.0
     STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_seen")
+    CLEARED = ("_predicted",)
 
     def __init__(self, pose: Floats | None = None) -> None:
         self._instant_ns: int | None = None
@@ -170,11 +171,6 @@ class ConstantVelocity(Stateful, MotionModel):
             if step > 0:
                 self._learn(se3.log(se3.relative(self._pose, middle)) / step, step)
         self._instant_ns, self._pose = instant_ns, middle.copy()
-        self._predicted = None
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        super().restore(state)
         self._predicted = None
 
     def _learn(self, velocity: Floats, step: float) -> None:

@@ -42,6 +42,7 @@ class InertialMotion(Stateful):
     STATE: ClassVar[tuple[str, ...]] = (
         "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
     )  # fmt: skip
+    CLEARED: ClassVar[tuple[str, ...]] = ("_taught", "_felt", "_expected")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
@@ -223,7 +224,6 @@ class InertialMotion(Stateful):
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         super().restore(state)
-        self._taught = self._felt = self._expected = None
         self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
 
     def turn(self, begin_ns: int, end_ns: int) -> Floats | None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
+from lslam.backend.graph.inertial_smoother import InertialSmoother
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
@@ -16,7 +17,6 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuStream, InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
-from lslam.core.types.state import State
 from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
@@ -30,30 +30,6 @@ log = logging.getLogger("lslam")
 ESTIMATE = np.r_[6:9, 15:18, 9:12]
 
 
-class Smoother(Protocol):
-    """Poses and IMU in one estimate, one step after the other."""
-
-    def begin(self, state: InertialState) -> None:
-        """Forget all steps; `state` is the prior of the first."""
-        ...
-
-    def add(self, step: InertialStep) -> InertialState:
-        """The state at the end of `step`."""
-        ...
-
-    def withdraw(self) -> None:
-        """Undo the newest step."""
-        ...
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here."""
-        ...
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        ...
-
-
 class SmootherMotion(InertialMotion):
     """Predicts with the newest state of a smoother, which takes each registered pose as a measurement beside the IMU's.
 
@@ -62,9 +38,11 @@ class SmootherMotion(InertialMotion):
     """
 
     HAS_DEVICE: ClassVar[bool] = False
+    STATE: ClassVar[tuple[str, ...]] = (*InertialMotion.STATE, "_is_begun", "smoother")
+    CLEARED: ClassVar[tuple[str, ...]] = (*InertialMotion.CLEARED, "_added")
 
     def __init__(
-        self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, smoother: Smoother
+        self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, smoother: InertialSmoother
     ) -> None:
         super().__init__(imu, T_lidar_imu, estimate, config)
         self.smoother = smoother
@@ -165,16 +143,6 @@ class SmootherMotion(InertialMotion):
         turning = np.gradient(rates, middles, axis=0) if len(rates) > 1 else np.zeros_like(rates)
         forces = step.accel + np.cross(turning, lever) + np.cross(rates, np.cross(rates, lever))
         return InertialStep(step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T, hidden=step.hidden)
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here; not the stream."""
-        return {**super().state(), "is_begun": self._is_begun, "smoother": self.smoother.state()}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        super().restore(state)
-        self._is_begun, self._added = state["is_begun"], None
-        self.smoother.restore(state["smoother"])
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """As of any IMU; the smoother begins again."""
