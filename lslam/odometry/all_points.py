@@ -7,7 +7,6 @@ from dataclasses import replace
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
-from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
 from lslam.registration.preprocessing.prepare import prepare_points
@@ -47,11 +46,8 @@ class AllPoints(Stateful):
         """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
         icp = self._of_recent(attempt.history)
         points = prepare_points(attempt.points.cloud, icp.preprocess)
-        held = held_by_non_ground(icp.attempt(points, T_start), result)
-        if held is result:
-            return result
-        error = correction(attempt.T_prior, held.T_world_lidar)
-        return replace(held, prior_error=error, pose_source=ALL_POINTS)
+        better = held_by_non_ground(icp.attempt(points, T_start), result)
+        return result if better is result else attempt.placed(better, ALL_POINTS)
 
     def instead(
         self, attempt: Attempt, by_features: RegistrationResult, known: RegistrationResult | None

@@ -26,6 +26,9 @@ class Traits:
     # It can register a sweep again along a course that later scans told as well.
     follows_course: bool = False
 
+    def warm_up(self) -> None:
+        """Nothing to compile."""
+
 
 class Method(Protocol):
     """What all methods have in common, the attributes of `Traits` among it.

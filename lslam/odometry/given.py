@@ -97,9 +97,6 @@ class GivenPoses(Traits, Stateful):
             source_points=len(scan),
         )
 
-    def warm_up(self) -> None:
-        """Nothing to compile."""
-
 
 def create(config: Config) -> GivenPoses:
     """The poses of `odometry.poses`. Raises UsageError without a file, InputError for one that cannot be read."""

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any, ClassVar
-
-import numpy as np
+from typing import Any
 
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import RecoveryConfig
@@ -14,17 +12,13 @@ from lslam.core.errors import UsageError
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.state import Stateful
-from lslam.odometry.base import Traits
 from lslam.odometry.elastic import SweepPoints, register_elastic
 from lslam.odometry.elastic_constraints import ElasticConstraints
 from lslam.odometry.keyframe_submap import KeyframeSubmap
-from lslam.odometry.scan_outcome import recorded
-from lslam.odometry.uncertainty import PoseUncertainty
+from lslam.odometry.map_method import MapMethod
 from lslam.registration.local_map import make_map_scans
 from lslam.registration.preprocessing.deskew import deskew
-from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.robust import Annealing
@@ -61,17 +55,14 @@ def registration_of(
     return Registration(c, config.preprocess, recovery or config.recovery, target)
 
 
-class Icp(Traits, Stateful):
-    """Adapter from scans and motion priors to `Registration`."""
+class Icp(MapMethod):
+    """Points on the local map."""
 
-    is_searching = True
     deskew = "by the motion prior, and again by the motion that registration finds"
-    STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
 
     def __init__(self, registration: Registration) -> None:
-        self.registration = registration
-        self._uncertainty = self._fresh_uncertainty()
         c = registration.config
+        super().__init__(registration, is_scan_to_scan=c.target == "scan")
         # Point to plane, on a map of many scans.
         self.follows_course = registration.preprocess.deskew and c.target == "map" and c.residual in (None, "plane")
 
@@ -117,39 +108,12 @@ class Icp(Traits, Stateful):
             stages={"register": time.perf_counter() - began},
         )  # fmt: skip
 
-    @property
-    def map_age(self) -> float:
-        """Mean age, in scans, of the points of the map."""
-        return self._uncertainty.map_age
-
     def information_of(self, prior: MotionPrior) -> Floats | None:
         """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
         return None
 
-    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
-        """Enter the scan into the local map where its result puts it."""
-        began = time.perf_counter()
-        result = self.insert(scan.stamp_ns, prior, result)
-        record = recorded(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))
-        return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
-
-    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
-        """Enter a scan that was registered from `prior` into the map; the result says whether the sensor is at rest."""
-        return self.registration.update(result)
-
-    def restart(self) -> None:
-        """An empty map."""
-        self.registration = self.registration.fresh()
-        self._uncertainty = self._fresh_uncertainty()
-
-    def _fresh_uncertainty(self) -> PoseUncertainty:
-        return PoseUncertainty(is_scan_to_scan=self.registration.config.target == "scan")
-
     def warm_up(self) -> None:
         """Register a small room twice with a throw-away copy: every kernel is compiled or loaded."""
-        rng = np.random.default_rng(0)
-        room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
-        room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
         trial = self.registration.fresh()
         for _ in range(2):
-            trial.register(room)
+            trial.register(small_room())

@@ -21,7 +21,7 @@ from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import judged
 from lslam.registration.optimiser import STEP_M, STEP_RAD
-from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
@@ -87,8 +87,7 @@ class IcpSvd(Traits, Stateful):
 
     def warm_up(self) -> None:
         """Compile or load the kernels of preprocessing."""
-        room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
-        self.prepare(Scan(room, 0, 0))
+        self.prepare(Scan(small_room(), 0, 0))
 
 
 def align_closed_form(

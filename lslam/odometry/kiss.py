@@ -105,6 +105,3 @@ class Kiss(Traits):
         before = self._T_world_kiss @ pose @ se3.inverse(delta)
         since = (0.5 + passed) * self._step if self._registered <= 3 else passed * se3.log(delta)
         return np.asarray(before @ se3.exp(since))
-
-    def warm_up(self) -> None:
-        """Nothing to compile."""

@@ -15,10 +15,10 @@ from lslam.core.config.odometry import rest_alone
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.core.types.state import Stateful
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
 from lslam.odometry.loam import Loam
+from lslam.odometry.map_method import MapMethod
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.solver import RegistrationResult
 
@@ -54,10 +54,10 @@ class SmoothedUncertainty(PoseUncertainty):
         return record if whole is None or own is None else replace(record, points_covariance=whole - own)
 
 
-class Smoothed(Stateful):
+class Smoothed(MapMethod):
     """Scans enter the map where the smoother puts them."""
 
-    _uncertainty: Any
+    _uncertainty: SmoothedUncertainty
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
         """As of the method; the covariance by the points is kept beside the smoother's."""
@@ -66,9 +66,7 @@ class Smoothed(Stateful):
 
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
         """Enter the scan into the map where the smoother puts it."""
-        record: ScanResult = super().update(scan, prior, result)  # type: ignore[misc]
-        smoothed: ScanResult = self._uncertainty.alone(record, result, scan.stamp_ns, prior)
-        return smoothed
+        return self._uncertainty.alone(super().update(scan, prior, result), result, scan.stamp_ns, prior)
 
     def _fresh_uncertainty(self) -> SmoothedUncertainty:
         return SmoothedUncertainty()

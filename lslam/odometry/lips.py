@@ -25,7 +25,7 @@ from lslam.odometry.plane_window import PlaneWindow, associate
 from lslam.odometry.scan_outcome import recorded
 from lslam.registration.acceptance import correction
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.solver import RegistrationResult
 
 # Share of the points on planes that known planes must take; where it is less, the scan is elsewhere.
@@ -104,10 +104,7 @@ class Lips(Traits, Stateful):
 
     def warm_up(self) -> None:
         """Extract the planes of a small room, and solve a small window."""
-        rng = np.random.default_rng(0)
-        room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
-        room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
-        self._extractor.extract(room)
+        self._extractor.extract(small_room())
         normal_equations.warm_up()
 
     def _predicted(self, link: SweepLink) -> PlaneWindow:

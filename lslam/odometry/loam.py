@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar
 
 import numpy as np
 
 from lslam.core.config.config import Config
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import ScanResult, StageClock
-from lslam.core.types.state import Stateful
-from lslam.odometry.base import Traits
+from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_policies import feature_policies
 from lslam.odometry.feature_solver import joint_step
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
-from lslam.odometry.scan_outcome import recorded
-from lslam.odometry.uncertainty import PoseUncertainty
+from lslam.odometry.map_method import MapMethod
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features
 from lslam.registration.preprocessing.ground import up_of
@@ -36,13 +32,11 @@ def create(config: Config) -> Loam:
     return Loam(config, VARIANTS[config.odometry.method])
 
 
-class Loam(Traits, Stateful):
-    """Adapter from scans and motion priors to `Registration`."""
+class Loam(MapMethod):
+    """Edges and planar points on the scan before, on the feature map, or on one after the other."""
 
     needs_rings = True
-    is_searching = True
     deskew = "features by the motion prior, and again by the motion that registration finds"
-    STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
 
     def __init__(self, config: Config, variant: LoamVariant) -> None:
         self.config, self.variant = config, variant
@@ -54,16 +48,8 @@ class Loam(Traits, Stateful):
         # From scan to scan no spot is remembered, on which the sensor could have come to rest.
         kept = {} if variant.with_map else {"at_rest": False}
         policies = feature_policies(config.recovery.model_copy(update=kept))
-        self.registration = Registration(c, config.preprocess, target=target, policies=policies)
-        self._uncertainty = self._fresh_uncertainty()
-
-    def restart(self) -> None:
-        """No scan seen, an empty feature map."""
-        self.registration = self.registration.fresh()
-        self._uncertainty = self._fresh_uncertainty()
-
-    def _fresh_uncertainty(self) -> PoseUncertainty:
-        return PoseUncertainty(is_scan_to_scan=not self.variant.with_map)
+        registration = Registration(c, config.preprocess, target=target, policies=policies)
+        super().__init__(registration, is_scan_to_scan=not variant.with_map)
 
     def prepare(self, scan: Scan) -> Features:
         """Edges and planar points. Raises InputError for a scan without usable rings."""
@@ -85,15 +71,7 @@ class Loam(Traits, Stateful):
         if features is prepared:
             del clock.seconds["deskew"]
         result = self.registration.locate(features, prior.pose, is_near, clock=clock)
-        return replace(result, map_age=self._uncertainty.map_age, stages=clock.seconds)
-
-    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
-        """Enter the scan where its result puts it: into the feature map, and as what the next one is registered on."""
-        clock = StageClock()
-        with clock.stage("update"):
-            result = self.registration.update(result)
-            record = recorded(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))
-        return replace(record, stages={**result.stages, **clock.seconds})
+        return replace(result, map_age=self.map_age, stages=clock.seconds)
 
     def warm_up(self) -> None:
         """Register a small room with a throw-away copy, well and badly: every kernel is compiled or loaded."""

@@ -68,8 +68,7 @@ class LoamLivox(Loam):
         result, sweep = joined(found, middles, prior)
         with clock.stage("deskew"):
             features = deskewed(prepared, sweep)
-        age = self._uncertainty.map_age
-        return replace(result, points=features, sweep=sweep, map_age=age, stages=clock.seconds)
+        return replace(result, points=features, sweep=sweep, map_age=self.map_age, stages=clock.seconds)
 
 
 def between(features: Features, begin: float, end: float) -> Features:

@@ -71,9 +71,6 @@ class Open3dGicp(Traits):
         result.stages["register"] = time.perf_counter() - began
         return result
 
-    def warm_up(self) -> None:
-        """Nothing to compile."""
-
     def _align(self, cloud: Any, T_prior: Floats) -> RegistrationResult:
         count = len(cloud.points)
         if self._last is None or count < MIN_SOURCE_POINTS:

@@ -63,9 +63,6 @@ class SmallGicp(Traits):
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
         return result
 
-    def warm_up(self) -> None:
-        """Nothing to compile."""
-
     def _align(self, source: Any, T_prior: Floats) -> RegistrationResult:
         count = 0 if source is None else source.size()
         if self._target is None or count < MIN_SOURCE_POINTS:

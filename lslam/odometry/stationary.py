@@ -13,7 +13,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult, solve
 
@@ -74,10 +74,7 @@ class StationaryDetector(Stateful):
 
     def warm_up(self) -> None:
         """Compile or load the kernels with a small room."""
-        room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
-        room[:, 2] = np.where(room[:, 2] > 0, 8.0, -8.0)
-        scan = Scan(room, 0, 0)
-        trial = StationaryDetector(self._preprocess, self._config)
+        trial, scan = StationaryDetector(self._preprocess, self._config), Scan(small_room(), 0, 0)
         trial._refer_to(scan)
         trial._is_stationary(scan)
 

@@ -8,9 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
-from lslam.registration.history import History
 from lslam.registration.robust import UsualAgreement
 from lslam.registration.solver import RegistrationResult
 
@@ -55,14 +53,6 @@ class Acceptance:
     is_usual_of_matches: bool = False
     source: str = "points"
     target: str = "map"
-
-    @classmethod
-    def of(cls, config: RegistrationConfig, history: History, source: str) -> Acceptance:
-        """The limits of odometry."""
-        return cls(
-            config.min_overlap, history.matches.least, max_jump_m=config.max_jump_m, max_jump_deg=config.max_jump_deg,
-            usual=history.agreement, source=source,
-        )  # fmt: skip
 
     def rejection(self, result: RegistrationResult, jump: tuple[float, float] = (0.0, 0.0)) -> Rejection | None:
         """The first test that the result fails; None when it passes them all. `jump` : m and rad, from the prior."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
-from lslam.registration.acceptance import Acceptance
+from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.history import History
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import RegistrationResult
@@ -50,10 +50,6 @@ class Target(Stateful, ABC):
     @abstractmethod
     def ready(self, points: Any, history: History) -> Any:
         """The points with all that the residual takes of them."""
-
-    def limits(self, history: History) -> Acceptance:
-        """What a registration must pass."""
-        return Acceptance.of(self.config, history, self.source)
 
     @abstractmethod
     def align(
@@ -102,8 +98,16 @@ class Attempt:
 
     def judged(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
-        limits: Acceptance = self.target.limits(self.history)
+        c, history = self.config, self.history
+        limits = Acceptance(
+            c.min_overlap, history.matches.least, max_jump_m=c.max_jump_m, max_jump_deg=c.max_jump_deg,
+            usual=history.agreement, source=self.target.source,
+        )  # fmt: skip
         return limits.accepted(result, self.T_prior if T_prior is None else T_prior)
+
+    def placed(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:
+        """The result of the policy `pose_source`, with its correction of the prior."""
+        return replace(result, prior_error=correction(self.T_prior, result.T_world_lidar), pose_source=pose_source)
 
     @property
     def is_young(self) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from lslam.core.config.odometry import RecoveryConfig
-from lslam.registration.acceptance import correction
 from lslam.registration.attempt import Attempt, Policy
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import StartSearch
@@ -55,8 +54,7 @@ class AtRest:
             return result
         if not rest.votes(attempt.target.cloud(attempt.points), T_registered).is_standing:
             return result
-        at_rest = result.moved(rest.T_world_lidar.copy(), result.covariance)
-        return replace(at_rest, prior_error=correction(attempt.T_prior, at_rest.T_world_lidar), pose_source=self.name)
+        return attempt.placed(result.moved(rest.T_world_lidar.copy(), result.covariance), self.name)
 
 
 def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:

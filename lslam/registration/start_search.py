@@ -11,7 +11,6 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Points
-from lslam.registration.acceptance import correction
 from lslam.registration.alignment import upright_directions
 from lslam.registration.attempt import NEAR_KERNEL, Attempt
 from lslam.registration.gaussian_map import GaussianMap
@@ -107,11 +106,8 @@ class StartSearch:
         is_settled = result.ok and not attempt.history.is_young
         if attempt.config.start_reach == 0 or is_settled:
             return result
-        found = held_by_non_ground(attempt, result, is_lost=attempt.history.inserted == 1)
-        if found is result:
-            return result
-        error = correction(attempt.T_prior, found.T_world_lidar) if found.ok else found.prior_error
-        return replace(found, prior_error=error, pose_source=self.name if found.ok else found.pose_source)
+        better = held_by_non_ground(attempt, result, is_lost=attempt.history.inserted == 1)
+        return attempt.placed(better, self.name) if better is not result and better.ok else better
 
 
 def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False) -> RegistrationResult:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.registration.acceptance import PRIOR_COVARIANCE, Acceptance, correction
+from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
 from lslam.registration.solver import RegistrationResult
 
@@ -27,7 +30,11 @@ def judged(
     history = History(CONFIG)
     history.agreement.observe(0.8)
     history.matches.observe(0.6)
-    return Acceptance.of(CONFIG, history, source).accepted(result, PRIOR)
+    return attempt(CONFIG, history, source).judged(result)
+
+
+def attempt(config: RegistrationConfig, history: History, source: str = "points") -> Attempt:
+    return Attempt(SimpleNamespace(source=source), None, PRIOR, config, history)
 
 
 def test_the_share_of_matches_that_agree_is_judged_by_the_share_of_earlier_scans() -> None:
@@ -36,7 +43,7 @@ def test_the_share_of_matches_that_agree_is_judged_by_the_share_of_earlier_scans
     for usual, is_accepted in ((0.2, True), (0.7, False)):
         history = History(RegistrationConfig())
         history.matches.observe(usual)
-        assert Acceptance.of(RegistrationConfig(), history, "points").accepted(result, PRIOR).ok == is_accepted
+        assert attempt(RegistrationConfig(), history).judged(result).ok == is_accepted
 
 
 def test_an_accepted_result_has_its_correction_of_the_prior() -> None:

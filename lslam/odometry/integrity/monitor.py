@@ -16,7 +16,7 @@ from lslam.core.types.state import Stateful
 from lslam.odometry.integrity.directions import emptied, filled_directions
 from lslam.odometry.integrity.pair_registration import PairRegistration, best_of, is_near, is_within, median_range
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, thin
+from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room, thin
 from lslam.registration.robust import UsualAgreement
 
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
@@ -101,11 +101,9 @@ class IntegrityMonitor(Stateful):
 
     def warm_up(self) -> None:
         """Compile or load the kernels with a small room."""
-        room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
-        room[:, 2] = np.where(room[:, 2] > 0, 8.0, -8.0)
         trial = IntegrityMonitor(self._preprocess)
         for k in range(2):
-            at, scan = k + 1, Scan(room, round(1e9 * k), k)
+            at, scan = k + 1, Scan(small_room(), round(1e9 * k), k)
             trial.see(at, scan, None, ScanResult(k, scan.stamp_ns, np.eye(4)), MotionPrior.at_once(np.eye(4)))
 
     def _is_due(self, position: int, scan: Scan, result: ScanResult, step_s: float) -> bool:

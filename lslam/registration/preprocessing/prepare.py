@@ -108,6 +108,14 @@ def as_cloud(points: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(array[:, :3], np.float32)
 
 
+def small_room() -> NDArray[np.float32]:
+    """(3000, 3) m, points in a room and on three of its walls, to compile kernels with."""
+    rng = np.random.default_rng(0)
+    room = rng.uniform(-8, 8, (3000, 3)).astype(np.float32)
+    room[np.arange(3000), rng.integers(0, 3, 3000)] = 8.0
+    return room
+
+
 def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> Longs:
     """Indices of the points (N, 3), m, that are finite, non-zero, within range and outside the ego box.
 
