@@ -98,7 +98,7 @@ def coupling_of(method: str) -> Coupling:
 
 def listed_methods() -> list[ListedMethod]:
     """All methods in the order of the table, those of other packages last."""
-    return [ListedMethod(name, said, coupling_of(name), name in BASELINES) for name, said in known_methods().items()]
+    return [ListedMethod(name, text, coupling_of(name), name in BASELINES) for name, text in known_methods().items()]
 
 
 def known_methods() -> dict[str, str]:

@@ -50,24 +50,24 @@ class AllPoints(Stateful):
         return result if better is result else attempt.placed(better, ALL_POINTS)
 
     def instead(
-        self, attempt: Attempt, by_features: RegistrationResult, known: RegistrationResult | None
+        self, attempt: Attempt, by_features: RegistrationResult, own: RegistrationResult | None
     ) -> RegistrationResult:
         """The pose by `icp` on a map of all points, unless it fails; directions degenerate by features stay flagged.
 
         Few rings at speed leave so few features that one outlier misleads them by metres.
-        known : the result of `locate`, if there is one already
+        own : the result of `locate`, if there is one already
         """
         if self._fed >= FED:
             self._icp = self._of_recent(attempt.history)
         self._fed = 0
-        if known is None:
+        if own is None:
             points = prepare_points(attempt.points.cloud, self._icp.preprocess)
-            known = self._icp.locate(points, attempt.T_prior)
-        if not known.ok:
+            own = self._icp.locate(points, attempt.T_prior)
+        if not own.ok:
             return by_features
-        degenerate = known.degenerate if len(known.degenerate) else by_features.degenerate
+        degenerate = own.degenerate if len(own.degenerate) else by_features.degenerate
         return replace(
-            known, degenerate=degenerate, pose_source=ALL_POINTS, replaced=by_features, points=None, detail=known
+            own, degenerate=degenerate, pose_source=ALL_POINTS, replaced=by_features, points=None, detail=own
         )
 
     def enter(self, result: RegistrationResult) -> None:

@@ -124,8 +124,8 @@ def register_elastic(
     covariance = np.asarray(np.linalg.pinv(A, hermitian=True), np.float64)
     information = np.asarray(np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True), np.float64)
     pose = sweep.prior.pose
-    found = OptimiserResult.of(pose, information, facts, at_stamp @ d.ravel(), iterations, converged, weak)
-    return ElasticResult(sweep, skew[0], covariance, found)
+    optimum = OptimiserResult.of(pose, information, facts, at_stamp @ d.ravel(), iterations, converged, weak)
+    return ElasticResult(sweep, skew[0], covariance, optimum)
 
 
 def _about_own_place(

@@ -169,8 +169,8 @@ class LastSweep(Stateful):
         self._covariance = covariance[:12, :12]
         L = np.kron((-share, share, 1.0 - share), np.eye(6))
         self._skew, self._skewed = (1.0 - share) * skew, L @ covariance @ L.T
-        found, expected = middle_of(sweep, stamp_ns, pose)[0], middle_of(prior, stamp_ns, prior.pose)[0]
-        change = se3.log(se3.relative(expected, found))
+        middle, expected = middle_of(sweep, stamp_ns, pose)[0], middle_of(prior, stamp_ns, prior.pose)[0]
+        change = se3.log(se3.relative(expected, middle))
         Q = self._change_over(prior.span_s)
         self._change = FORGETTING * Q + (1.0 - FORGETTING) * np.outer(change, change)
 

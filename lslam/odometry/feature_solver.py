@@ -65,10 +65,10 @@ def solve_on_scan(
         noise.weak_share, TIMES_ON_SCAN * noise.least / noise.plane**2, by_surfaces=True,
         allowed=EVERYWHERE if allowed is None else np.ascontiguousarray(allowed),
     )  # fmt: skip
-    found = optimise(terms, T_prior, annealing, limits, Correspondences(0))
+    optimum = optimise(terms, T_prior, annealing, limits, Correspondences(0))
     if allowed is not None:
-        found = replace(found, weak=found.weak[np.linalg.norm(found.weak @ allowed, axis=1) > 0.5])
-    return result_of(found, T_prior, len(edges) + len(planes))
+        optimum = replace(optimum, weak=optimum.weak[np.linalg.norm(optimum.weak @ allowed, axis=1) > 0.5])
+    return result_of(optimum, T_prior, len(edges) + len(planes))
 
 
 def solve_on_map(

@@ -189,11 +189,11 @@ class FeatureTarget(Target):
             return result
         # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
         offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP, self._up)]
-        tried = [on_coarse(T_prior @ T, 2 * START_STEP) for T in offsets]
-        agree = [edges_at(one) for one in tried]
+        trials = [on_coarse(T_prior @ T, 2 * START_STEP) for T in offsets]
+        agree = [edges_at(one) for one in trials]
         most, usual = max(agree, default=0), max(edges_at(result), 0)
         is_clear = most > MUCH * usual and is_more(most, usual)
-        return tried[int(np.argmax(agree))] if is_clear else result
+        return trials[int(np.argmax(agree))] if is_clear else result
 
     def _planes(self) -> FeatureMap:
         """The feature map, or one made of the last scan alone."""

@@ -71,14 +71,14 @@ class IcpSvd(Traits, Stateful):
         began = time.perf_counter()
         c = self._config
         if self._last is None or len(prepared.source) < MIN_SOURCE_POINTS:
-            found = RegistrationResult(prior.pose, source_points=len(prepared.source), inliers=len(prepared.source))
+            alignment = RegistrationResult(prior.pose, source_points=len(prepared.source), inliers=len(prepared.source))
         else:
-            found = align_closed_form(
+            alignment = align_closed_form(
                 prepared.source, self._last, prior.pose, inlier_ratio=c.inlier_ratio,
                 inlier_distance=c.inlier_distance, max_iterations=c.max_iterations,
             )  # fmt: skip
         aligned = time.perf_counter()
-        result = judged(scan, found, prior.pose, c, {})
+        result = judged(scan, alignment, prior.pose, c, {})
         self._failed = 0 if result.status == "ok" else self._failed + 1
         if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
             self._last = Partners(prepared.map_points.astype(np.float64), result.T_world_lidar)
@@ -101,23 +101,23 @@ def align_closed_form(
     centroids removed (2.18, 2.19), rotation by SVD of the covariance (2.20).
     """
     T = se3.relative(last.T_world_lidar, T_prior)
-    converged, rounds, kept = False, 0, np.zeros(0, np.int64)
+    converged, rounds, near = False, 0, np.zeros(0, np.int64)
     distance = np.zeros(len(source))
     for rounds in range(1, max_iterations + 1):
         moved = se3.apply(T, source)
         reach = np.inf if inlier_distance is None else inlier_distance
         distance, partner = (np.asarray(a) for a in last.tree.query(moved, distance_upper_bound=reach))
-        kept = keep_pairs(distance, inlier_ratio, inlier_distance)
-        step, _, is_determined = se3.umeyama(moved[kept], last.points[partner[kept]]) if len(kept) else (T, 1.0, False)
+        near = keep_pairs(distance, inlier_ratio, inlier_distance)
+        step, _, is_determined = se3.umeyama(moved[near], last.points[partner[near]]) if len(near) else (T, 1.0, False)
         if not is_determined:
             return RegistrationResult(T_prior, source_points=len(source), converged=False, iterations=rounds)
         T = step @ T
         if np.linalg.norm(step[:3, 3]) < STEP_M and so3.angle(step[:3, :3]) < STEP_RAD:
             converged = True
             break
-    rmse = float(np.sqrt(np.mean(distance[kept] ** 2))) if len(kept) else 0.0
+    rmse = float(np.sqrt(np.mean(distance[near] ** 2))) if len(near) else 0.0
     return RegistrationResult(
-        last.T_world_lidar @ se3.normalise(T), source_points=len(source), inliers=len(kept), converged=converged,
+        last.T_world_lidar @ se3.normalise(T), source_points=len(source), inliers=len(near), converged=converged,
         iterations=rounds, rmse=rmse,
     )  # fmt: skip
 

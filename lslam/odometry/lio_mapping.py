@@ -55,8 +55,8 @@ class LioMapping(FastLio2):
 
     def equations_at(self, poses: Mapping[int, Floats]) -> tuple[ScanEquations, ...]:
         """Of scans at other poses (4, 4), by their stamps; none of those that are in the map already."""
-        known = self._offered | {stamp_ns: points for stamp_ns, points, *_ in self.pending}
-        return tuple(self._at(stamp_ns, known[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in known)
+        by_stamp = self._offered | {stamp_ns: points for stamp_ns, points, *_ in self.pending}
+        return tuple(self._at(stamp_ns, by_stamp[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in by_stamp)
 
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
         return ScanEquations(stamp_ns, T, *self.registration.target.equations(points, T))

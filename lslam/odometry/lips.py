@@ -70,17 +70,17 @@ class Lips(Traits, Stateful):
             planes = self._extractor.extract(centred)
         with clock.stage("register"):
             predicted = self._predicted(link)
-            found = associate(predicted, planes, predicted.joint_covariance())
-            reason = _refusal(predicted, planes, found)
+            matches = associate(predicted, planes, predicted.joint_covariance())
+            reason = _refusal(predicted, planes, matches)
             window, steps = predicted, 0
             if not reason:
-                solution, steps = _with(predicted, planes, found).solved()
+                solution, steps = _with(predicted, planes, matches).solved()
                 reason = (
                     "the window of planes and IMU has no solution: the IMU carries the scan" if solution is None else ""
                 )
                 window = solution or predicted
         with clock.stage("covariance"):
-            result = self._result(link, window, planes, found)
+            result = self._result(link, window, planes, matches)
         off = correction(prior.pose, result.T_world_lidar)
         return replace(
             result, ok=not reason, reason=reason, converged=not reason, iterations=steps, source_points=len(points),
@@ -113,50 +113,50 @@ class Lips(Traits, Stateful):
             return PlaneWindow.begin(link.state, se3.inverse(link.T_lidar_imu))
         return self.window.extended(link.step)
 
-    def _result(self, link: SweepLink, window: PlaneWindow, planes: Planes, found: Longs) -> RegistrationResult:
+    def _result(self, link: SweepLink, window: PlaneWindow, planes: Planes, matches: Longs) -> RegistrationResult:
         """The newest pose with its covariance on the planes; the detail is that in the world."""
         pose = se3.normalise(window.T_world_lidar @ se3.inverse(link.within))
         P = window.joint_covariance()
-        known = np.flatnonzero(found >= 0)
+        which = np.flatnonzero(matches >= 0)
         state = slice(SHARED, SHARED + 6)
         step = pose[:3, 3] - window.values.poses[-1, :3, 3]
         on_planes = noise.transported(window.covariance_on_planes(), step)
-        n = planes.counts[known]
-        rmse = float(np.sqrt(n @ planes.rms[known] ** 2 / max(n.sum(), 1.0)))
+        n = planes.counts[which]
+        rmse = float(np.sqrt(n @ planes.rms[which] ** 2 / max(n.sum(), 1.0)))
         return RegistrationResult(
             pose, covariance=on_planes, inliers=round(float(n.sum())), matched=round(float(n.sum())), rmse=rmse,
-            degenerate=self._degenerate(window, found), inertial=window.values.newest(P[:27, :27]),
+            degenerate=self._degenerate(window, matches), inertial=window.values.newest(P[:27, :27]),
             detail=noise.transported(P[state, state], step),
         )  # fmt: skip
 
-    def _degenerate(self, window: PlaneWindow, found: Longs) -> Floats:
+    def _degenerate(self, window: PlaneWindow, matches: Longs) -> Floats:
         """(D, 6) twists of the LiDAR along which the known planes of the scan say next to nothing."""
         if window.values.states == 1:
             return np.zeros((0, 6))  # the first scan begins the world
-        is_known = (window.seen.states == window.values.states - 1) & np.isin(window.seen.planes, found[found >= 0])
-        seen = window.seen.only(is_known)
-        _, J, _ = sighting_residuals(window.values, seen, window.landmarks.anchors, window.T_imu_lidar)
+        is_known = (window.seen.states == window.values.states - 1) & np.isin(window.seen.planes, matches[matches >= 0])
+        sightings = window.seen.only(is_known)
+        _, J, _ = sighting_residuals(window.values, sightings, window.landmarks.anchors, window.T_imu_lidar)
         J[:, :, 3:] /= LEVER_M
-        values, vectors = np.linalg.eigh(np.einsum("kia,kij,kjb->ab", J, seen.information, J))
+        values, vectors = np.linalg.eigh(np.einsum("kia,kij,kjb->ab", J, sightings.information, J))
         return np.ascontiguousarray(vectors[:, values <= self.config.registration.weak_share * values.sum()].T)
 
 
-def _refusal(window: PlaneWindow, planes: Planes, found: Longs) -> str:
+def _refusal(window: PlaneWindow, planes: Planes, matches: Longs) -> str:
     """Why a scan's planes are rejected; empty where they are not."""
     if len(planes) == 0:
         return "no plane is seen: the IMU carries the scan"
     if len(window.landmarks) == 0:
         return ""
-    share = float(planes.counts[found >= 0].sum() / planes.counts.sum())
+    share = float(planes.counts[matches >= 0].sum() / planes.counts.sum())
     if share < LEAST_SHARE:
         return f"only {share:.0%} of the points on planes lie on known ones: the IMU carries the scan"
     return ""
 
 
-def _with(window: PlaneWindow, planes: Planes, found: Longs) -> PlaneWindow:
+def _with(window: PlaneWindow, planes: Planes, matches: Longs) -> PlaneWindow:
     """The window whose newest state saw the planes, known ones and new ones."""
     information: Floats = np.asarray(np.linalg.inv(planes.covariance), np.float64)
     lows, highs = turned(planes, window.T_world_lidar)
-    old, new = found >= 0, found < 0
-    window = window.with_sightings(found[old], planes.cp[old], information[old], lows[old], highs[old])
+    old, new = matches >= 0, matches < 0
+    window = window.with_sightings(matches[old], planes.cp[old], information[old], lows[old], highs[old])
     return window.with_planes(planes.cp[new], information[new], lows[new], highs[new])

@@ -46,8 +46,8 @@ class Loam(MapMethod):
             with_all_points=config.recovery.fallback == "all-points",
         )  # fmt: skip
         # From scan to scan no spot is remembered, on which the sensor could have come to rest.
-        kept = {} if variant.with_map else {"at_rest": False}
-        policies = feature_policies(config.recovery.model_copy(update=kept))
+        switches = {} if variant.with_map else {"at_rest": False}
+        policies = feature_policies(config.recovery.model_copy(update=switches))
         registration = Registration(c, config.preprocess, target=target, policies=policies)
         super().__init__(registration, is_scan_to_scan=not variant.with_map)
 

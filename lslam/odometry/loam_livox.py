@@ -59,13 +59,13 @@ class LoamLivox(Loam):
             features = deskewed(prepared, prior)
         borders = np.linspace(*scan.span, count + 1)
         middles = (borders[:-1] + borders[1:]) / 2
-        found: list[RegistrationResult] = []
+        pieces: list[RegistrationResult] = []
         pose = prior.pose
         for k in range(count):
             piece = between(features, borders[k], borders[k + 1] if k + 1 < count else np.inf)
-            found.append(self.registration.locate(piece, pose, clock=clock))
-            pose = found[-1].T_world_lidar if found[-1].ok else pose
-        result, sweep = joined(found, middles, prior)
+            pieces.append(self.registration.locate(piece, pose, clock=clock))
+            pose = pieces[-1].T_world_lidar if pieces[-1].ok else pose
+        result, sweep = joined(pieces, middles, prior)
         with clock.stage("deskew"):
             features = deskewed(prepared, sweep)
         return replace(result, points=features, sweep=sweep, map_age=self.map_age, stages=clock.seconds)
@@ -86,7 +86,7 @@ def between(features: Features, begin: float, end: float) -> Features:
 
 
 def joined(
-    found: list[RegistrationResult], middles: Floats, prior: MotionPrior
+    pieces: list[RegistrationResult], middles: Floats, prior: MotionPrior
 ) -> tuple[RegistrationResult, MotionPrior]:
     """The registrations of the pieces as one of the scan, and the motion over its sweep.
 
@@ -96,12 +96,12 @@ def joined(
 
     middles : s from the stamp
     """
-    good = [k for k, result in enumerate(found) if result.ok]
-    offered = sum(result.source_points for result in found)
-    if 2 * len(good) <= len(found):
-        reason = next(result.reason for result in found if not result.ok)
+    good = [k for k, result in enumerate(pieces) if result.ok]
+    offered = sum(result.source_points for result in pieces)
+    if 2 * len(good) <= len(pieces):
+        reason = next(result.reason for result in pieces if not result.ok)
         return failed(prior.pose, offered, reason), prior
-    parts = [found[k] for k in good]
+    parts = [pieces[k] for k in good]
     base = parts[len(parts) // 2].T_world_lidar
     off = np.stack([se3.log(se3.relative(base, part.T_world_lidar)) for part in parts])
 
@@ -114,7 +114,7 @@ def joined(
     located = replace(
         parts[len(parts) // 2], T_world_lidar=pose, covariance=_combined(parts, shares), source_points=offered,
         matched=sum(part.matched for part in parts), inliers=sum(part.inliers for part in parts),
-        iterations=sum(result.iterations for result in found), converged=all(part.converged for part in parts),
+        iterations=sum(result.iterations for result in pieces), converged=all(part.converged for part in parts),
         rmse=float(np.sqrt(np.mean([part.rmse**2 for part in parts]))), prior_error=correction(prior.pose, pose),
         pose_source=next((part.pose_source for part in parts if part.pose_source), ""),
         degenerate=min((part.degenerate for part in parts), key=len), replaced=None, detail=None,
@@ -130,7 +130,7 @@ def line_weights(at: Floats, times: Floats) -> Floats:
 
 def _combined(parts: list[RegistrationResult], shares: Floats) -> Floats | None:
     """Covariance (6, 6) of the sum of independent poses that count by `shares`; None where one has none."""
-    known = [part.covariance for part in parts if part.covariance is not None]
-    if len(known) < len(parts):
+    covariances = [part.covariance for part in parts if part.covariance is not None]
+    if len(covariances) < len(parts):
         return None
-    return np.asarray(np.einsum("k,kij->ij", shares**2, np.stack(known)))
+    return np.asarray(np.einsum("k,kij->ij", shares**2, np.stack(covariances)))

@@ -54,9 +54,9 @@ class Open3dGicp(Traits):
 
     def prepare(self, scan: Scan) -> Any:
         """Open3D's point cloud: gated, down-sampled, with a covariance per point."""
-        kept = clean_points(scan.points, self._preprocess).astype(np.float64)
+        points = clean_points(scan.points, self._preprocess).astype(np.float64)
         package = self._package
-        cloud = package.geometry.PointCloud(package.utility.Vector3dVector(kept)).voxel_down_sample(LEAF)
+        cloud = package.geometry.PointCloud(package.utility.Vector3dVector(points)).voxel_down_sample(LEAF)
         if len(cloud.points) >= MIN_SOURCE_POINTS:
             cloud.estimate_covariances(package.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
         return cloud
@@ -64,8 +64,8 @@ class Open3dGicp(Traits):
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         """Align with the last scan that was registered."""
         began = time.perf_counter()
-        found = self._align(prepared, prior.pose)
-        result = judged(scan, found, prior.pose, self._limits, {})
+        alignment = self._align(prepared, prior.pose)
+        result = judged(scan, alignment, prior.pose, self._limits, {})
         if result.status == "ok":
             self._last = Reference(prepared, result.T_world_lidar)
         result.stages["register"] = time.perf_counter() - began
@@ -76,10 +76,10 @@ class Open3dGicp(Traits):
         if self._last is None or count < MIN_SOURCE_POINTS:
             return RegistrationResult(T_prior, source_points=count, inliers=count)
         registration = self._package.pipelines.registration
-        found = registration.registration_generalized_icp(
+        alignment = registration.registration_generalized_icp(
             cloud, self._last.cloud, REACH, se3.relative(self._last.T_world_lidar, T_prior),
             registration.TransformationEstimationForGeneralizedICP(),
         )  # fmt: skip
-        pose = self._last.T_world_lidar @ np.asarray(found.transformation, np.float64)
-        inliers = len(found.correspondence_set)
-        return RegistrationResult(pose, source_points=count, inliers=inliers, rmse=float(found.inlier_rmse))
+        pose = self._last.T_world_lidar @ np.asarray(alignment.transformation, np.float64)
+        inliers = len(alignment.correspondence_set)
+        return RegistrationResult(pose, source_points=count, inliers=inliers, rmse=float(alignment.inlier_rmse))

@@ -174,7 +174,7 @@ def step_residual(values: WindowValues, k: int, step: PreintegratedStep) -> tupl
 
 
 def sighting_residuals(
-    values: WindowValues, seen: Sightings, anchors: Floats, T_imu_lidar: Floats
+    values: WindowValues, sightings: Sightings, anchors: Floats, T_imu_lidar: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Measured less expected closest points.
 
@@ -185,28 +185,28 @@ def sighting_residuals(
     (K, 3) m; (K, 3, 6) by position and rotation of the IMU; (K, 3, 3) by the plane
     """
     T_world_lidar = values.poses @ T_imu_lidar
-    found, by_pose, by_plane = closest_point.linearised(
-        values.planes[seen.planes], anchors[seen.planes], T_world_lidar[seen.states]
+    expected, by_pose, by_plane = closest_point.linearised(
+        values.planes[sightings.planes], anchors[sightings.planes], T_world_lidar[sightings.states]
     )
-    lever = (T_world_lidar[:, :3, 3] - values.poses[:, :3, 3])[seen.states]
+    lever = (T_world_lidar[:, :3, 3] - values.poses[:, :3, 3])[sightings.states]
     by_pose[:, :, 3:] -= by_pose[:, :, :3] @ so3.hat(lever)
-    return seen.cp - found, -by_pose, -by_plane
+    return sightings.cp - expected, -by_pose, -by_plane
 
 
 def normal_equations(
     values: WindowValues,
     prior: WindowPrior,
     steps: tuple[PreintegratedStep, ...],
-    seen: Sightings,
+    sightings: Sightings,
     anchors: Floats,
     T_imu_lidar: Floats,
 ) -> Normal:
     """All factors at `values`; the prior is on the first state."""
     H, g = np.zeros((values.size, values.size)), np.zeros(values.size)
     first = np.r_[0 : SHARED + STATE_SIZE, values.first_plane : values.size]
-    known = np.einsum("ij,j->i", prior.information, values.cut(slice(1)).since(prior.at)) + prior.gradient
+    pull = np.einsum("ij,j->i", prior.information, values.cut(slice(1)).since(prior.at)) + prior.gradient
     H[np.ix_(first, first)] += prior.information
-    g[first] += known
+    g[first] += pull
     for k, step in enumerate(steps):
         r, J = step_residual(values, k, step)
         weighted = np.linalg.solve(step.covariance, J).T
@@ -214,15 +214,15 @@ def normal_equations(
         at = np.r_[0:SHARED, a : a + 2 * STATE_SIZE]
         H[np.ix_(at, at)] += weighted @ J
         g[at] += weighted @ r
-    if len(seen):
-        r, by_pose, by_plane = sighting_residuals(values, seen, anchors, T_imu_lidar)
+    if len(sightings):
+        r, by_pose, by_plane = sighting_residuals(values, sightings, anchors, T_imu_lidar)
         J = np.concatenate([by_pose, by_plane], axis=2)
-        far = np.sqrt(np.einsum("ki,kij,kj->k", r, seen.information, r))
+        far = np.sqrt(np.einsum("ki,kij,kj->k", r, sightings.information, r))
         weight = np.minimum(1.0, HUBER / np.maximum(far, HUBER))
-        weighted = np.swapaxes(J, 1, 2) @ (weight[:, None, None] * seen.information)
+        weighted = np.swapaxes(J, 1, 2) @ (weight[:, None, None] * sightings.information)
         at = np.concatenate([
-            SHARED + STATE_SIZE * seen.states[:, None] + np.arange(6),
-            values.first_plane + PLANE_SIZE * seen.planes[:, None] + np.arange(PLANE_SIZE),
+            SHARED + STATE_SIZE * sightings.states[:, None] + np.arange(6),
+            values.first_plane + PLANE_SIZE * sightings.planes[:, None] + np.arange(PLANE_SIZE),
         ], axis=1)  # fmt: skip
         np.add.at(H, (at[:, :, None], at[:, None, :]), weighted @ J)
         np.add.at(g, at, np.einsum("kij,kj->ki", weighted, r))

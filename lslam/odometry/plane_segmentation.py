@@ -97,31 +97,31 @@ class PlaneExtractor:
         cells = _Cells.of(voxels, order[voxels.moments[order, 0] >= FEWEST])
         wide = voxels.coarsen(WIDER)
         few = np.argsort(wide.keys[: len(wide)], kind="stable")
-        found = self._regions(
+        regions = self._regions(
             cells, [_Seeds.of(cells, voxels.planes[order]), _Seeds.of(cells, wide.planes[few], WIDER)]
         )
-        if not found:
+        if not regions:
             none = np.zeros((0, 3))
             return Planes(none, np.zeros((0, 3, 3)), np.zeros(0), none, np.zeros((0, 3, 3)), np.zeros(0), none, none)
-        return Planes(*(np.stack(column) for column in zip(*found, strict=True)))
+        return Planes(*(np.stack(column) for column in zip(*regions, strict=True)))
 
     def _regions(self, cells: _Cells, sizes: list[_Seeds]) -> list[tuple[Floats, ...]]:
-        free, found = np.ones(len(cells.means), bool), list[tuple[Floats, ...]]()
-        tried = 0
+        free, regions = np.ones(len(cells.means), bool), list[tuple[Floats, ...]]()
+        trials = 0
         for seeds in sizes:
             fresh = free.copy()
             for cell, mean, normal in zip(seeds.cells, seeds.means, seeds.normals, strict=True):
-                if not fresh[cell] or len(found) == MOST_PLANES or tried == MOST_SEEDS:
+                if not fresh[cell] or len(regions) == MOST_PLANES or trials == MOST_SEEDS:
                     continue
-                tried += 1
+                trials += 1
                 region = cells.grown(int(cell), mean, normal, seeds.radii, free)
                 fresh[cell] = False
                 fresh[region] = False
                 plane = self._plane(cells, region)
                 if plane is not None:
                     free[region] = False
-                    found.append(plane)
-        return found
+                    regions.append(plane)
+        return regions
 
     def _plane(self, cells: _Cells, region: Longs) -> tuple[Floats, ...] | None:
         """The plane of a region of voxels in the order of `Planes`, None where it is too small."""

@@ -164,8 +164,8 @@ class PlaneWindow:
         """(6, 6) of the newest pose, were the planes known exactly."""
         first = self.values.first_plane
         H = np.ascontiguousarray(self.normal().H[:first, :first])
-        left = Normal(H, np.zeros(first)).without(self._older[:first])
-        return linalg.inverse(left.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
+        rest = Normal(H, np.zeros(first)).without(self._older[:first])
+        return linalg.inverse(rest.H)[SHARED : SHARED + 6, SHARED : SHARED + 6]
 
     @property
     def _older(self) -> Bools:
@@ -194,18 +194,18 @@ class PlaneWindow:
             seen=replace(rest, states=rest.states - 1),
         )  # fmt: skip
 
-    def _without_planes(self, gone: Bools) -> PlaneWindow:
-        gone = gone & ~np.isin(np.arange(len(gone)), self.seen.planes)
-        if not gone.any():
+    def _without_planes(self, is_old: Bools) -> PlaneWindow:
+        is_old = is_old & ~np.isin(np.arange(len(is_old)), self.seen.planes)
+        if not is_old.any():
             return self
-        out = np.concatenate([np.zeros(SHARED + STATE_SIZE, bool), np.repeat(gone, PLANE_SIZE)])
+        out = np.concatenate([np.zeros(SHARED + STATE_SIZE, bool), np.repeat(is_old, PLANE_SIZE)])
         # At the present planes, not where they were: the prior moves with its gradient.
         at = self.prior.at
-        left = Normal(self.prior.information, self.prior.gradient).without(out)
-        number = np.cumsum(~gone) - 1
+        rest = Normal(self.prior.information, self.prior.gradient).without(out)
+        number = np.cumsum(~is_old) - 1
         return replace(
-            self, values=self.values.cut(slice(None), ~gone), prior=WindowPrior(left.H, left.g, at.cut(slice(None), ~gone)),
-            landmarks=self.landmarks.only(~gone), seen=replace(self.seen, planes=number[self.seen.planes]),
+            self, values=self.values.cut(slice(None), ~is_old), prior=WindowPrior(rest.H, rest.g, at.cut(slice(None), ~is_old)),
+            landmarks=self.landmarks.only(~is_old), seen=replace(self.seen, planes=number[self.seen.planes]),
         )  # fmt: skip
 
 
@@ -222,13 +222,13 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
 
     window : its newest state predicted; covariance : (27 + 3 M) square of that, from `joint_covariance`
     """
-    found = np.full(len(planes), -1)
+    matches = np.full(len(planes), -1)
     which, landmark = _candidates(window, planes)
     if len(which) == 0:
-        return found
+        return matches
     states, covariances = np.full(len(which), window.values.states - 1), planes.covariance[which]
-    seen = Sightings(states, landmark, planes.cp[which], np.asarray(np.linalg.inv(covariances), np.float64))
-    r, by_pose, by_plane = sighting_residuals(window.values, seen, window.landmarks.anchors, window.T_imu_lidar)
+    sightings = Sightings(states, landmark, planes.cp[which], np.asarray(np.linalg.inv(covariances), np.float64))
+    r, by_pose, by_plane = sighting_residuals(window.values, sightings, window.landmarks.anchors, window.T_imu_lidar)
     J = np.concatenate([by_pose, by_plane], axis=2)
     at = np.concatenate([
         np.broadcast_to(SHARED + np.arange(6), (len(which), 6)),
@@ -239,8 +239,8 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
     # The nearest landmark of each plane: the last one written is the smallest.
     for k in np.argsort(-squares, kind="stable"):
         if squares[k] < GATE:
-            found[which[k]] = landmark[k]
-    return found
+            matches[which[k]] = landmark[k]
+    return matches
 
 
 def _candidates(window: PlaneWindow, planes: Planes) -> tuple[Longs, Longs]:

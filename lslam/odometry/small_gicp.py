@@ -49,15 +49,15 @@ class SmallGicp(Traits):
 
     def prepare(self, scan: Scan) -> Any:
         """The package's point cloud: gated, down-sampled, with a covariance per point; None without usable points."""
-        kept = clean_points(scan.points, self._preprocess)
-        return self._covered(kept.astype(np.float64))[0] if len(kept) >= MIN_SOURCE_POINTS else None
+        points = clean_points(scan.points, self._preprocess)
+        return self._covered(points.astype(np.float64))[0] if len(points) >= MIN_SOURCE_POINTS else None
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         """Align with the local map; enter a keyframe when the sensor has moved on."""
         began = time.perf_counter()
-        found = self._align(prepared, prior.pose)
+        alignment = self._align(prepared, prior.pose)
         aligned = time.perf_counter()
-        result = judged(scan, found, prior.pose, self._limits, {})
+        result = judged(scan, alignment, prior.pose, self._limits, {})
         if result.status == "ok" and self._has_moved_on(result.T_world_lidar):
             self._insert(np.asarray(prepared.points())[:, :3], result.T_world_lidar)
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
@@ -68,13 +68,13 @@ class SmallGicp(Traits):
         if self._target is None or count < MIN_SOURCE_POINTS:
             return RegistrationResult(T_prior, source_points=count, inliers=count)
         target, tree = self._target
-        found = self._package.align(
+        alignment = self._package.align(
             target, source, tree, T_prior, max_correspondence_distance=REACH, num_threads=self._threads
         )
-        pose = np.asarray(found.T_target_source, np.float64)
+        pose = np.asarray(alignment.T_target_source, np.float64)
         return RegistrationResult(
-            pose, source_points=count, inliers=int(found.num_inliers), converged=bool(found.converged),
-            iterations=int(found.iterations),
+            pose, source_points=count, inliers=int(alignment.num_inliers), converged=bool(alignment.converged),
+            iterations=int(alignment.iterations),
         )  # fmt: skip
 
     def _has_moved_on(self, pose: Floats) -> bool:

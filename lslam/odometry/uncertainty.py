@@ -104,7 +104,7 @@ class PoseUncertainty(Stateful):
     map_age : mean age, in scans, of the points of the map on which the next scan is registered
     """
 
-    STATE: ClassVar[tuple[str, ...]] = ("_map", "_position", "_start", "_begun", "_sweep", "_scans", "map_age")
+    STATE: ClassVar[tuple[str, ...]] = ("_map", "_position", "_start", "_start_factor", "_sweep", "_scans", "map_age")
 
     def __init__(self, *, is_scan_to_scan: bool = False) -> None:
         self.is_scan_to_scan = is_scan_to_scan
@@ -113,7 +113,7 @@ class PoseUncertainty(Stateful):
         # The world's origin, until the first sweep's covariance is estimated.
         self._start: Floats | None = None
         # Factor on the deskewing covariance, of the first scan and those entered with it until then.
-        self._begun = FIRST
+        self._start_factor = FIRST
         self._sweep = DeskewUncertainty()
         self._scans = 0
         self.map_age = 1.0
@@ -155,15 +155,15 @@ class PoseUncertainty(Stateful):
             self.map_age = 1 + (1 - share) * self.map_age
         if self._start is None:
             return np.asarray(self._map + own)
-        begun = noise.transported(self._begun * sweep, position - self._start)
+        at_start = noise.transported(self._start_factor * sweep, position - self._start)
         if self._sweep.scans >= BEGINNING:
-            self._map, self._start = self._map + begun, None
+            self._map, self._start = self._map + at_start, None
             return np.asarray(self._map + own)
-        return np.asarray(self._map + begun + own)
+        return np.asarray(self._map + at_start + own)
 
     def _enter(self, share: float, sweep: Floats) -> None:
         """Add a share of a scan's deskewing covariance (6, 6) to the map's."""
         if self._start is None:
             self._map += share * sweep
         else:
-            self._begun += share
+            self._start_factor += share

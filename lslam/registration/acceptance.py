@@ -69,10 +69,10 @@ class Acceptance:
             return Rejection("inliers", f"only {result.inlier_share:.0%} of the matches agree")
         share = result.inlier_share if self.is_usual_of_matches else result.agreement
         if self.usual is not None and self.usual.is_collapse(share):
-            said = (
+            message = (
                 f"only {share:.0%} of the {self.source} agree with the {self.target}, lately {self.usual.usual:.0%} did"
             )
-            return Rejection("agreement", said)
+            return Rejection("agreement", message)
         if move > self.max_jump_m or turn_deg > self.max_jump_deg:
             return Rejection("jump", f"impossible jump of {move:.1f} m and {turn_deg:.0f} deg")
         return None

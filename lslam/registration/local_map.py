@@ -84,8 +84,8 @@ class LocalMap(Stateful):
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         self.changes += 1
-        for level, kept in zip(self.levels, state["levels"], strict=True):
-            level.restore(kept)
+        for level, level_state in zip(self.levels, state["levels"], strict=True):
+            level.restore(level_state)
 
 
 class MapScans(Stateful, ABC):
@@ -134,8 +134,8 @@ class LastKeyframes(MapScans):
             return
         del self.keyframes[0]
         target.clear()
-        for kept, pose in self.keyframes:
-            self.insert(target, kept, pose)
+        for keyframe_cloud, pose in self.keyframes:
+            self.insert(target, keyframe_cloud, pose)
 
     def insert(self, target: Any, cloud: Any, T_world_lidar: Floats) -> None:
         """Add what a map of this kind takes of a scan."""

@@ -34,8 +34,9 @@ def _with_gaps(points: PreparedPoints, sigma: float) -> Arrays:
 def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
     from lslam.registration.source_covariance import source_covariance
 
-    known = points.covariance
-    return points.source, source_covariance(points.source, points.map_points, sigma**2) if known is None else known
+    if points.covariance is not None:
+        return points.source, points.covariance
+    return points.source, source_covariance(points.source, points.map_points, sigma**2)
 
 
 def _planes(target: GaussianMap) -> Arrays:

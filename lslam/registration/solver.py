@@ -160,35 +160,35 @@ def part_of_usual(size: float, usual: float) -> float:
     return min(usual / size, 1.0)
 
 
-def result_of(found: OptimiserResult, T_prior: Floats, source_points: int) -> RegistrationResult:
+def result_of(optimum: OptimiserResult, T_prior: Floats, source_points: int) -> RegistrationResult:
     """The optimiser's result as a registration's, or the prior (4, 4) where it is not finite."""
-    finite = bool(np.isfinite(found.pose).all() and np.isfinite(found.step).all())
-    is_known = finite and found.matched >= LEAST_MATCHED
+    finite = bool(np.isfinite(optimum.pose).all() and np.isfinite(optimum.step).all())
+    is_known = finite and optimum.matched >= LEAST_MATCHED
     return RegistrationResult(
-        T_world_lidar=found.pose if finite else T_prior,
+        T_world_lidar=optimum.pose if finite else T_prior,
         ok=finite,
         reason="" if finite else "the solution is not finite",
-        covariance=_covariance(found) if is_known else None,
-        converged=found.converged,
-        iterations=found.iterations,
+        covariance=_covariance(optimum) if is_known else None,
+        converged=optimum.converged,
+        iterations=optimum.iterations,
         source_points=source_points,
-        matched=found.matched,
-        inliers=found.inliers,
-        rmse=found.rmse,
-        degenerate=found.weak,
-        lever_arm=found.lever_arm,
+        matched=optimum.matched,
+        inliers=optimum.inliers,
+        rmse=optimum.rmse,
+        degenerate=optimum.weak,
+        lever_arm=optimum.lever_arm,
     )
 
 
-def _covariance(found: OptimiserResult) -> Floats:
+def _covariance(optimum: OptimiserResult) -> Floats:
     """Inverse of the information, with a sigma of one metre along degenerate directions."""
-    lever = found.lever_arm
+    lever = optimum.lever_arm
     scale = np.array([1.0, 1.0, 1.0, 1 / lever, 1 / lever, 1 / lever])
-    A = found.H * np.outer(scale, scale)
+    A = optimum.H * np.outer(scale, scale)
     values, vectors = np.linalg.eigh(A)
-    values = np.maximum(values, 1e-9 * max(found.information, 1e-9))
-    if len(found.weak):
-        along = ((found.weak @ vectors) ** 2).sum(0) > 0.5
+    values = np.maximum(values, 1e-9 * max(optimum.information, 1e-9))
+    if len(optimum.weak):
+        along = ((optimum.weak @ vectors) ** 2).sum(0) > 0.5
         values = np.where(along, np.minimum(values, 1.0), values)
     C = (vectors / values) @ vectors.T
     return np.asarray(C * np.outer(scale, scale))

@@ -54,25 +54,25 @@ class NonGroundPoints:
             index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance, self._up)
             self._cells.insert(points[index], T_world_lidar)
 
-    def agreeing(self, seen: PreparedPoints, T_world_lidar: Floats) -> Bools:
+    def agreeing(self, high: PreparedPoints, T_world_lidar: Floats) -> Bools:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
-        matches = Correspondences(len(seen.source))
-        terms = voxel_terms(MEANS, MEANS.points(seen, NEAR), (self._cells,), matches, NEAR, 1.0)
+        matches = Correspondences(len(high.source))
+        terms = voxel_terms(MEANS, MEANS.points(high, NEAR), (self._cells,), matches, NEAR, 1.0)
         optimise(terms, T_world_lidar, Annealing(NEAR, NEAR, 0.5, 1), Limits(0.0), matches)
         return (matches.away2 >= 0) & (matches.away2 < NEAR**2)
 
-    def share(self, seen: PreparedPoints, T_world_lidar: Floats) -> float:
+    def share(self, high: PreparedPoints, T_world_lidar: Floats) -> float:
         """Which part of them does."""
-        return np.count_nonzero(self.agreeing(seen, T_world_lidar)) / max(len(seen.source), 1)
+        return np.count_nonzero(self.agreeing(high, T_world_lidar)) / max(len(high.source), 1)
 
-    def align(self, seen: PreparedPoints, T_start: Floats) -> RegistrationResult:
+    def align(self, high: PreparedPoints, T_start: Floats) -> RegistrationResult:
         """Lay them on these points, point to point, from less than `START_STEP` away, with height and tilt as they are.
 
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
         level = np.eye(6) - upright_directions(T_start, self._up)
         annealing = Annealing(START_STEP, NEAR / 2, 0.7, 20)
-        return solve((self._cells,), seen, T_start, annealing, ALL_ALIKE, residual=MEANS, allowed=level)
+        return solve((self._cells,), high, T_start, annealing, ALL_ALIKE, residual=MEANS, allowed=level)
 
 
 def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground:
@@ -82,8 +82,8 @@ def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground
 
 def sought(points: PreparedPoints, ground: Ground) -> PreparedPoints:
     """What to look for among `NonGroundPoints` at some pose: the points of another scan that are high above its ground."""
-    wanted = points.map_points[ground.above(points.map_points, HIGH)]
-    return PreparedPoints(wanted, wanted.astype(np.float64), np.zeros((len(wanted), 6)), len(wanted))
+    above = points.map_points[ground.above(points.map_points, HIGH)]
+    return PreparedPoints(above, above.astype(np.float64), np.zeros((len(above), 6)), len(above))
 
 
 def on_ground(points: PreparedPoints, ground: Ground, tolerance: float) -> PreparedPoints:
@@ -117,16 +117,16 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
     """
     target, c, points, T_prior = attempt.target, attempt.config, attempt.points, attempt.T_prior
     ground = ground_under(points, target.preprocess)
-    non_ground, seen = NonGroundPoints(attempt.history.recent, target.preprocess), sought(points, ground)
+    non_ground, high = NonGroundPoints(attempt.history.recent, target.preprocess), sought(points, ground)
     if is_lost:
-        result = _best_start(attempt, result, non_ground, seen)
+        result = _best_start(attempt, result, non_ground, high)
     coarser = target.coarse_maps(points, T_prior)
     flat = on_ground(points, ground, target.preprocess.ground_tolerance)
     width = NEAR_KERNEL * c.kernel_min
 
     def placed(start: Floats) -> RegistrationResult:
         """Height and tilt by the ground, the rest by non-ground points, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
-        aligned = non_ground.align(seen, upright(start))
+        aligned = non_ground.align(high, upright(start))
         return aligned.moved(upright(aligned.T_world_lidar), aligned.covariance)
 
     def upright(pose: Floats) -> Floats:
@@ -135,11 +135,11 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
         return aligned.T_world_lidar
 
     def agreeing(at: RegistrationResult) -> Bools:
-        return non_ground.agreeing(seen, at.T_world_lidar)
+        return non_ground.agreeing(high, at.T_world_lidar)
 
     starts = [T_prior]
     if is_lost or not result.ok:
-        starts.append(_likeliest(non_ground, seen, T_prior, c.start_reach, up_of(target.preprocess)))
+        starts.append(_likeliest(non_ground, high, T_prior, c.start_reach, up_of(target.preprocess)))
     aligned = max(map(placed, starts), key=lambda at: np.count_nonzero(agreeing(at)))
     place, most = aligned.T_world_lidar, agreeing(aligned)
     last = attempt.history.recent[-1][1]
@@ -158,23 +158,23 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
 
 
 def _best_start(
-    attempt: Attempt, best: RegistrationResult, non_ground: NonGroundPoints, seen: PreparedPoints
+    attempt: Attempt, best: RegistrationResult, non_ground: NonGroundPoints, high: PreparedPoints
 ) -> RegistrationResult:
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
-    target, count = attempt.target, len(seen.source)
+    target, count = attempt.target, len(high.source)
     coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_SHARE)
     slow = target.slowly(2 * START_STEP)
-    tried = [
+    trials = [
         target.on_planes(coarse_map, few, attempt.T_prior @ se3.make(np.eye(3), offset), slow)
         for offset in start_offsets(attempt.config.start_reach, START_STEP, up_of(target.preprocess))
     ]
     # Without non-ground points, as in hills, the ground decides.
-    tried.sort(key=lambda at: (-non_ground.share(seen, at.T_world_lidar), -at.inliers))
-    for promising in distinct(tried, best.T_world_lidar):
+    trials.sort(key=lambda at: (-non_ground.share(high, at.T_world_lidar), -at.inliers))
+    for promising in distinct(trials, best.T_world_lidar):
         start = promising.T_world_lidar
         # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
         result = attempt.judged(target.coarse_to_fine(attempt.points, start, 2 * START_STEP), start)
-        share, usual = (non_ground.share(seen, at.T_world_lidar) for at in (result, best))
+        share, usual = (non_ground.share(high, at.T_world_lidar) for at in (result, best))
         if count == 0:
             share, usual = result.agreement, best.agreement
         # A failed one has the prior's pose: fewer inliers than there are no improvement.
@@ -184,13 +184,13 @@ def _best_start(
 
 
 def _likeliest(
-    non_ground: NonGroundPoints, seen: PreparedPoints, T_prior: Floats, reach: float, up: Floats
+    non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats
 ) -> Floats:  # fmt: skip
     """(4, 4) pose up to `reach`, m, from the prior, or turned about `up`, at which most points have one near by."""
     moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR, up)]
     turns = np.deg2rad(START_TURNS_DEG)
     turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in turns]
-    return max([*moved, *turned], key=lambda start: non_ground.share(seen, start))
+    return max([*moved, *turned], key=lambda start: non_ground.share(high, start))
 
 
 def is_at_rest(pose: Floats, last: Floats) -> bool:
@@ -208,9 +208,9 @@ def is_much_more(ours: Bools, others: Bools, margin: float = MUCH) -> bool:
     return bool(np.count_nonzero(ours) > margin * np.count_nonzero(others) and is_more(int(won), int(lost)))
 
 
-def distinct(results: list[RegistrationResult], known: Floats) -> list[RegistrationResult]:
+def distinct(results: list[RegistrationResult], T_best: Floats) -> list[RegistrationResult]:
     """The first `LOOKED_AT` places that lie at least half a step from the known pose (4, 4) and from each other."""
-    places, chosen = [known[:3, 3]], []
+    places, chosen = [T_best[:3, 3]], []
     for result in results:
         place = result.T_world_lidar[:3, 3]
         if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP / 2:

@@ -52,7 +52,7 @@ STATE_CLASSES = (
 log = logging.getLogger("lslam")
 
 # The last one may be damaged when the machine itself went down while it was written.
-KEPT = 2
+COPIES = 2
 
 
 class CheckpointSchedule:
@@ -98,9 +98,9 @@ class Checkpoints:
         """
         began = time.perf_counter()
         self.folder.mkdir(exist_ok=True)
-        known = {**content(), "warned": warnings_so_far().state()}
-        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", known)
-        for old in self._files()[:-KEPT]:
+        record = {**content(), "warned": warnings_so_far().state()}
+        write_state(self.folder / f"{self._stage}-{scans:07d}.npz", record)
+        for old in self._files()[:-COPIES]:
             with contextlib.suppress(OSError):
                 old.unlink()
         self.schedule.wrote(time.perf_counter() - began)
@@ -109,9 +109,9 @@ class Checkpoints:
         """What the newest checkpoint that can be read holds, its warnings being those of this run now; None without one."""
         for path in reversed(self._files()):
             try:
-                known = read_state(path, STATE_CLASSES)
-                warnings_so_far().take_over(known.pop("warned", {"texts": [], "places": []}))
-                return known
+                record = read_state(path, STATE_CLASSES)
+                warnings_so_far().take_over(record.pop("warned", {"texts": [], "places": []}))
+                return record
             except InputError as error:
                 log.warning("a checkpoint is left out: %s", error)
                 with contextlib.suppress(OSError):

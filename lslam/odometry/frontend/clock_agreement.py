@@ -225,10 +225,10 @@ def _distance(tree: Any, cloud: Floats, owner: Longs, number: int, points: Float
     near = np.where(is_there, near, 0)
     weight = (is_there & (owner[near] != number)).astype(np.float64)
     count = weight.sum(axis=1)
-    kept = count >= _FEWEST
-    if not kept.any():
+    is_usable = count >= _FEWEST
+    if not is_usable.any():
         return _LOST
-    points, near, weight, count = points[kept], near[kept], weight[kept], count[kept, None]
+    points, near, weight, count = points[is_usable], near[is_usable], weight[is_usable], count[is_usable, None]
     neighbours = cloud[near]
     middle = np.einsum("nk,nki->ni", weight, neighbours) / count
     apart = (neighbours - middle[:, None]) * weight[..., None]

@@ -103,19 +103,19 @@ def _judge(windows: list[ClockWindow], proposal: Proposal, sample: Scan) -> Cloc
     """
     forward = proposal.clock
     backward = replace(forward, is_reversed=True)
-    tried: list[SweepClock | None] = [None, forward, backward]
-    best = _best(windows, tried)
+    candidates: list[SweepClock | None] = [None, forward, backward]
+    best = _best(windows, candidates)
     if proposal.is_guess or best is None:
-        tried += [replace(clock, turn=turn) for clock in (forward, backward) for turn in TURNS]
+        candidates += [replace(clock, turn=turn) for clock in (forward, backward) for turn in TURNS]
     else:
-        tried += [replace(best, turn=turn) for turn in TURNS]
-    best = _best(windows, tried)
+        candidates += [replace(best, turn=turn) for turn in TURNS]
+    best = _best(windows, candidates)
     if best is not None and (best.turn or proposal.is_guess):
         for step in _FINER:
             near = [replace(best, turn=(best.turn + sign * step) % 1.0) for sign in (-1, 1)]
-            tried += near
+            candidates += near
             best = min((best, *near), key=lambda clock: mean_score(windows, clock))
-    return _verdict(windows, tried, best, sample, proposal.is_guess)
+    return _verdict(windows, candidates, best, sample, proposal.is_guess)
 
 
 def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepClock | None:
@@ -123,35 +123,35 @@ def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepC
 
 
 def _verdict(
-    windows: list[ClockWindow], tried: list[SweepClock | None], best: SweepClock | None, sample: Scan,
+    windows: list[ClockWindow], candidates: list[SweepClock | None], best: SweepClock | None, sample: Scan,
     is_guess: bool,
 ) -> ClockChoice:  # fmt: skip
-    scores = {_name(clock): mean_score(windows, clock) for clock in tried}
-    rivals = [clock for clock in tried if clock is not best and not _is_alike(best, clock, sample)]
+    scores = {_name(clock): mean_score(windows, clock) for clock in candidates}
+    rivals = [clock for clock in candidates if clock is not best and not _is_alike(best, clock, sample)]
     results = {_name(clock): compare_clocks(windows, best, clock) for clock in rivals}
     closest = min(results, key=lambda name: results[name].t)
     count = sum(len(window.scores(None)) for window in windows)
     margin = f"t = {results[closest].t:.1f} against {closest}, {count} scans"
     # Under the reverse of a clock compensated scans agree as well as under the clock itself. Where it is worse beyond doubt they
     # are not, and for the rest it is enough that the order of the points speaks for the clock too.
-    if best is not None and best == tried[1] and not is_guess and _is_forward(windows, best, tried[2]):
+    if best is not None and best == candidates[1] and not is_guess and _is_forward(windows, best, candidates[2]):
         is_clear = all(result.is_likely for result in results.values())
     else:
         is_clear = all(result.is_clear for result in results.values())
     # Under a wrong clock the motion may be lost. But what is proposed must have been judged before another, or none, is taken.
-    needed = tried if is_guess else tried[:3] if best != tried[1] else tried[:2]
+    needed = candidates if is_guess else candidates[:3] if best != candidates[1] else candidates[:2]
     is_clear &= not any(window.is_astray(clock) for window in windows for clock in needed)
     # The order tells better where a sweep begins than scans that agree a little better with another place near by.
     is_clear &= is_guess or best is None or not 0 < min(best.turn, 1 - best.turn) < _NEAR
-    moving = best or next(clock for clock in tried if clock is not None)
+    moving = best or next(clock for clock in candidates if clock is not None)
     half = replace(moving, seconds=0.5 * moving.seconds)
     if is_clear and compare_clocks(windows, half, best).t > _HALF_T:
         is_clear, margin = False, "a sweep of half the time between scans fits better"
     if not is_clear:
         return ClockChoice(
             None, "unclear",
-            f"point times: not clear whether {_name(best or tried[1])} tells them ({margin}): left without, point_times states "
-            "them", scores,
+            f"point times: not clear whether {_name(best or candidates[1])} tells them ({margin}): left without, point_times "
+            "states them", scores,
         )  # fmt: skip
     if best is None:
         return ClockChoice(

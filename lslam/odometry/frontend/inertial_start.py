@@ -73,16 +73,16 @@ def begin_inertial(sequence: Sequence, config: Config) -> Inertial:
         part.problems.append("T_lidar_imu is not known: the IMU is taken to sit in the LiDAR with the same axes")
         T_lidar_imu = np.eye(4)
     try:
-        begun = _begin(sequence, sequence.imu, T_lidar_imu, config)
+        opening = _begin(sequence, sequence.imu, T_lidar_imu, config)
     except ImuRefusedError as error:
         if is_needed:
             raise InputError(f"{config.odometry.method} needs an IMU, and this one is refused: {error}") from None
         part.problems.append(f"the IMU is refused, the run goes on without it: {error}")
         log.warning("%s", part.problems[-1])
         return part
-    part.start, part.notes = begun, list(begun.notes)
-    part.problems += begun.problems
-    part.motion = motion_of(begun, config)
+    part.start, part.notes = opening, list(opening.notes)
+    part.problems += opening.problems
+    part.motion = motion_of(opening, config)
     for note in part.notes:
         log.info("%s", note)
     return part
@@ -107,13 +107,13 @@ def save_start(path: Path, part: Inertial) -> None:
 def load_start(path: Path, config: Config) -> Inertial | None:
     """What `begin_inertial` found in an earlier run; None when that is not there, or cannot be read."""
     try:
-        known = read_state(path, STATE_CLASSES) if path.is_file() else None
+        record = read_state(path, STATE_CLASSES) if path.is_file() else None
     except InputError as error:
         log.warning("the IMU is aligned again: %s", error)
-        known = None
-    if known is None:
+        record = None
+    if record is None:
         return None
-    part = Inertial(None, known["start"], known["notes"], known["problems"])
+    part = Inertial(None, record["start"], record["notes"], record["problems"])
     if part.start is not None:
         part.motion = motion_of(part.start, config)
     return part
@@ -123,20 +123,20 @@ def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, config: Conf
     """The start by scans registered without the IMU; again by scans that it then deskewed, where that matters."""
     last_ns = int(sequence.stamps_ns[-1])
     first = first_poses(sequence, config, None)
-    begun = start(imu, T_lidar_imu, first, last_ns, config.imu)
-    is_moved = begun.offset_s != 0 and config.imu.time_offset_s is None
+    opening = start(imu, T_lidar_imu, first, last_ns, config.imu)
+    is_moved = opening.offset_s != 0 and config.imu.time_offset_s is None
     if not is_moved and first.covariances is not None:
-        return begun
-    motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
+        return opening
+    motion = InertialMotion(opening.imu, T_lidar_imu, opening.estimate, config.imu)
     better = first_poses(sequence, config, motion)
     if not is_moved:
         on_time = config.imu.model_copy(update={"time_offset_s": 0.0})
-        again = start(begun.imu, T_lidar_imu, better, last_ns, on_time)
-        return replace(again, offset_s=begun.offset_s, notes=begun.notes, problems=begun.problems)
-    again = start(begun.imu, T_lidar_imu, better, last_ns, config.imu, 0.0)
-    offset = begun.offset_s + again.offset_s
-    said = f"IMU stamps moved by {1e3 * offset:+.1f} ms: its turns then fit those of the scans best"
-    return replace(again, offset_s=offset, notes=[*begun.notes, said])
+        again = start(opening.imu, T_lidar_imu, better, last_ns, on_time)
+        return replace(again, offset_s=opening.offset_s, notes=opening.notes, problems=opening.problems)
+    again = start(opening.imu, T_lidar_imu, better, last_ns, config.imu, 0.0)
+    offset = opening.offset_s + again.offset_s
+    note = f"IMU stamps moved by {1e3 * offset:+.1f} ms: its turns then fit those of the scans best"
+    return replace(again, offset_s=offset, notes=[*opening.notes, note])
 
 
 def with_imu_settings(config: Config) -> Config:
@@ -202,15 +202,15 @@ def first_heard_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> i
 
 def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     """What the manifest says of the IMU when the run is over; problems that arose on the way are added to `part`."""
-    motion, begun = part.motion, part.start
-    if motion is None or begun is None:
+    motion, opening = part.motion, part.start
+    if motion is None or opening is None:
         return {"used": False, "decisions": [*part.notes, *part.problems]}
     if motion.gap_scans:
         part.problems.append(
             f"IMU: {motion.gap_scans} scans fell into gaps of the IMU and were predicted by constant velocity"
         )
-    if said := mounting_problem(motion):
-        part.problems.append(said)
+    if problem := mounting_problem(motion):
+        part.problems.append(problem)
     if motion.refusal:
         part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")
     last = motion.estimate
@@ -222,10 +222,10 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "used": not motion.refusal,
         "decisions": part.notes,
         "velocity": motion.config.velocity,
-        "time_offset_s": round(begun.offset_s + last.gyroscope.offset_s, 5),
-        **calibration_found(last.gyroscope, begun),
-        "is_checked_by_turns": begun.is_checked,
-        "is_static_start": begun.is_static,
+        "time_offset_s": round(opening.offset_s + last.gyroscope.offset_s, 5),
+        **calibration_found(last.gyroscope, opening),
+        "is_checked_by_turns": opening.is_checked,
+        "is_static_start": opening.is_static,
         "gyro_bias_rad_s": _rounded(last.gyroscope.bias, 5),
         "accel_bias_m_s2": _rounded(last.accel_bias, 4),
         "gravity_in_world_m_s2": _rounded(last.gravity, 4),
@@ -298,22 +298,22 @@ def _is_turned(gyroscope: Gyroscope) -> bool:
     return angle**2 > SIGMAS * float(np.sqrt(rotation @ covariance @ rotation))
 
 
-def calibration_found(gyroscope: Gyroscope, begun: InertialStart) -> dict[str, Any]:
+def calibration_found(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, Any]:
     """For the manifest: what was estimated, with its sigma; empty where nothing was to be.
 
     `mounting_deg` turns readings into the axes of the T_lidar_imu that was given, a rotation vector; `T_lidar_imu` is that with
     it.
     """
-    found: dict[str, Any] = {}
+    facts: dict[str, Any] = {}
     if gyroscope.has_offset:
-        found["time_offset_sigma_s"] = round(float(np.sqrt(gyroscope.covariance[12, 12])), 6)
+        facts["time_offset_sigma_s"] = round(float(np.sqrt(gyroscope.covariance[12, 12])), 6)
     if gyroscope.is_mounted:
         vector, sigma = gyroscope.rotation
-        T = begun.T_lidar_imu.copy()
+        T = opening.T_lidar_imu.copy()
         mounting = gyroscope.mounting
         assert mounting is not None
         T[:3, :3] = T[:3, :3] @ mounting
-        found["mounting_deg"] = [round(float(v), 3) for v in np.rad2deg(vector)]
-        found["mounting_sigma_deg"] = round(float(np.rad2deg(sigma)), 3)
-        found["T_lidar_imu"] = [round(float(v), 6) for v in T[:3].ravel()]
-    return found
+        facts["mounting_deg"] = [round(float(v), 3) for v in np.rad2deg(vector)]
+        facts["mounting_sigma_deg"] = round(float(np.rad2deg(sigma)), 3)
+        facts["T_lidar_imu"] = [round(float(v), 6) for v in T[:3].ravel()]
+    return facts

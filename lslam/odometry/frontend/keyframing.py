@@ -104,6 +104,6 @@ class Keyframing(Stateful):
     def _write(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:
         self.store.add(keyframe, keyframe_cloud(scan, motion, self._config.preprocess, self._config.keyframes))
 
-    def _wait(self, left: int) -> None:
-        while len(self._pending) > left:
+    def _wait(self, most: int) -> None:
+        while len(self._pending) > most:
             self._pending.pop(0).result()

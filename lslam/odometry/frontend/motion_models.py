@@ -26,25 +26,25 @@ def smoother_noise(noise: ImuNoise) -> SmootherNoise:
     return SmootherNoise(noise.force, noise.accel_walk, noise.gyro_walk, GRAVITY_WALK)
 
 
-def _loose(begun: InertialStart, config: Config) -> InertialMotion:
-    return InertialMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+def _loose(opening: InertialStart, config: Config) -> InertialMotion:
+    return InertialMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
 
 
-def _filter(begun: InertialStart, config: Config) -> InertialMotion:
-    return FilterMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+def _filter(opening: InertialStart, config: Config) -> InertialMotion:
+    return FilterMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
 
 
-def _smoother(begun: InertialStart, config: Config) -> InertialMotion:
-    smoother = InertialSmoother(smoother_noise(begun.estimate.gyroscope.noise), config.lio_sam.reset_scans)
-    return SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, smoother)
+def _smoother(opening: InertialStart, config: Config) -> InertialMotion:
+    smoother = InertialSmoother(smoother_noise(opening.estimate.gyroscope.noise), config.lio_sam.reset_scans)
+    return SmootherMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, smoother)
 
 
-def _window(begun: InertialStart, config: Config) -> InertialMotion:
-    return WindowMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu, config.lio_mapping.window)
+def _window(opening: InertialStart, config: Config) -> InertialMotion:
+    return WindowMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, config.lio_mapping.window)
 
 
-def _planes(begun: InertialStart, config: Config) -> InertialMotion:
-    return LinkedMotion(begun.imu, begun.T_lidar_imu, begun.estimate, config.imu)
+def _planes(opening: InertialStart, config: Config) -> InertialMotion:
+    return LinkedMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
 
 
 MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
@@ -55,13 +55,13 @@ MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
 }
 
 
-def motion_of(begun: InertialStart, config: Config) -> InertialMotion:
+def motion_of(opening: InertialStart, config: Config) -> InertialMotion:
     """The motion model that the method asks for."""
-    return MOTION_MODELS.get(config.odometry.method, _loose)(begun, config)
+    return MOTION_MODELS.get(config.odometry.method, _loose)(opening, config)
 
 
-def copy_of(motion: InertialMotion, begun: InertialStart, config: Config) -> InertialMotion:
+def copy_of(motion: InertialMotion, opening: InertialStart, config: Config) -> InertialMotion:
     """A second model of the same IMU that goes on where `motion` is."""
-    other = motion_of(begun, config)
+    other = motion_of(opening, config)
     other.restore(deepcopy(motion.state()))
     return other

@@ -152,18 +152,18 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
 
     A skipped scan adds `PRIOR_COVARIANCE` to the last; that of a scan in another frame is `UNBOUNDED`.
     """
-    known = any(r.covariance is not None for r in results)
+    has_covariances = any(r.covariance is not None for r in results)
     covariances: list[Floats] = []
-    for result in results if known else ():
+    for result in results if has_covariances else ():
         before = covariances[-1] if covariances else np.zeros((6, 6))
         covariances.append(before + PRIOR_COVARIANCE if result.covariance is None else result.covariance)
-    elsewhere = [k for k, result in enumerate(results) if result.frame and known]
+    elsewhere = [k for k, result in enumerate(results) if result.frame and has_covariances]
     for k in elsewhere:
         covariances[k] = UNBOUNDED
     return Trajectory(
         stamps_ns=np.array([r.stamp_ns for r in results], np.int64),
         poses=np.stack([r.at_stamp.T_world_lidar for r in results]),
-        covariances=np.stack(covariances) if known else None,
+        covariances=np.stack(covariances) if has_covariances else None,
         source=method,
     )
 
@@ -202,9 +202,9 @@ def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> 
     read = time.perf_counter()
     if len(scan) == 0:
         return Loaded(scan.index, stamp_ns, error="the scan has no points", read_s=read - began)
-    given, scan = len(scan), measurable(scan)
+    count, scan = len(scan), measurable(scan)
     if len(scan) == 0:
-        why = f"0 usable points: none of {given} is finite and within {FARTHEST_M / 1e3:g} km"
+        why = f"0 usable points: none of {count} is finite and within {FARTHEST_M / 1e3:g} km"
         return Loaded(scan.index, stamp_ns, error=why, read_s=read - began, status="bridged")
     prepared = prepare(scan) if prepare is not None else None
     return Loaded(scan.index, stamp_ns, scan, prepared, "", read - began, time.perf_counter() - read)

@@ -97,7 +97,7 @@ class SegmentTracker(Stateful):
         result : of the present tracker
         """
         first = self._tracked(self._tracker, loaded, result, self._segment)
-        other = None if self._other is None else self._tried(self._other, loaded)
+        other = None if self._other is None else self._trial(self._other, loaded)
         is_held = first.result.status == "ok"
         if is_held:
             self._usual.observe(_share(first.result))
@@ -111,7 +111,7 @@ class SegmentTracker(Stateful):
         if is_held or self._begin is None or loaded.scan is None:
             return [*decided, first]
         self._other = self._begin(first.result.T_world_lidar)
-        other = self._tried(self._other, loaded)
+        other = self._trial(self._other, loaded)
         self._open = [(first, other)]
         return decided if other.result.status == "ok" else [*decided, *self.finish()]
 
@@ -142,7 +142,7 @@ class SegmentTracker(Stateful):
         self._segment += 1
         return registered
 
-    def _tried(self, other: Tracker, loaded: Loaded) -> Tracked:
+    def _trial(self, other: Tracker, loaded: Loaded) -> Tracked:
         return self._tracked(other, loaded, other.track(loaded), self._segment + 1)
 
     @staticmethod

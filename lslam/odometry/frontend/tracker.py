@@ -194,8 +194,8 @@ class Tracker(Stateful):
         )  # fmt: skip
         stages = {**result.stages, **own}
         if trial is not None and trial.is_accepted and result.status != "bridged":
-            taken = sum(seconds for name, seconds in stages.items() if name not in ("update", "standing"))
-            saved_s = sum(trial.stages.values()) - taken
+            work_s = sum(seconds for name, seconds in stages.items() if name not in ("update", "standing"))
+            saved_s = sum(trial.stages.values()) - work_s
             imu = replace(imu, steady_iterations=trial.iterations, saved_s=saved_s)
         return replace(result, prior_norm=_matrix_norm(expected.pose, pose), imu=imu, stages=stages)
 

@@ -61,31 +61,31 @@ def check_agreement(
     """
     if len(stamps_ns) < 5:
         return Agreement(False)
-    felt, seen = _Felt(imu, T_lidar_imu, stamps_ns), _seen(stamps_ns, poses)
+    imu_rates, scan_rates = _GyroRates(imu, T_lidar_imu, stamps_ns), _scan_rates(stamps_ns, poses)
     offsets = np.arange(-NEAR_S, NEAR_S + STEP_S / 2, STEP_S) if offset_s is None else np.array([offset_s])
-    width = _width(felt, seen, stamps_ns, poses, offsets)
+    width = _width(imu_rates, scan_rates, stamps_ns, poses, offsets)
     if width is None:
-        return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s), seen, T_lidar_imu)
-    felt, seen = _Felt(imu, T_lidar_imu, stamps_ns, width), _seen(stamps_ns, poses, width)
-    scores = np.array([_compare(seen, felt.rates(t))[0] for t in offsets])
+        return _hardly_turning(imu_rates.rates(0.0 if offset_s is None else offset_s), scan_rates, T_lidar_imu)
+    imu_rates, scan_rates = _GyroRates(imu, T_lidar_imu, stamps_ns, width), _scan_rates(stamps_ns, poses, width)
+    scores = np.array([_compare(scan_rates, imu_rates.rates(t))[0] for t in offsets])
     best = int(np.argmax(scores))
-    correlation, ratio, turning = _compare(seen, felt.rates(float(offsets[best])))
+    correlation, ratio, turning = _compare(scan_rates, imu_rates.rates(float(offsets[best])))
     if turning < LEAST_TURNING:
-        return _hardly_turning(felt.rates(0.0 if offset_s is None else offset_s), seen, T_lidar_imu)
+        return _hardly_turning(imu_rates.rates(0.0 if offset_s is None else offset_s), scan_rates, T_lidar_imu)
     _refuse_scale(ratio)
     if correlation < LEAST_CORRELATION:
-        raise _no_fit(felt, seen, correlation)
+        raise _no_fit(imu_rates, scan_rates, correlation)
     if offset_s is None and best in (0, len(offsets) - 1):
         at_zero = float(scores[len(offsets) // 2])
         if correlation > at_zero + CLEARLY:
-            raise _beyond(felt, seen, float(offsets[best]), at_zero, correlation)
+            raise _beyond(imu_rates, scan_rates, float(offsets[best]), at_zero, correlation)
         # In long even bends the clock offset is unobservable.
         best = len(offsets) // 2
-    _refuse_axes(felt, seen, offsets)
-    bias = _mean_excess(felt.rates(float(offsets[best])), seen, T_lidar_imu)
+    _refuse_axes(imu_rates, scan_rates, offsets)
+    bias = _mean_excess(imu_rates.rates(float(offsets[best])), scan_rates, T_lidar_imu)
     if offset_s is not None:
         return Agreement(True, correlation, offset_s, gyro_bias=bias)
-    offset, sigma = _refined(felt, seen, float(offsets[best]))
+    offset, sigma = _refined(imu_rates, scan_rates, float(offsets[best]))
     is_sure = abs(offset) > max(least_offset_s, SIGNIFICANT * sigma)
     return Agreement(True, correlation, offset if is_sure else 0.0, sigma, bias)
 
@@ -98,16 +98,16 @@ def turns(
     stamps_ns : (N,) of the poses (N, 4, 4) of the LiDAR; offset_s : s added to the IMU's stamps. M is 0 where the stream
     tells of less than half of the poses.
     """
-    return _centred(_seen(stamps_ns, poses), _Felt(imu, T_lidar_imu, stamps_ns).rates(offset_s))
+    return _centred(_scan_rates(stamps_ns, poses), _GyroRates(imu, T_lidar_imu, stamps_ns).rates(offset_s))
 
 
-def _seen(stamps_ns: Longs, poses: Floats, width: int = 1) -> Floats:
+def _scan_rates(stamps_ns: Longs, poses: Floats, width: int = 1) -> Floats:
     """(N - width, 3) rad/s in LiDAR axes, each from a scan to the one `width` later."""
     seconds = (stamps_ns[width:] - stamps_ns[:-width])[:, None] * 1e-9
     return np.asarray(so3.log(np.swapaxes(poses[:-width, :3, :3], -1, -2) @ poses[width:, :3, :3]) / seconds)
 
 
-class _Felt:
+class _GyroRates:
     """Mean angular rates from scan to scan, or to the one `width` later, in LiDAR axes, for any offset of the clocks."""
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, stamps_ns: Longs, width: int = 1) -> None:
@@ -127,61 +127,61 @@ class _Felt:
         return np.asarray((at[w:] - at[:-w]) / (query[w:] - query[:-w])[:, None])
 
 
-def _width(felt: _Felt, seen: Floats, stamps_ns: Longs, poses: Floats, offsets: Floats) -> int | None:
+def _width(imu_rates: _GyroRates, scan_rates: Floats, stamps_ns: Longs, poses: Floats, offsets: Floats) -> int | None:
     """Over how many scans turns must be compared for registration's noise to be a small part of them; None over any.
 
-    felt, seen : from scan to scan; offsets : of the clocks that are possible, s
+    imu_rates, scan_rates : from scan to scan; offsets : of the clocks that are possible, s
 
     What one pose is wrong by, two turns show with opposite signs: the noise stands in how what the gyroscope leaves changes
     its sign from scan to scan. A wrong gyroscope leaves turns, which do not.
     """
-    best = max(offsets, key=lambda t: _compare(seen, felt.rates(t))[0])
-    a, b = _centred(seen, felt.rates(float(best)))
+    best = max(offsets, key=lambda t: _compare(scan_rates, imu_rates.rates(t))[0])
+    a, b = _centred(scan_rates, imu_rates.rates(float(best)))
     if not len(a):
         return 1
-    left = a - b * (float(np.sum(a * b)) / max(float(np.sum(b * b)), 1e-12))
-    noise = max(-2.0 * float(np.sum(left[1:] * left[:-1])) / len(a), 0.0)
+    rest = a - b * (float(np.sum(a * b)) / max(float(np.sum(b * b)), 1e-12))
+    noise = max(-2.0 * float(np.sum(rest[1:] * rest[:-1])) / len(a), 0.0)
     for width in range(1, max(len(stamps_ns) // FEWEST_STRETCHES, 1) + 1):
-        power = float(np.sum(np.var(_seen(stamps_ns, poses, width), axis=0)))
+        power = float(np.sum(np.var(_scan_rates(stamps_ns, poses, width), axis=0)))
         if noise / width**2 <= MOST_NOISE * power:
             return width
     return None
 
 
-def _centred(seen: Floats, felt: Floats) -> tuple[Floats, Floats]:
-    known = np.isfinite(felt).all(axis=1)
-    if known.sum() < max(5, len(felt) // 2):
+def _centred(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
+    is_covered = np.isfinite(imu_rates).all(axis=1)
+    if is_covered.sum() < max(5, len(imu_rates) // 2):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    a, b = seen[known], felt[known]
+    a, b = scan_rates[is_covered], imu_rates[is_covered]
     return a - a.mean(axis=0), b - b.mean(axis=0)
 
 
-def _compare(seen: Floats, felt: Floats) -> tuple[float, float, float]:
+def _compare(scan_rates: Floats, imu_rates: Floats) -> tuple[float, float, float]:
     """Correlation of the rates about their means, how many times larger the felt ones are, and the rms of the seen ones."""
-    a, b = _centred(seen, felt)
+    a, b = _centred(scan_rates, imu_rates)
     if not len(a):
         return 0.0, 1.0, 0.0
     aa, bb, ab = (float(np.sum(x * y)) for x, y in ((a, a), (b, b), (a, b)))
     return ab / max(np.sqrt(aa * bb), 1e-12), float(np.sqrt(bb / max(aa, 1e-12))), float(np.sqrt(aa / len(a)))
 
 
-def _mean_excess(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Floats | None:
+def _mean_excess(imu_rates: Floats, scan_rates: Floats, T_lidar_imu: Floats) -> Floats | None:
     """(3,) rad/s in IMU axes: a mean over both, so turns at the start do not count as bias."""
-    if not np.isfinite(felt).all(axis=1).any():
+    if not np.isfinite(imu_rates).all(axis=1).any():
         return None
-    return np.asarray(np.nanmean(felt - seen, axis=0) @ T_lidar_imu[:3, :3])
+    return np.asarray(np.nanmean(imu_rates - scan_rates, axis=0) @ T_lidar_imu[:3, :3])
 
 
-def _hardly_turning(felt: Floats, seen: Floats, T_lidar_imu: Floats) -> Agreement:
+def _hardly_turning(imu_rates: Floats, scan_rates: Floats, T_lidar_imu: Floats) -> Agreement:
     """Nothing turned, or not beyond noise, so nothing can be compared, unless the gyroscope says something else."""
-    varied = float(np.nanstd(felt, axis=0).max()) if np.isfinite(felt).any() else 0.0
-    shown = float(np.std(seen, axis=0).max())
+    varied = float(np.nanstd(imu_rates, axis=0).max()) if np.isfinite(imu_rates).any() else 0.0
+    shown = float(np.std(scan_rates, axis=0).max())
     if varied > max(20 * LEAST_TURNING, MOST_SCALE * shown):
         raise ImuRefusedError(
             f"its rates vary by {np.rad2deg(varied):.1f} deg/s, those of the scans by {np.rad2deg(shown):.1f}",
             "check its unit (rad/s), its axes and its stamps",
         )
-    return Agreement(False, gyro_bias=_mean_excess(felt, seen, T_lidar_imu))
+    return Agreement(False, gyro_bias=_mean_excess(imu_rates, scan_rates, T_lidar_imu))
 
 
 def _refuse_scale(ratio: float) -> None:
@@ -198,47 +198,47 @@ def _refuse_scale(ratio: float) -> None:
         )
 
 
-def _refuse_axes(felt: _Felt, seen: Floats, offsets: Floats) -> None:
+def _refuse_axes(imu_rates: _GyroRates, scan_rates: Floats, offsets: Floats) -> None:
     """Refuse turns that are those of the scans about other axes: where one axis turns most, they correlate all the same.
 
     About any axes the best of the `offsets` counts: what a clock mends says nothing about axes.
     """
 
-    def left(axes: Floats, t: float) -> float:
-        a, b = _centred(seen, felt.rates(t))
+    def residual(axes: Floats, t: float) -> float:
+        a, b = _centred(scan_rates, imu_rates.rates(t))
         return float(np.sum((a - b @ axes.T) ** 2)) if len(a) else np.inf
 
-    best = min(offsets, key=lambda t: left(_best_axes(*_centred(seen, felt.rates(t)))[1], t))
-    R, M = _best_axes(*_centred(seen, felt.rates(float(best))))
-    given, turned, mirrored = min(left(np.eye(3), t) for t in offsets), left(R, best), left(M, best)
-    if MUCH_WORSE * mirrored < min(given, turned):
+    best = min(offsets, key=lambda t: residual(_best_axes(*_centred(scan_rates, imu_rates.rates(t)))[1], t))
+    R, M = _best_axes(*_centred(scan_rates, imu_rates.rates(float(best))))
+    as_is, turned, mirrored = min(residual(np.eye(3), t) for t in offsets), residual(R, best), residual(M, best)
+    if MUCH_WORSE * mirrored < min(as_is, turned):
         raise ImuRefusedError(
             "its turns fit those of the scans when mirrored: one of its axes has the wrong sign, or two of them are swapped, "
             "which no T_lidar_imu mends",
             "correct its recording",
         )
     angle = float(so3.angle(R))
-    if angle > OTHER_AXES and MUCH_WORSE * turned < given:
+    if angle > OTHER_AXES and MUCH_WORSE * turned < as_is:
         raise ImuRefusedError(
             f"its turns fit those of the scans far better when turned by {np.rad2deg(angle):.0f} deg",
             "correct T_lidar_imu",
         )
 
 
-def _best_axes(seen: Floats, felt: Floats) -> tuple[Floats, Floats]:
-    """What (3, 3) makes the `felt` turns (M, 3) fit those `seen` best: a rotation, and what may mirror them too."""
-    u, _, vt = np.linalg.svd(seen.T @ felt)
+def _best_axes(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
+    """What (3, 3) makes the `imu_rates` turns (M, 3) fit those `scan_rates` best: a rotation, and what may mirror them too."""
+    u, _, vt = np.linalg.svd(scan_rates.T @ imu_rates)
     M = u @ vt
     return np.asarray(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(M))]) @ vt), np.asarray(M)
 
 
-def _no_fit(felt: _Felt, seen: Floats, correlation: float) -> ImuRefusedError:
+def _no_fit(imu_rates: _GyroRates, scan_rates: Floats, correlation: float) -> ImuRefusedError:
     """The refusal of turns that do not agree, and what would make them."""
     what = f"its turns do not fit those of the scans (correlation {correlation:.2f}, {LEAST_CORRELATION} needed)"
-    far, score = _best_far(felt, seen)
+    far, score = _best_far(imu_rates, scan_rates)
     if score > 0.9:
         return ImuRefusedError(what, f"with its stamps moved by {far:.2f} s they would, set imu.time_offset_s")
-    a, b = _centred(seen, felt.rates(0.0))
+    a, b = _centred(scan_rates, imu_rates.rates(0.0))
     if len(a):
         R = _best_axes(a, b)[0]
         if _compare(a, b @ R.T)[0] > 0.9:
@@ -247,35 +247,37 @@ def _no_fit(felt: _Felt, seen: Floats, correlation: float) -> ImuRefusedError:
     return ImuRefusedError(what, "check its axes, T_lidar_imu and its stamps")
 
 
-def _beyond(felt: _Felt, seen: Floats, edge_s: float, at_zero: float, at_edge: float) -> ImuRefusedError:
+def _beyond(
+    imu_rates: _GyroRates, scan_rates: Floats, edge_s: float, at_zero: float, at_edge: float
+) -> ImuRefusedError:
     """The refusal of turns that fit the better the farther the stamps are moved."""
     what = (
         f"its turns fit those of the scans the better the farther its stamps are moved (correlation {at_zero:.2f}, moved by "
         f"{edge_s:+.2f} s {at_edge:.2f})"
     )
-    far, score = _best_far(felt, seen)
+    far, score = _best_far(imu_rates, scan_rates)
     if score > max(at_edge, 0.9):
         return ImuRefusedError(what, f"best by {far:+.2f} s; set imu.time_offset_s")
     return ImuRefusedError(what, "check its stamps, and set imu.time_offset_s when the clocks are known to differ")
 
 
-def _best_far(felt: _Felt, seen: Floats) -> tuple[float, float]:
+def _best_far(imu_rates: _GyroRates, scan_rates: Floats) -> tuple[float, float]:
     """Offset, s, within `FAR_S` at which the turns agree best, and their correlation there."""
     far = np.arange(-FAR_S, FAR_S, 4 * STEP_S)
-    scores = [_compare(seen, felt.rates(float(t)))[0] for t in far]
+    scores = [_compare(scan_rates, imu_rates.rates(float(t)))[0] for t in far]
     best = int(np.argmax(scores))
     return float(far[best]), scores[best]
 
 
-def _refined(felt: _Felt, seen: Floats, near: float) -> tuple[float, float]:
+def _refined(imu_rates: _GyroRates, scan_rates: Floats, near: float) -> tuple[float, float]:
     """The offset at which the rates differ least, and its standard deviation, by a parabola through the squared error."""
     costs = []
     for t in (near - STEP_S, near, near + STEP_S):
-        a, b = _centred(seen, felt.rates(t))
+        a, b = _centred(scan_rates, imu_rates.rates(t))
         costs.append(float(np.sum((a - b) ** 2)) if len(a) else np.inf)
     bend = (costs[0] - 2 * costs[1] + costs[2]) / STEP_S**2
     if not np.isfinite(bend) or bend <= 0:
         return 0.0, np.inf
     shift = float(np.clip(0.5 * (costs[0] - costs[2]) / STEP_S / bend, -STEP_S, STEP_S))
-    variance = costs[1] / max(3 * len(seen) / felt.width - 4, 1)
+    variance = costs[1] / max(3 * len(scan_rates) / imu_rates.width - 4, 1)
     return near + shift, float(np.sqrt(2 * variance / bend))

@@ -98,7 +98,7 @@ class ConstantVelocity(Stateful, MotionModel):
     MAX_STRETCH = 5.0
     # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
     MAX_ACCELERATION = 20.0
-    STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_seen")
+    STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_velocity")
     CLEARED = ("_predicted",)
 
     def __init__(self, pose: Floats | None = None) -> None:
@@ -107,7 +107,7 @@ class ConstantVelocity(Stateful, MotionModel):
         self._twist = np.zeros(6)
         self._step_s = 0.0
         # Velocity (6,) between the last two poses, m/s and rad/s.
-        self._seen: Floats | None = None
+        self._velocity: Floats | None = None
         # The newest prediction and its stamp, ns: several ask for the same one.
         self._predicted: tuple[int, Floats] | None = None
         # Tells the motion of the sweeps that it knows instead.
@@ -175,20 +175,20 @@ class ConstantVelocity(Stateful, MotionModel):
 
     def _learn(self, velocity: Floats, step: float) -> None:
         """Update with the velocity (6,) of a step of so many seconds, with bounded acceleration."""
-        before, self._seen = self._seen, velocity
+        before, self._velocity = self._velocity, velocity
         if before is not None and self._step_s > 0:
-            known = self._twist / self._step_s
-            change, again = velocity[:3] - known[:3], velocity[:3] - before[:3]
+            expected = self._twist / self._step_s
+            change, again = velocity[:3] - expected[:3], velocity[:3] - before[:3]
             most = self.MAX_ACCELERATION * (step + self._step_s) / 2
             size = float(np.linalg.norm(change))
             if size > most and np.linalg.norm(again) > most:
-                velocity = np.concatenate([known[:3] + change * most / size, velocity[3:]])
+                velocity = np.concatenate([expected[:3] + change * most / size, velocity[3:]])
         self._twist, self._step_s = velocity * step, step
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """Forget all scans but the first, taken at `stamp_ns` and `pose` (4, 4); its sweep by what is known of the speed."""
         prior = self.steady(pose, span)
-        self._instant_ns, self._step_s, self._seen = None, 0.0, None
+        self._instant_ns, self._step_s, self._velocity = None, 0.0, None
         self.correct(stamp_ns, pose, prior)
         return prior
 

@@ -35,12 +35,12 @@ class FilterMotion(InertialMotion):
         # At the middle of the newest sweep, `_instant_ns`; and at that of the next one, before and after its registration.
         self._now: NavigationState | None = None
         self._next: tuple[int, NavigationState] | None = None
-        self._found: tuple[int, NavigationState] | None = None
+        self._posterior: tuple[int, NavigationState] | None = None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """As of any IMU, with the covariance of the pose at the stamp."""
         prior = super().sweep(stamp_ns, span)
-        self._next = self._found = None
+        self._next = self._posterior = None
         if not self.is_inertial or self._now is None or self._instant_ns is None:
             return prior
         middle, instant_ns = middle_of(prior, stamp_ns, prior.pose)
@@ -67,8 +67,8 @@ class FilterMotion(InertialMotion):
         middle, _ = middle_of(prior, stamp_ns, pose)
         T_world_imu = middle @ self.T_lidar_imu
         noise_found = np.diag(np.repeat([PLACE_SIGMA**2, TURN_SIGMA**2], 3))
-        found = state.moved_to(T_world_imu, noise_found).estimate
-        swept = self._prior(found, instant_ns, middle, stamp_ns, prior.times)
+        estimate = state.moved_to(T_world_imu, noise_found).estimate
+        swept = self._prior(estimate, instant_ns, middle, stamp_ns, prior.times)
         return replace(swept, covariance=prior.covariance)
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
@@ -80,22 +80,22 @@ class FilterMotion(InertialMotion):
         middle, _ = middle_of(prior, stamp_ns, result.T_world_lidar)
         T_world_imu = middle @ self.T_lidar_imu
         covariance = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
-        self._found = instant_ns, state.moved_to(T_world_imu, covariance)
+        self._posterior = instant_ns, state.moved_to(T_world_imu, covariance)
         return result
 
     def correct(
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
     ) -> None:
         """As of any IMU; the states are those that the filter found."""
-        predicted, found = self._next, self._found
-        self._next = self._found = None
+        predicted, posterior = self._next, self._posterior
+        self._next = self._posterior = None
         before = self.estimate
         super().correct(stamp_ns, pose, prior, is_registered)
         if self._instant_ns is None or self._has_gap:
             self._now = None
             return
-        if is_registered and found is not None and found[0] == self._instant_ns:
-            self._now = found[1]
+        if is_registered and posterior is not None and posterior[0] == self._instant_ns:
+            self._now = posterior[1]
         elif predicted is not None and predicted[0] == self._instant_ns and not is_registered:
             self._now = predicted[1]
         else:

@@ -42,7 +42,7 @@ class InertialMotion(Stateful):
     STATE: ClassVar[tuple[str, ...]] = (
         "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
     )  # fmt: skip
-    CLEARED: ClassVar[tuple[str, ...]] = ("_taught", "_felt", "_expected")
+    CLEARED: ClassVar[tuple[str, ...]] = ("_taught", "_increments", "_expected")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
@@ -63,7 +63,7 @@ class InertialMotion(Stateful):
         # From `weigh` at an instant, ns, for `correct`: the gyroscope, and the variance of the registered position, m2.
         self._taught: tuple[int, Gyroscope, Floats] | None = None
         # Until the next `correct`: what the IMU felt since the last scan, and where it expects the LiDAR at a stamp, ns.
-        self._felt: Increments | None = None
+        self._increments: Increments | None = None
         self._expected: tuple[int, Floats] | None = None
         self._errors: list[tuple[float, float]] = []
 
@@ -137,9 +137,9 @@ class InertialMotion(Stateful):
         """
         R = (self._pose @ self.T_lidar_imu)[:3, :3]
         R_felt = R @ step.rotations[-1]
-        moved, felt = self.estimate.displacement(step, R)
+        moved, spread = self.estimate.displacement(step, R)
         P = np.zeros((6, 6))
-        P[:3, :3], P[3:, 3:] = felt, R_felt @ self.estimate.gyroscope.turn_covariance(step) @ R_felt.T
+        P[:3, :3], P[3:, 3:] = spread, R_felt @ self.estimate.gyroscope.turn_covariance(step) @ R_felt.T
         return moved, P
 
     def _rejected(
@@ -187,7 +187,7 @@ class InertialMotion(Stateful):
         self.coasting.correct(instant_ns, middle)
         self._instant_ns, self._pose = instant_ns, middle.copy()
         self._was_bridged = not is_registered
-        self._taught = self._felt = self._expected = None
+        self._taught = self._increments = self._expected = None
         self._scans += 1
 
     def gravity_at(self, pose: Floats) -> GravityDirection | None:
@@ -244,9 +244,9 @@ class InertialMotion(Stateful):
     def _prior(
         self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, times: Floats
     ) -> MotionPrior:
-        wanted = stamp_ns + np.round(1e9 * times).astype(np.int64)
-        k = int(np.searchsorted(wanted, anchor_ns))
-        step = estimate.over(self.imu, np.concatenate([wanted[:k], [anchor_ns], wanted[k:]]))
+        instants = stamp_ns + np.round(1e9 * times).astype(np.int64)
+        k = int(np.searchsorted(instants, anchor_ns))
+        step = estimate.over(self.imu, np.concatenate([instants[:k], [anchor_ns], instants[k:]]))
         poses = step.poses(k, anchor @ self.T_lidar_imu, estimate.velocity, estimate.gravity, self.T_imu_lidar)
         return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), is_felt=True)
 
@@ -268,9 +268,9 @@ class InertialMotion(Stateful):
     def _since_last(self, instant_ns: int) -> Increments:
         """What the IMU felt since the last scan, integrated once for all who ask before the next `correct`."""
         assert self._instant_ns is not None
-        if self._felt is None or self._felt.instants_ns[-1] != instant_ns:
-            self._felt = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
-        return self._felt
+        if self._increments is None or self._increments.instants_ns[-1] != instant_ns:
+            self._increments = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
+        return self._increments
 
     def _advanced(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
         """The estimate at the first scan's stamp at the middle of its sweep."""

@@ -118,9 +118,9 @@ def gaps(imu: ImuStream, longest_s: float) -> Longs:
     """
     steps = np.diff(imu.stamps_ns)
     limit = max(1e9 * longest_s, 1.5 * float(np.median(steps)))
-    found = np.flatnonzero(steps > limit)
+    pauses = np.flatnonzero(steps > limit)
     far, slack, half = np.iinfo(np.int64), int(limit), int(limit / 2)
-    inner = np.stack([imu.stamps_ns[found] + half, imu.stamps_ns[found + 1] - half], axis=1)
+    inner = np.stack([imu.stamps_ns[pauses] + half, imu.stamps_ns[pauses + 1] - half], axis=1)
     before = np.array([[far.min, imu.stamps_ns[0] - slack]])
     after = np.array([[imu.stamps_ns[-1] + slack, far.max]])
     return np.concatenate([before, inner, after])

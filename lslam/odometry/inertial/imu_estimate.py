@@ -120,16 +120,16 @@ class ImuEstimate:
     def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:
         # Velocity, gravity and accelerometer bias.
         P = P + np.diag(np.repeat([0.0, GRAVITY_WALK**2, self.gyroscope.noise.accel_walk**2], 3)) * step.duration
-        known = self.gyroscope if gyroscope is None else gyroscope
+        device = self.gyroscope if gyroscope is None else gyroscope
         bias = x[BIAS]
-        before, after = self.gyroscope.mounting, known.mounting
+        before, after = self.gyroscope.mounting, device.mounting
         if gyroscope is not None and before is not None and after is not None:
             # The force goes on as it was: the bias had learnt it about the axes before, and may be wrong by as much.
-            felt = np.linalg.solve(step.velocity_arms[-1], step.velocities[-1])
-            change = before.T @ felt - after.T @ felt
+            force = np.linalg.solve(step.velocity_arms[-1], step.velocities[-1])
+            change = before.T @ force - after.T @ force
             bias = bias + change
             P[BIAS, BIAS] += np.outer(change, change)
-        return ImuEstimate(x[VELOCITY], x[DOWN], bias, known, P)
+        return ImuEstimate(x[VELOCITY], x[DOWN], bias, device, P)
 
 
 def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floats, Floats]:

@@ -52,11 +52,11 @@ class FirstPoses:
     def during(self, begin: int, end: int) -> FirstPoses:
         """The scans from number `begin` to before `end`, and the middles of sweeps between them."""
         stamps = self.stamps_ns[begin:end]
-        kept = self.instants_ns >= stamps[0]
+        is_in = self.instants_ns >= stamps[0]
         if end < len(self.stamps_ns):
-            kept &= self.instants_ns <= stamps[-1]
-        covariances = None if self.covariances is None else self.covariances[kept]
-        return FirstPoses(stamps, self.poses[begin:end], self.instants_ns[kept], self.middles[kept], covariances)
+            is_in &= self.instants_ns <= stamps[-1]
+        covariances = None if self.covariances is None else self.covariances[is_in]
+        return FirstPoses(stamps, self.poses[begin:end], self.instants_ns[is_in], self.middles[is_in], covariances)
 
 
 @dataclass(frozen=True)
@@ -91,35 +91,37 @@ def start(
 
     Raises ImuRefusedError with the reason when the stream cannot be of this sensor's motion.
     """
-    given = config.time_offset_s
-    shift = 0 if given is None else round(1e9 * given)
+    offset_s = config.time_offset_s
+    shift = 0 if offset_s is None else round(1e9 * offset_s)
     cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(first.stamps_ns[0]), last_ns)
     notes = list(cleaned.notes)
-    told = told_poses(first, cleaned.imu, config.gap_s)[0]
+    part = told_poses(first, cleaned.imu, config.gap_s)[0]
     agreement = check_agreement(
-        cleaned.imu, T_lidar_imu, told.instants_ns, told.middles, None if given is None else 0.0, least_offset_s
+        cleaned.imu, T_lidar_imu, part.instants_ns, part.middles, None if offset_s is None else 0.0, least_offset_s
     )
-    offset = agreement.offset_s if given is None else given
+    offset = agreement.offset_s if offset_s is None else offset_s
     if not agreement.is_judged:
         notes.append("IMU: the first scans show too few turns to check its axes and its clock")
     problems: list[str] = []
     config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
-    told, opening = told_poses(first, usable, config.gap_s)
-    _refuse_sign(usable, T_lidar_imu, told, agreement.gyro_bias)
-    guess, is_static = _first_guess(usable, T_lidar_imu, told.stamps_ns, told.poses, config, agreement.gyro_bias)
-    asked = config.estimate_extrinsics, config.estimate_offset
-    guess = replace(guess, gyroscope=guess.gyroscope.calibrated(*asked))
-    estimate = _learnt(usable, T_lidar_imu, guess, told, opening, config)
-    if any(asked):
+    part, opening = told_poses(first, usable, config.gap_s)
+    _refuse_sign(usable, T_lidar_imu, part, agreement.gyro_bias)
+    guess, is_static = _first_guess(usable, T_lidar_imu, part.stamps_ns, part.poses, config, agreement.gyro_bias)
+    options = config.estimate_extrinsics, config.estimate_offset
+    guess = replace(guess, gyroscope=guess.gyroscope.calibrated(*options))
+    estimate = _learnt(usable, T_lidar_imu, guess, part, opening, config)
+    if any(options):
         # Once more, with forces about the axes that the turns showed and at their time: what was learnt is no prior.
-        known = replace(estimate.gyroscope, covariance=guess.gyroscope.covariance)
-        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
+        device = replace(estimate.gyroscope, covariance=guess.gyroscope.covariance)
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
     if config.gyro_bias is not None:
         bias = np.array(config.gyro_bias)
-        known = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope), ImuNoise.of(config)).calibrated(*asked)
-        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=known), told, opening, config)
+        device = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope), ImuNoise.of(config)).calibrated(
+            *options
+        )
+        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
@@ -143,18 +145,18 @@ def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPo
     return first.during(*longest), first.during(*stretches[0])
 
 
-def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, told: FirstPoses, gyro_bias: Floats | None) -> None:
+def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bias: Floats | None) -> None:
     """Refuse forces that lead along the scans' path when they point the other way: at rest +g is up (REP 145).
 
     Where the sensor stood, the path is what registration errs by, and tells nothing of the IMU.
     """
-    if _farthest(told.poses) < STILL_MOVE:
+    if _farthest(part.poses) < STILL_MOVE:
         return
     bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
     guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
     as_given, reversed_ = (
         _path_of_force(
-            replace(imu, accel=sign * imu.accel), told.poses @ T_lidar_imu, told.stamps_ns, guess, GRAVITY_S
+            replace(imu, accel=sign * imu.accel), part.poses @ T_lidar_imu, part.stamps_ns, guess, GRAVITY_S
         )[2]
         for sign in (1.0, -1.0)
     )
@@ -165,11 +167,11 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, told: FirstPoses, gyro_bia
         )
 
 
-def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[str]) -> ImuConfig:
+def _without_wrong_bias(config: ImuConfig, scan_bias: Floats | None, problems: list[str]) -> ImuConfig:
     """A given bias that the scans contradict is another device's: a preset's, say."""
-    if config.gyro_bias is None or seen is None:
+    if config.gyro_bias is None or scan_bias is None:
         return config
-    off = float(np.abs(np.array(config.gyro_bias) - seen).max())
+    off = float(np.abs(np.array(config.gyro_bias) - scan_bias).max())
     if off < MOST_BIAS_ERROR:
         return config
     problems.append(
@@ -179,9 +181,9 @@ def _without_wrong_bias(config: ImuConfig, seen: Floats | None, problems: list[s
     return config.model_copy(update={"gyro_bias": None, "accel_bias": None})
 
 
-def _bias_sigma(given: Floats, seen: Gyroscope) -> float:
-    """Sigma of a given bias (3,), rad/s: its difference from the one `seen` with a weak prior."""
-    beyond = np.abs(given - seen.bias) - 3 * np.sqrt(np.diag(seen.covariance)[:3])
+def _bias_sigma(bias: Floats, device: Gyroscope) -> float:
+    """Sigma of a given bias (3,), rad/s: its difference from that of the `device`, estimated with a weak prior."""
+    beyond = np.abs(bias - device.bias) - 3 * np.sqrt(np.diag(device.covariance)[:3])
     return max(float(beyond.max()), GIVEN_GYRO_BIAS)
 
 
@@ -228,14 +230,14 @@ def _farthest(poses: Floats) -> float:
 
 
 def _learnt(
-    imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, told: FirstPoses, opening: FirstPoses, config: ImuConfig
+    imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, part: FirstPoses, opening: FirstPoses, config: ImuConfig
 ) -> ImuEstimate:
     """The guess after all the sweeps, with the velocity at the first pose."""
-    T = told.middles @ T_lidar_imu
+    T = part.middles @ T_lidar_imu
     learnt = guess
     for k in range(len(T) - 1):
-        step, R, R_end = learnt.over(imu, told.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
-        noise = None if told.covariances is None else told.covariances[k + 1, 3:, 3:]
+        step, R, R_end = learnt.over(imu, part.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
+        noise = None if part.covariances is None else part.covariances[k + 1, 3:, 3:]
         gyroscope = learnt.taught(step, R, R_end, noise)
         learnt = learnt.corrected(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
     covariance = learnt.covariance.copy()
@@ -251,22 +253,22 @@ def _learnt(
 
 
 def _path_of_force(
-    imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, known: ImuEstimate, seconds: float
+    imu: ImuStream, T_world_imu: Floats, stamps_ns: Longs, prior: ImuEstimate, seconds: float
 ) -> tuple[Floats, Floats, float]:
     """Velocity at the first pose (3,), gravity (3,) and the velocity's sigma that lead along the poses of some seconds.
 
-    Where `known` has a gravity, it is kept and only the velocity is looked for.
+    Where `prior` has a gravity, it is kept and only the velocity is looked for.
     """
     count = max(int(np.searchsorted(stamps_ns, stamps_ns[0] + round(1e9 * seconds))), min(4, len(stamps_ns)))
-    has_gravity = bool(known.gravity.any())
+    has_gravity = bool(prior.gravity.any())
     if count < 4:
-        step = known.over(imu, stamps_ns[0] + np.array([0, 500_000_000]))
-        return np.zeros(3), known.gravity if has_gravity else -T_world_imu[0, :3, :3] @ step.velocities[-1], ANY_SPEED
-    step = known.over(imu, stamps_ns[:count])
-    _, _, moved = step.motion(0, T_world_imu[0, :3, :3], np.zeros(3), known.gravity)
+        step = prior.over(imu, stamps_ns[0] + np.array([0, 500_000_000]))
+        return np.zeros(3), prior.gravity if has_gravity else -T_world_imu[0, :3, :3] @ step.velocities[-1], ANY_SPEED
+    step = prior.over(imu, stamps_ns[:count])
+    _, _, moved = step.motion(0, T_world_imu[0, :3, :3], np.zeros(3), prior.gravity)
     rest = T_world_imu[:count, :3, 3] - T_world_imu[0, :3, 3] - moved
     t = step.seconds[:, None]
     A = t if has_gravity else np.hstack([t, 0.5 * t**2])
     x = np.linalg.lstsq(A, rest, rcond=None)[0]
     spread = float(np.sqrt(np.mean(np.sum((rest - A @ x) ** 2, axis=1)) / float(np.sum(t**2))))
-    return x[0], known.gravity if has_gravity else x[1], spread
+    return x[0], prior.gravity if has_gravity else x[1], spread

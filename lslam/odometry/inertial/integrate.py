@@ -97,8 +97,8 @@ def integrate(
         used = slice(max(first - 1, 0), int(np.searchsorted(stamps, at[-1], side="left")) + 1)
         stamps, gyro, first = stamps[used], gyro[used], first - used.start
         accel, accel_bias = accel[used] @ mounting.T, mounting @ accel_bias
-    felt = strapdown.integrate(stamps, gyro, accel, first, at, gyro_bias, accel_bias, axes)
-    return Increments(instants_ns, *felt, _readings(imu, at[[0, -1]]), _hidden(imu, int(at[0]), int(at[-1])))
+    increments = strapdown.integrate(stamps, gyro, accel, first, at, gyro_bias, accel_bias, axes)
+    return Increments(instants_ns, *increments, _readings(imu, at[[0, -1]]), _hidden(imu, int(at[0]), int(at[-1])))
 
 
 def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:

@@ -64,10 +64,10 @@ class LinkedMotion(FilterMotion):
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The result as it is; the states of the smoother are kept for `correct`."""
-        self._found = None
+        self._posterior = None
         if result.inertial is not None and prior.link is not None:
             middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
-            self._found = instant_ns, self._state_of(result.inertial)
+            self._posterior = instant_ns, self._state_of(result.inertial)
             self._linked = instant_ns, middle
         return replace(result, inertial=None)
 
@@ -81,7 +81,7 @@ class LinkedMotion(FilterMotion):
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """As of any IMU; the smoother begins anew, too."""
-        self._now = self._next = self._found = None
+        self._now = self._next = self._posterior = None
         prior = super().rewind(stamp_ns, pose, span)
         assert self._instant_ns is not None
         self._linked = self._instant_ns, self._pose.copy()
@@ -100,16 +100,16 @@ class LinkedMotion(FilterMotion):
         # Since then it stood, in no state of the smoother: its pose is known, forces over minutes lead anywhere.
         has_stood = self._instant_ns != before_ns and not self._was_bridged
         if not self.refusal and not has_stood and self._covers(before_ns, instant_ns):
-            felt = self.estimate.over(self.imu, np.array([before_ns, instant_ns]))
-            return replace(link, step=_felt(self.estimate, felt, (before @ self.T_lidar_imu)[:3, :3]))
+            increments = self.estimate.over(self.imu, np.array([before_ns, instant_ns]))
+            return replace(link, step=_from_imu(self.estimate, increments, (before @ self.T_lidar_imu)[:3, :3]))
         moved = se3.relative(before @ self.T_lidar_imu, T_world_imu)
         return replace(link, step=_coasted(self.estimate, moved, 1e-9 * (instant_ns - before_ns)))
 
-    def _state_of(self, found: MotionState) -> NavigationState:
-        P, before = found.covariance, self.estimate.gyroscope
-        gyroscope = Gyroscope(found.gyro_bias, found.gyro_axes, P[GYRO, GYRO], before.rate_variance, before.noise)
-        estimate = ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P[REST, REST])
-        return NavigationState(found.T_world_imu, estimate, P)
+    def _state_of(self, state: MotionState) -> NavigationState:
+        P, before = state.covariance, self.estimate.gyroscope
+        gyroscope = Gyroscope(state.gyro_bias, state.gyro_axes, P[GYRO, GYRO], before.rate_variance, before.noise)
+        estimate = ImuEstimate(state.velocity, state.gravity, state.accel_bias, gyroscope, P[REST, REST])
+        return NavigationState(state.T_world_imu, estimate, P)
 
 
 def _plain(state: NavigationState) -> MotionState:
@@ -119,7 +119,7 @@ def _plain(state: NavigationState) -> MotionState:
     )
 
 
-def _felt(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
+def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
     """What the IMU felt, as the estimate integrated it; R : (3, 3) of the IMU in the world at the first instant."""
     t = step.duration
     C = process_noise(t, e.gyroscope.rate_variance, e.gyroscope.noise)

@@ -44,8 +44,8 @@ def transition(step: Increments, R: Floats, R_end: Floats, gyroscope: Gyroscope)
     mounting = gyroscope.mounting
     if mounting is not None:
         # Turned further by d, the device feels d x f more of a force f.
-        felt = so3.hat(np.linalg.solve(step.velocity_arms[-1], step.velocities[-1]))
-        F[PLACE, AXES], F[SPEED, AXES] = (-R @ arm @ felt @ MOUNTING for arm in arms)
+        force = so3.hat(np.linalg.solve(step.velocity_arms[-1], step.velocities[-1]))
+        F[PLACE, AXES], F[SPEED, AXES] = (-R @ arm @ force @ MOUNTING for arm in arms)
         arms = arms[0] @ mounting, arms[1] @ mounting
     F[PLACE, FORCE] = -R @ arms[0]
     F[TURN, DEVICE] = R_end @ columns
@@ -130,8 +130,8 @@ class NavigationState:
             T_world_imu[:3, 3] - self.T_world_imu[:3, 3], so3.log(T_world_imu[:3, :3] @ self.T_world_imu[:3, :3].T)
         ])  # fmt: skip
         P = P - gain @ (P[POSE, POSE] - covariance) @ gain.T
-        found = self._shifted(gain @ d, 0.5 * (P + P.T))._with_gravity()
-        return replace(found, T_world_imu=T_world_imu)._shared()
+        state = self._shifted(gain @ d, 0.5 * (P + P.T))._with_gravity()
+        return replace(state, T_world_imu=T_world_imu)._shared()
 
     def _shifted(self, x: Floats, P: Floats) -> NavigationState:
         """All states but the pose, moved by the error x (N,), with the covariance P."""

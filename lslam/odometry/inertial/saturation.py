@@ -36,7 +36,7 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
         # Filled before: what it was filled with is no range.
         return imu
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9 if len(imu) else np.zeros(0)
-    parts, hidden, said = [], [], []  # readings, sigmas, words
+    parts, hidden, words = [], [], []  # readings, sigmas, words
     for values, least, unit, name in (
         (imu.accel, LEAST_FORCE, "m/s2", "accelerometer"), (imu.gyro, LEAST_RATE, "rad/s", "gyroscope")
     ):  # fmt: skip
@@ -46,11 +46,11 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
         hidden.append(filled[1])
         if cut.any():
             limit = float(np.abs(values).max())
-            said.append(f"{int(cut.any(axis=1).sum())} at the {limit:.4g} {unit} of its {name}")
-    if not said:
+            words.append(f"{int(cut.any(axis=1).sum())} at the {limit:.4g} {unit} of its {name}")
+    if not words:
         return imu
     notes.append(
-        f"IMU: of {len(imu)} samples {' and '.join(said)}, the end of the range: what is beyond is filled in smoothly, and "
+        f"IMU: of {len(imu)} samples {' and '.join(words)}, the end of the range: what is beyond is filled in smoothly, and "
         "trusted the less"
     )
     return replace(imu, accel=parts[0], gyro=parts[1], hidden=np.hstack(hidden))

@@ -70,17 +70,17 @@ class SmootherMotion(InertialMotion):
         begin = (self._pose @ self.T_lidar_imu)[:3, :3]
         self._taught = instant_ns, self.estimate.taught(step, begin, T_world_imu[:3, :3], C[3:, 3:]), C[:3, :3]
         try:
-            found = self.smoother.add(self._measured(step, T_world_imu, there))
+            state = self.smoother.add(self._measured(step, T_world_imu, there))
         except GraphError as error:
             self._is_begun = False
             # The IMU's pose is as sure as the IMU, whatever registration said of its own.
             lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
             covariance = noise.transported(self._felt_motion(step)[1], lever)
             return result.rejected(str(error), prior.pose, covariance)
-        self._added = instant_ns, found
+        self._added = instant_ns, state
         within = se3.relative(result.T_world_lidar, middle)
-        pose = se3.normalise(found.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
-        covariance = noise.transported(found.covariance[:6, :6], pose[:3, 3] - found.T_world_imu[:3, 3])
+        pose = se3.normalise(state.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
+        covariance = noise.transported(state.covariance[:6, :6], pose[:3, 3] - state.T_world_imu[:3, 3])
         return result.moved(pose, covariance)
 
     def correct(
@@ -102,7 +102,7 @@ class SmootherMotion(InertialMotion):
             self.estimate = before if self.refusal else self.estimate
             return
         if added is not None and added[0] == self._instant_ns:
-            found = added[1]
+            state = added[1]
         else:
             carried = None if step is None else self._carried_by_smoother(step)
             if carried is None:
@@ -111,8 +111,8 @@ class SmootherMotion(InertialMotion):
                 self.smoother.begin(self._beginning())
                 self._is_begun = True
                 return
-            found = carried
-        self.estimate = self._as_estimate(found)
+            state = carried
+        self.estimate = self._as_estimate(state)
 
     def _carried_by_smoother(self, step: Increments) -> InertialState | None:
         """The state at the end of `step` by the IMU alone; None where the graph has no solution."""
@@ -132,8 +132,8 @@ class SmootherMotion(InertialMotion):
         if not links:
             return None
         R = self.T_lidar_imu[:3, :3]
-        known = self._beginning()
-        return InertialChain(links, R @ known.accel_bias, R @ known.gyro_bias, imu_noise)
+        opening = self._beginning()
+        return InertialChain(links, R @ opening.accel_bias, R @ opening.gyro_bias, imu_noise)
 
     def _at_lidar(self, step: InertialStep) -> InertialStep:
         """The readings of an IMU in the place and axes of the LiDAR, its biases but turned."""
@@ -168,10 +168,10 @@ class SmootherMotion(InertialMotion):
         knots = np.concatenate([[begin_ns], inner, [end_ns]])
         near = slice(max(int(np.searchsorted(stamps, begin_ns)) - 1, 0), int(np.searchsorted(stamps, end_ns)) + 1)
         at = 1e-9 * (knots - begin_ns)
-        known = 1e-9 * (stamps[near] - begin_ns)
+        times = 1e-9 * (stamps[near] - begin_ns)
 
         def means(readings: Floats) -> Floats:
-            values = np.stack([np.interp(at, known, column) for column in readings[near].T], axis=1)
+            values = np.stack([np.interp(at, times, column) for column in readings[near].T], axis=1)
             return np.asarray(0.5 * (values[1:] + values[:-1]))
 
         gyroscope = self.estimate.gyroscope
@@ -190,12 +190,12 @@ class SmootherMotion(InertialMotion):
         bias = axes @ (e.gyroscope.bias - self._usual_bias)
         return InertialState(self._pose @ self.T_lidar_imu, e.velocity, e.accel_bias, bias, e.gravity, P)
 
-    def _as_estimate(self, found: InertialState) -> ImuEstimate:
+    def _as_estimate(self, state: InertialState) -> ImuEstimate:
         """The state as what predicts; the gyroscope's axes and noise are the calibration's, which follows the bias."""
-        known = self.estimate.gyroscope
-        unturned = np.linalg.inv(known.axes)
-        gyroscope = known.with_bias(
-            self._usual_bias + unturned @ found.gyro_bias, unturned @ found.covariance[12:15, 12:15] @ unturned.T
+        device = self.estimate.gyroscope
+        unturned = np.linalg.inv(device.axes)
+        gyroscope = device.with_bias(
+            self._usual_bias + unturned @ state.gyro_bias, unturned @ state.covariance[12:15, 12:15] @ unturned.T
         )
-        P = found.covariance[np.ix_(ESTIMATE, ESTIMATE)]
-        return ImuEstimate(found.velocity, found.gravity, found.accel_bias, gyroscope, P)
+        P = state.covariance[np.ix_(ESTIMATE, ESTIMATE)]
+        return ImuEstimate(state.velocity, state.gravity, state.accel_bias, gyroscope, P)

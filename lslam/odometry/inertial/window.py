@@ -118,10 +118,10 @@ class Window:
         """With one more moment, the newest."""
         return replace(self, moments=(*self.moments, moment))
 
-    def with_equations(self, found: dict[int, ScanEquations]) -> Window:
+    def with_equations(self, equations: dict[int, ScanEquations]) -> Window:
         """With other equations of some scans, by their stamps."""
         return replace(
-            self, moments=tuple(replace(m, equations=found.get(m.stamp_ns, m.equations)) for m in self.moments)
+            self, moments=tuple(replace(m, equations=equations.get(m.stamp_ns, m.equations)) for m in self.moments)
         )
 
     def solved(self, imu: ImuStream) -> tuple[Window, Floats]:
@@ -229,11 +229,11 @@ class Window:
         self._add_past(H, g)
         self._add_scan(H, g, 0)
         self._add_increments(H, g, 1, imu)
-        gone = np.zeros(size, bool)
-        gone[SHARED : SHARED + EACH] = True
-        left = Normal(H, g).without(gone)
+        is_first = np.zeros(size, bool)
+        is_first[SHARED : SHARED + EACH] = True
+        rest = Normal(H, g).without(is_first)
         walk = GRAVITY_WALK**2 * 1e-9 * (second.instant_ns - first.instant_ns)
-        information, gradient = loosened(left.H, left.g, DOWN, walk)
+        information, gradient = loosened(rest.H, rest.g, DOWN, walk)
         past = Past(information, gradient, self.gravity, self.axes, second)
         return replace(self, moments=self.moments[1:], past=past)
 

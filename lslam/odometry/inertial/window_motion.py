@@ -42,21 +42,21 @@ class WindowMotion(FilterMotion):
         self.size = size
         self.window: Window | None = None
         # Of the scan that is being registered: equations that were taken, and the window with it.
-        self._taken: dict[int, ScanEquations] = {}
+        self._equations: dict[int, ScanEquations] = {}
         self._joint: Window | None = None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """As of the filter."""
-        self._taken, self._joint = {}, None
+        self._equations, self._joint = {}, None
         return super().sweep(stamp_ns, span)
 
     def take(self, equations: Iterable[ScanEquations]) -> None:
         """What the points of some scans say of their poses, for the estimates to come."""
-        self._taken |= {one.stamp_ns: one for one in equations}
+        self._equations |= {one.stamp_ns: one for one in equations}
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The result at the pose and with the covariance that the joint estimate gives it."""
-        self._joint = self._found = None
+        self._joint = self._posterior = None
         if not result.is_accepted or prior.covariance is None or self._next is None or self.window is None:
             return result
         instant_ns, state = self._next
@@ -64,12 +64,12 @@ class WindowMotion(FilterMotion):
         T_world_imu = middle @ self.T_lidar_imu
         T_imu_scan = se3.relative(T_world_imu, result.T_world_lidar)
         moment = moment_of(replace(state, T_world_imu=T_world_imu), instant_ns, stamp_ns, T_imu_scan)
-        window, H = self.window.extended(moment).with_equations(self._taken).solved(self.imu)
+        window, H = self.window.extended(moment).with_equations(self._equations).solved(self.imu)
         newest = window.newest(H, state)
         pose = se3.normalise(newest.T_world_imu @ T_imu_scan)
         if not (np.isfinite(pose).all() and np.isfinite(newest.covariance).all()):
             return result
-        self._joint, self._found = window, (instant_ns, newest)
+        self._joint, self._posterior = window, (instant_ns, newest)
         lever = pose[:3, 3] - newest.T_world_imu[:3, 3]
         covariance = noise.transported(newest.covariance[POSE, POSE], lever)
         return result.moved(pose, covariance)
@@ -92,14 +92,14 @@ class WindowMotion(FilterMotion):
         self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
     ) -> None:
         """As of the filter; the window goes on, or begins anew where the filter does."""
-        joint, found, predicted = self._joint, self._found, self._next
+        joint, posterior, predicted = self._joint, self._posterior, self._next
         super().correct(stamp_ns, pose, prior, is_registered)
-        self._joint, self._taken = None, {}
+        self._joint, self._equations = None, {}
         if self._now is None or self._instant_ns is None:
             self.window = None
             return
         T_imu_scan = se3.relative(self._pose @ self.T_lidar_imu, pose)
-        if found is not None and self._now is found[1]:
+        if posterior is not None and self._now is posterior[1]:
             self.window = joint
         elif predicted is not None and self._now is predicted[1] and self.window is not None:
             self.window = self.window.extended(moment_of(self._now, self._instant_ns, stamp_ns, T_imu_scan))

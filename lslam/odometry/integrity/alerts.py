@@ -73,39 +73,39 @@ def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: in
     """Begin and end of where they say so again and again, or one of them by much, along one axis."""
     is_better = np.array([check.agreement > MORE * check.claimed_agreement for check in checks])
     is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * SAME_SIGMAS * sigma)
-    found = []
+    stretches = []
     for begin, end in _runs(np.where(np.abs(apart) > LEAST[axis], np.sign(apart), 0)):
         part = slice(begin, end)
         mean, count = float(np.mean(apart[part])), end - begin
         bound = LEAST[axis] + SAME_SIGMAS * float(np.median(sigma[part])) / np.sqrt(count)
         if is_large[part].any() or (count >= IN_A_ROW and abs(mean) > bound):
-            found.append((begin, end))
-    return found
+            stretches.append((begin, end))
+    return stretches
 
 
 def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
     """In words, the two axes along which most is missing."""
     seconds = float(np.median([check.seconds for check in run]))
     worst = sorted(np.argsort(-np.abs(apart) / LEAST)[:2].tolist())
-    said = " and ".join(
+    motion = " and ".join(
         f"{apart[axis]:+.2f} m {AXES[axis]}" if axis < 3 else f"{np.rad2deg(apart[axis]):+.2f} deg {AXES[axis]}"
         for axis in worst
         if abs(apart[axis]) > LEAST[axis]
     )
     each = "each" if len(run) > 1 else "it"
-    why = f"beside the scan {seconds:.1f} s before, {each} moved by {said or 'another way'} more than its pose says"
+    why = f"beside the scan {seconds:.1f} s before, {each} moved by {motion or 'another way'} more than its pose says"
     return Alert(run[0].first + 1, run[-1].last, why)
 
 
 def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
     """Where scans are missing or failed, and a check rejects the motion of the poses before and after."""
-    found = []
+    out = []
     for check in checks:
         is_elsewhere = check.claimed_agreement < USUAL * check.usual
         if check.is_after_break and check.usual > 0 and (check.is_open or is_elsewhere):
             why = f"nothing in the scans confirms the motion over the {check.seconds:.1f} s before, in which scans failed or miss"
-            found.append(Alert(check.first + 1, check.last, why))
-    return found
+            out.append(Alert(check.first + 1, check.last, why))
+    return out
 
 
 def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:

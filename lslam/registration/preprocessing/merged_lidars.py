@@ -101,19 +101,19 @@ class MergedLidars(SequenceView):
         begin, end = int(self._edges[index]), int(self._edges[index + 1])
         end = min(end, begin + round(_LONGEST_SWEEP * self._period_ns))
         first, last = int(np.searchsorted(source.ends, begin)), int(np.searchsorted(source.begins, end))
-        held = source.held
-        source.held = held = {k: held[k] if k in held else _read(source.lidar, k) for k in range(first, last)}
-        for scan in held.values():
+        cache = source.held
+        source.held = cache = {k: cache[k] if k in cache else _read(source.lidar, k) for k in range(first, last)}
+        for scan in cache.values():
             if scan is None or not len(scan):
                 continue
             at_ns = np.full(len(scan), scan.stamp_ns)
-            kept = _is_far(scan.points)
+            is_used = _is_far(scan.points)
             if source.sweep is not None:
                 if scan.times is not None:
                     at_ns += np.round(scan.times.astype(np.float64) * 1e9).astype(np.int64)
-                kept &= (at_ns >= begin) & (at_ns < end)
-            if kept.any():
-                yield _moved(scan, kept, at_ns, stamp_ns, source.lidar.T_lidar_other, number)
+                is_used &= (at_ns >= begin) & (at_ns < end)
+            if is_used.any():
+                yield _moved(scan, is_used, at_ns, stamp_ns, source.lidar.T_lidar_other, number)
 
     def _describe(self, source: _Reading) -> None:
         """Say how a further LiDAR is used; raise InputError when none of its scans falls into a sweep."""
@@ -182,14 +182,14 @@ def _is_far(points: NDArray[np.float32]) -> Bools:
         return np.asarray((squared >= np.float32(_NEAREST_M**2)) & np.isfinite(squared))
 
 
-def _moved(scan: Scan, kept: Bools, at_ns: Longs, stamp_ns: int, T: Matrix, number: int) -> Scan:
-    """The points `kept`, of the `number`-th further LiDAR, in the frame of the leading one, with times from `stamp_ns`."""
+def _moved(scan: Scan, is_used: Bools, at_ns: Longs, stamp_ns: int, T: Matrix, number: int) -> Scan:
+    """The points `is_used`, of the `number`-th further LiDAR, in the frame of the leading one, with times from `stamp_ns`."""
     from lslam.core.kernels.transform import transform
 
-    part = scan.select(kept)
+    part = scan.select(is_used)
     points = np.empty_like(part.points)
     transform(np.ascontiguousarray(part.points), T, points)
-    times = ((at_ns[kept] - stamp_ns) * 1e-9).astype(np.float32)
+    times = ((at_ns[is_used] - stamp_ns) * 1e-9).astype(np.float32)
     rings = part.rings
     if rings is not None:
         rings = np.where(rings == NO_RING, NO_RING, rings + np.uint16(number * RINGS_APART)).astype(np.uint16)

@@ -78,8 +78,8 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
 def walk_lines(scan: Scan, gate: PreprocessConfig) -> RingWalk:
     """The gated points of a scan laser after laser in the order of firing, cut into lines. Raises InputError as above."""
     lasers = np.zeros(len(scan), np.uint16) if scan.rings is None else scan.rings
-    kept = gate_points(scan.points, gate)
-    order, starts = curvature.into_rings(lasers, kept[lasers[kept] != NO_RING])
+    in_range = gate_points(scan.points, gate)
+    order, starts = curvature.into_rings(lasers, in_range[lasers[in_range] != NO_RING])
     if scan.times is not None:
         order = order[np.lexsort((scan.times[order], lasers[order]))]
     points, ranges, steps, step, _, _ = curvature.walk(scan.points, order, starts)
@@ -98,8 +98,8 @@ def _brightness(scan: Scan, walk: RingWalk) -> Floats:
     """Intensities (K,) along the walk; (0,) where there are none, or the same for all points."""
     if scan.intensity is None or not len(walk.order):
         return np.zeros(0)
-    found = np.nan_to_num(scan.intensity[walk.order].astype(np.float64), posinf=0.0, neginf=0.0)
-    return found if found.max() > found.min() else np.zeros(0)
+    intensity = np.nan_to_num(scan.intensity[walk.order].astype(np.float64), posinf=0.0, neginf=0.0)
+    return intensity if intensity.max() > intensity.min() else np.zeros(0)
 
 
 def _left_out(walk: RingWalk, brightness: Floats) -> Bools:

@@ -56,18 +56,18 @@ def prepare_points(
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
     times_of = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)
-    kept, kept_times = _gated(as_cloud(points), times_of, config)
-    map_points, map_times, counts = voxel.means(kept, kept_times, config.map_leaf)
+    cloud, cloud_times = _gated(as_cloud(points), times_of, config)
+    map_points, map_times, counts = voxel.means(cloud, cloud_times, config.map_leaf)
     if config.least_line > 0:
         solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
         if len(solid) < len(map_points):
             map_points, map_times = voxel.take(map_points, solid), map_times[solid] if len(map_times) else map_times
-    source, source_times, scatter = _source_points(kept, kept_times, map_points, map_times, config, index)
+    source, source_times, scatter = _source_points(cloud, cloud_times, map_points, map_times, config, index)
     return PreparedPoints(
         map_points,
         source.astype(np.float64),
         scatter.astype(np.float64),
-        len(kept),
+        len(cloud),
         None if times is None else map_times,
         None if times is None else source_times,
     )
@@ -122,14 +122,14 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> Longs:
     With `remove_ground` and `denoise` also neither on the ground nor, among the rest, an outlier. Every method's points
     pass here.
     """
-    kept = voxel.gate(points, *_gate_of(config))
+    index = voxel.gate(points, *_gate_of(config))
     if config.remove_ground:
-        kept = kept[above_ground(points[kept], config.ground_slope, config.ground_tolerance, up_of(config))]
+        index = index[above_ground(points[index], config.ground_slope, config.ground_tolerance, up_of(config))]
     if config.denoise:
         from lslam.registration.preprocessing.weather_filter import dense_points
 
-        kept = kept[dense_points(points[kept], config.denoise_neighbours, config.denoise_deviations)]
-    return kept
+        index = index[dense_points(points[index], config.denoise_neighbours, config.denoise_deviations)]
+    return index
 
 
 def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, Floats]:
@@ -152,7 +152,7 @@ Down = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 def _source_points(
-    kept: NDArray[np.float32], kept_times: NDArray[np.float32], map_points: NDArray[np.float32],
+    cloud: NDArray[np.float32], cloud_times: NDArray[np.float32], map_points: NDArray[np.float32],
     map_times: NDArray[np.float32], config: PreprocessConfig, index: int,
 ) -> Down:  # fmt: skip
     if config.downsample == "target":
@@ -160,14 +160,14 @@ def _source_points(
     if config.downsample == "grid":
         return voxel.centroids(map_points, map_times, config.source_voxel)[:3]
     if config.downsample == "first":
-        chosen = voxel.first_points(kept, config.source_voxel)
+        chosen = voxel.first_points(cloud, config.source_voxel)
     elif config.downsample == "random":
         rng = np.random.default_rng((config.seed, index))
-        chosen = np.sort(rng.permutation(len(kept))[: round(config.random_share * len(kept))])
+        chosen = np.sort(rng.permutation(len(cloud))[: round(config.random_share * len(cloud))])
     else:
-        chosen = np.arange(len(kept))
-    times = kept_times[chosen] if len(kept_times) else kept_times
-    return kept[chosen], times, np.zeros((len(chosen), 6), np.float32)
+        chosen = np.arange(len(cloud))
+    times = cloud_times[chosen] if len(cloud_times) else cloud_times
+    return cloud[chosen], times, np.zeros((len(chosen), 6), np.float32)
 
 
 def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32], config: PreprocessConfig) -> Down:
@@ -180,15 +180,15 @@ def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32
     size = config.source_voxel
     down = voxel.centroids(map_points, map_times, size)[:3]
     for _ in range(3):
-        found = len(down[0])
-        if found > high:
-            wanted = min(size * (found / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE)
-        elif found < low and len(map_points) > found:
-            wanted = max(size * (found / (0.5 * (low + high))) ** 0.5, config.map_leaf)
+        count = len(down[0])
+        if count > high:
+            next_size = min(size * (count / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE)
+        elif count < low and len(map_points) > count:
+            next_size = max(size * (count / (0.5 * (low + high))) ** 0.5, config.map_leaf)
         else:
             break
-        if wanted == size:
+        if next_size == size:
             break
-        size = wanted
+        size = next_size
         down = voxel.centroids(map_points, map_times, size)[:3]
     return down

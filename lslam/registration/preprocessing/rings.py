@@ -65,10 +65,10 @@ class RingRule:
         if self.kind == "rows":
             return _rows(scan, self.count, self.columns)
         if self.kind == "order":
-            found = rings_by_order(scan.points)
-            if found is None:
+            rings = rings_by_order(scan.points)
+            if rings is None:
                 raise InputError(f"scan {scan.index} is not in ring order, unlike the first one: see --rings")
-            return found
+            return rings
         elevation = elevations(scan.points)
         return (self.count - 1 - np.searchsorted(self.borders, elevation)).astype(np.uint16)
 
@@ -90,24 +90,24 @@ def decide_rings(scans: list[Scan], wanted: str = "auto", known: int | None = No
     usual = np.median([len(scan) for scan in scans])
     whole = [scan for scan in scans if 2 * len(scan) >= usual]
     first = whole[0]
-    tried = {
+    rules = {
         "field": lambda: _decide_field(scans),
         "rows": lambda: _decide_rows(whole, count or known),
         "order": lambda: _decide_order(first),
         "elevation": lambda: _decide_elevation(scans, count, known),
     }
-    for name in tried if kind == "auto" else [kind]:
-        rule = tried[name]()
+    for name in rules if kind == "auto" else [kind]:
+        rule = rules[name]()
         if rule is not None:
             return rule
     raise InputError(_refusal(kind, count, first))
 
 
-def parse_rings(wanted: str) -> tuple[str, int | None]:
+def parse_rings(rule: str) -> tuple[str, int | None]:
     """`rows:64` -> ("rows", 64). Raises UsageError for what `input.rings` does not know."""
-    match = RINGS.fullmatch(wanted)
+    match = RINGS.fullmatch(rule)
     if match is None:
-        raise UsageError(f"--rings {wanted}: auto, field, order, rows[:N] or elevation[:N] is needed")
+        raise UsageError(f"--rings {rule}: auto, field, order, rows[:N] or elevation[:N] is needed")
     kind, count = match.group(1) or match.group(2), match.group(3)
     return kind, int(count) if count else None
 
@@ -203,11 +203,11 @@ def _is_organised(points: NDArray[np.float32], rows: int, columns: bool) -> bool
     """Whether each row keeps its elevation and lies below (or above) the one before."""
     table = elevations(points).reshape((-1, rows) if columns else (rows, -1))
     table = table.T if columns else table
-    known = np.isfinite(table).sum(axis=1) >= 5
-    if known.sum() < max(FEWEST, rows // 2):
+    is_full = np.isfinite(table).sum(axis=1) >= 5
+    if is_full.sum() < max(FEWEST, rows // 2):
         return False
-    middle = np.nanmedian(table[known], axis=1)
-    spread = np.nanmedian(np.abs(table[known] - middle[:, None]), axis=1)
+    middle = np.nanmedian(table[is_full], axis=1)
+    spread = np.nanmedian(np.abs(table[is_full] - middle[:, None]), axis=1)
     return _is_staircase(middle) and bool(np.median(spread) < 0.25 * np.median(np.abs(np.diff(middle))))
 
 

@@ -74,15 +74,15 @@ def lego_features(
 
 def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: Floats) -> Segments:
     slopes = range_image.row_slopes(walk.points, walk.starts) * (1.0 if vertical[2] >= 0 else -1.0)
-    known = np.flatnonzero(np.isfinite(slopes))
+    with_slope = np.flatnonzero(np.isfinite(slopes))
     row = np.zeros(len(slopes), np.int64)
-    upwards = known[np.argsort(slopes[known], kind="stable")]
+    upwards = with_slope[np.argsort(slopes[with_slope], kind="stable")]
     if not len(upwards):
         return Segments(np.zeros(len(scan), bool), np.zeros(len(scan), np.int32))
-    row[upwards] = np.arange(len(known))
-    elevation = np.arctan(np.sort(slopes[known]))
+    row[upwards] = np.arange(len(with_slope))
+    elevation = np.arctan(np.sort(slopes[with_slope]))
     columns = max(round(2 * np.pi / walk.step), 1)
-    pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(known), columns)
+    pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(with_slope), columns)
     up, floor = _floor(walk, upwards[: max(1, len(upwards) // _LOWEST)], vertical)
     ground = range_image.find_ground(
         walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE

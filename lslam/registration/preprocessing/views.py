@@ -89,16 +89,16 @@ def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:
     return ring(sequence, wanted)
 
 
-def _ringed(sequence: Sequence, wanted: str) -> Sequence:
+def _ringed(sequence: Sequence, choice: str) -> Sequence:
     scans = [scan for _, scan in islice(readable(range(len(sequence)), sequence.scan), _LOOKED_AT)]
     if not scans:
         return sequence  # nothing can be read, which is said in its turn
     rows = getattr(sequence, "rows", None)
     try:
-        if rows and wanted == "auto":
+        if rows and choice == "auto":
             rule = RingRule("rows", rows)  # as the reader filled them in
         else:
-            rule = decide_rings(scans, wanted, rows or getattr(sequence, "rings", None))
+            rule = decide_rings(scans, choice, rows or getattr(sequence, "rings", None))
     except InputError as error:
         raise InputError(f"{sequence.path}: {error}") from None
     return Ringed(sequence, rule)

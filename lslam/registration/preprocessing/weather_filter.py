@@ -34,9 +34,9 @@ def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf:
     """
     pulses = int(counts.sum())
     needed = least_line / np.sqrt(FIELD_OF_VIEW_SR / max(pulses, 1))
-    kept = voxel.accompanied(centroids, counts, leaf * needed, WIDE_CELL, WIDE_CELL * needed)
-    is_clear = len(counts) - len(kept) < CLEAR * len(counts)
-    return np.arange(len(counts)) if is_clear or int(counts[kept].sum()) < MOSTLY * pulses else kept
+    is_accompanied = voxel.accompanied(centroids, counts, leaf * needed, WIDE_CELL, WIDE_CELL * needed)
+    is_clear = len(counts) - len(is_accompanied) < CLEAR * len(counts)
+    return np.arange(len(counts)) if is_clear or int(counts[is_accompanied].sum()) < MOSTLY * pulses else is_accompanied
 
 
 def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float) -> Longs:
