@@ -85,24 +85,24 @@ def recorded_errors(estimate: str, truth: str) -> tuple[Floats, Floats]:
     Raises InputError when a file cannot be read, the two do not belong together, or nothing moves.
     """
     matches = associate(read_trajectory(estimate), read_trajectory(truth))
-    real, found = (se3.relative(poses[:-1], poses[1:]) for poses in (matches.truth, matches.estimate))
+    real, recorded = (se3.relative(poses[:-1], poses[1:]) for poses in (matches.truth, matches.estimate))
     way = np.linalg.norm(real[:, :3, 3], axis=1)
     if way.sum() <= 0:
         raise InputError(f"{truth} does not move: it has no errors over the way")
-    twists = se3.log(se3.relative(real, found))
+    twists = se3.log(se3.relative(real, recorded))
     if main_axis(matches.truth) in ("+z", "-z"):  # as cameras advance
         twists = (twists.reshape(-1, 2, 3) @ CAMERA_TO_LIDAR.T).reshape(-1, 6)
     zero = np.zeros((1, 6))
     return np.append(0.0, np.cumsum(way)), np.concatenate([zero, np.cumsum(twists, axis=0)])
 
 
-def errors_over(way: Floats, known: Floats, errors: Floats) -> Floats:
-    """(N, 4, 4) errors of steps of `way` (N,) m: what was added up until `known` (K,) m, begun anew where that ends."""
+def errors_over(way: Floats, nodes: Floats, errors: Floats) -> Floats:
+    """(N, 4, 4) errors of steps of `way` (N,) m: what was added up until `nodes` (K,) m, begun anew where that ends."""
     ends = np.append(0.0, np.cumsum(way))
-    rounds, at = np.divmod(ends, known[-1])
+    rounds, at = np.divmod(ends, nodes[-1])
     # Places where the sensor stood have one way and several errors: the last one counts.
-    last = np.append(np.diff(known) > 0, True)
-    summed = np.column_stack([np.interp(at, known[last], column[last]) for column in errors.T])
+    last = np.append(np.diff(nodes) > 0, True)
+    summed = np.column_stack([np.interp(at, nodes[last], column[last]) for column in errors.T])
     return np.asarray(se3.exp(np.diff(summed + rounds[:, None] * errors[-1], axis=0)))
 
 

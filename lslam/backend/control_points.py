@@ -48,14 +48,14 @@ def with_control(
     """
     on_earth = _on_earth(points, config.gnss.geoid)
     stamps = np.array([stamp_of(point.at, results) for point in points])
-    seen = _seen(points, stamps, results)
+    own = _seen(points, stamps, results)
     sigmas = np.stack([point.sigma for point in points])
-    known = placement.georeference
-    if known is None:
+    reference = placement.georeference
+    if reference is None:
         direction = world_up_of(config.preprocess, results[0].T_world_lidar) if up is None else up
         level = so3.least_rotation(direction, np.array([0.0, 0.0, 1.0]))
         enu = geodesy.to_local(on_earth, on_earth[0])
-        T = _aligned(seen @ level.T, enu, sigmas)
+        T = _aligned(own @ level.T, enu, sigmas)
         if T is None:
             return replace(
                 placement,
@@ -63,26 +63,26 @@ def with_control(
                 "takes two that lie apart",
             )
         T_enu_world = T @ se3.make(level, np.zeros(3))
-        known = _in_crs(Georeference(on_earth[0], T_enu_world, method="control"), points, config)
+        reference = _in_crs(Georeference(on_earth[0], T_enu_world, method="control"), points, config)
         tilt = UNLEVELLED if up is None else LEVELLED
     else:
-        enu, tilt = geodesy.to_local(on_earth, known.origin), placement.tilt_sigma
-        known = known if known.epsg else _in_crs(known, points, config)
-    held = [
+        enu, tilt = geodesy.to_local(on_earth, reference.origin), placement.tilt_sigma
+        reference = reference if reference.epsg else _in_crs(reference, points, config)
+    fixes = [
         _held(position, sigma, place, int(stamp), results, keyframes)
-        for position, sigma, place, stamp in zip(enu, sigmas, seen, stamps, strict=True)
+        for position, sigma, place, stamp in zip(enu, sigmas, own, stamps, strict=True)
     ]
-    return replace(placement, georeference=known, fixes=(*placement.fixes, *held), tilt_sigma=tilt)
+    return replace(placement, georeference=reference, fixes=(*placement.fixes, *fixes), tilt_sigma=tilt)
 
 
 def _held(
-    position: Floats, sigma: Floats, seen: Floats, stamp_ns: int, results: Many[ScanResult], keyframes: Many[Keyframe]
+    position: Floats, sigma: Floats, own: Floats, stamp_ns: int, results: Many[ScanResult], keyframes: Many[Keyframe]
 ) -> PositionFix:
     """The factor, between the keyframes around the instant."""
-    known = [k.stamp_ns for k in keyframes]
-    owner = int(np.clip(np.searchsorted(known, stamp_ns, side="right") - 1, 0, len(known) - 2))
-    share = float(np.clip((stamp_ns - known[owner]) / (known[owner + 1] - known[owner]), 0.0, 1.0))
-    arms = [se3.apply(se3.inverse(results[keyframes[k].scan].T_world_lidar), seen[None])[0] for k in (owner, owner + 1)]
+    stamps = [k.stamp_ns for k in keyframes]
+    owner = int(np.clip(np.searchsorted(stamps, stamp_ns, side="right") - 1, 0, len(stamps) - 2))
+    share = float(np.clip((stamp_ns - stamps[owner]) / (stamps[owner + 1] - stamps[owner]), 0.0, 1.0))
+    arms = [se3.apply(se3.inverse(results[keyframes[k].scan].T_world_lidar), own[None])[0] for k in (owner, owner + 1)]
     return PositionFix(owner, position, sigma, arms[0], is_held=True, share=share, next_arm=arms[1])
 
 
@@ -124,13 +124,13 @@ def against_odometry(
     off = np.linalg.norm(np.diff(enu, axis=0), axis=1) - np.linalg.norm(np.diff(seen, axis=0), axis=1)
     times = np.abs(off) / (float(np.sqrt(quantile(probability, 1))) * sigma)
     names = [points[i].at.said for i in order]
-    said = [
+    texts = [
         f"{names[k]} and {names[k + 1]}: the control points are {abs(off[k]):.2f} m "
         f"{'farther apart' if off[k] > 0 else 'nearer to each other'} than odometry has them, {times[k]:.1f} times what it may "
         "drift: they hold, are scan, sigma and CRS right?"
         for k in np.flatnonzero(times > 1).tolist()
     ]
-    return _some(said, "pairs of control points")
+    return _some(texts, "pairs of control points")
 
 
 def as_surveyed_and_seen(
@@ -157,17 +157,17 @@ def contradicting(residuals: Many[ControlResidual], probability: float) -> list[
     """One sentence for each point that the others and odometry contradict: a held one bends the trajectory to it all the same."""
     limit = float(np.sqrt(quantile(probability, 3)))
     wrong = sorted((one for one in residuals if one.size > limit), key=lambda one: -one.size)
-    said = [
+    texts = [
         f"{one.point.at.said}: the control point is left off by {np.linalg.norm(one.residual):.2f} m, {one.size:.1f} sigmas: "
         "is it the right scan, sigma and CRS?"
         for one in wrong
     ]
-    return _some(said, "control points: see control.csv")
+    return _some(texts, "control points: see control.csv")
 
 
-def _some(said: list[str], what: str) -> list[str]:
-    more = len(said) - MOST_SAID
-    return [*said[:MOST_SAID], f"and {more} more {what}"] if more > 0 else said
+def _some(texts: list[str], what: str) -> list[str]:
+    more = len(texts) - MOST_SAID
+    return [*texts[:MOST_SAID], f"and {more} more {what}"] if more > 0 else texts
 
 
 def _on_earth(points: Many[ControlPoint], geoid: str) -> Floats:
@@ -181,17 +181,17 @@ def _seen(points: Many[ControlPoint], stamps: Longs, results: Many[ScanResult]) 
     return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], np.stack([p.seen for p in points])) + poses[:, :3, 3])
 
 
-def _aligned(seen: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
+def _aligned(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
     """(4, 4) by heading and place, least squares of points (N, 3) of a level world; None where they leave the heading vague."""
     weights = 1.0 / sigmas[:, 0] ** 2
     weights /= weights.sum()
-    a, b = (points - weights @ points for points in (seen, enu))
+    a, b = (points - weights @ points for points in (own, enu))
     spread = weights @ (a[:, :2] ** 2).sum(1)
-    if float(np.sqrt((weights @ sigmas[:, 0] ** 2) / len(seen))) > VAGUE * float(np.sqrt(spread)):
+    if float(np.sqrt((weights @ sigmas[:, 0] ** 2) / len(own))) > VAGUE * float(np.sqrt(spread)):
         return None
     across = weights @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
     R = so3.exp(np.array([0.0, 0.0, np.arctan2(across, weights @ (a[:, :2] * b[:, :2]).sum(1))]))
-    return se3.make(R, weights @ enu - R @ (weights @ seen))
+    return se3.make(R, weights @ enu - R @ (weights @ own))
 
 
 def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Config) -> Georeference:
@@ -239,7 +239,7 @@ def doubts(
     config: Config,
 ) -> list[str]:  # fmt: skip
     """A sentence for each known pair that does not register, and for each that odometry contradicts, which holds all the same."""
-    said = [
+    texts = [
         f"{pair.said}: the scans of the known pair do not close a loop: {candidate.reason}"
         for pair, candidate in zip(pairs, known, strict=True)
         if not candidate.is_accepted
@@ -248,12 +248,12 @@ def doubts(
     if held:
         graph = _graph_of(keyframes, [constraint for _, constraint in held], results, config)
         reasons = judge_loops(graph, config.graph)
-        said += [
+        texts += [
             f"{pair.said}: the known pair holds, though {reason}"
             for (pair, _), reason in zip(held, reasons, strict=True)
             if reason
         ]
-    return said
+    return texts
 
 
 def _graph_of(

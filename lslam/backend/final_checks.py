@@ -96,31 +96,31 @@ def fixes_against_points(fixes: Fixes, points: Many[ControlPoint], georeference:
     own = np.maximum(np.median(fixes.sigmas, axis=0), scatter)
     sigma = np.hypot(own, np.median([point.sigma for point in points], axis=0))
     aside, sigma_aside = float(np.hypot(*middle[:2])), float(sigma[:2].max())
-    said = []
+    texts = []
     if aside > APART_SIGMAS * sigma_aside:
-        said.append(f"{aside:.1f} m aside (one sigma {sigma_aside:.2g} m)")
+        texts.append(f"{aside:.1f} m aside (one sigma {sigma_aside:.2g} m)")
     if abs(middle[2]) > APART_SIGMAS * sigma[2]:
-        said.append(f"{abs(middle[2]):.1f} m {'above' if middle[2] > 0 else 'below'} (one sigma {sigma[2]:.2g} m)")
-    if not said:
+        texts.append(f"{abs(middle[2]):.1f} m {'above' if middle[2] > 0 else 'below'} (one sigma {sigma[2]:.2g} m)")
+    if not texts:
         return ""
     return (
-        f"GNSS: fixes and control points disagree: the fixes lie {' and '.join(said)} of where the points put the run; are CRS, "
+        f"GNSS: fixes and control points disagree: the fixes lie {' and '.join(texts)} of where the points put the run; are CRS, "
         "geoid and datum right?"
     )
 
 
-def redundancy(surveyed: Floats, seen: Floats, is_level: bool) -> tuple[str, dict[str, Any]]:
+def redundancy(surveyed: Floats, run: Floats, is_level: bool) -> tuple[str, dict[str, Any]]:
     """A sentence about points that nothing checks: two, with the scale between them and odometry, or the heights of three.
 
-    surveyed, seen : (N, 3) m, of the points by their survey and by odometry
+    surveyed, run : (N, 3) m, of the points by their survey and by odometry
     is_level : whether something else tells what is up
     """
     if len(surveyed) == 3 and not is_level:
-        said = "the heights of three have no redundancy where no IMU tells what is up: a wrong one tilts the drive"
-        return f"control points: {said}", {"height_redundancy": 0}
+        text = "the heights of three have no redundancy where no IMU tells what is up: a wrong one tilts the drive"
+        return f"control points: {text}", {"height_redundancy": 0}
     if len(surveyed) != 2:
         return "", {}
-    there, here = (float(np.linalg.norm(places[1] - places[0])) for places in (surveyed, seen))
+    there, here = (float(np.linalg.norm(places[1] - places[0])) for places in (surveyed, run))
     if here <= 0:
         return "", {}
     scale = there / here

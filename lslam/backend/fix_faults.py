@@ -83,8 +83,8 @@ def clock_of(fixes: Fixes, stamps_ns: Longs, poses: Floats, arm: Floats, level: 
         return np.where(inside[:, None], places, np.nan)
 
     seconds = np.asarray(1e-9 * (fixes.stamps_ns - start), np.float64)
-    found = clock_offset(seconds, fixes.positions, antenna_at)
-    return found if found is not None and found.is_clear else None
+    offset = clock_offset(seconds, fixes.positions, antenna_at)
+    return offset if offset is not None and offset.is_clear else None
 
 
 def on_clock_of_scans(stream: GnssStream, offset: ClockOffset) -> GnssStream:
@@ -118,13 +118,13 @@ def with_actual_sigmas(
     sigmas = fixes.sigmas * factors
     stated, actual = np.median(fixes.sigmas[wrong], axis=0), np.median(sigmas[wrong], axis=0)
     which = "fixes" if wrong.all() else f"{np.count_nonzero(wrong)} of {len(sigmas)} fixes"
-    said = (
+    text = (
         f"GNSS: {which} state {_axes(stated)} m (east, north, up) and scatter by {_axes(actual)} m where odometry is smooth: "
         "they are weighted by their scatter"
     )
     facts = {"stated": np.round(stated, 3).tolist(), "scatter": np.round(actual, 3).tolist()}
     is_refuted = bool((factors[:, :2] > 1.0).any())
-    return replace(fixes, sigmas=sigmas, is_refuted=is_refuted), faults.and_another(said, fix_sigma_m=facts)
+    return replace(fixes, sigmas=sigmas, is_refuted=is_refuted), faults.and_another(text, fix_sigma_m=facts)
 
 
 def _kinds(sigmas: Floats) -> list[Bools]:
@@ -147,38 +147,38 @@ def aligned(
     def fit(of: Fixes) -> GnssAlignment | None:
         return align(of.antenna, of.positions, of.sigmas, of.slack, up, up_sigma, min_fixes)
 
-    found = fit(fixes)
+    alignment = fit(fixes)
     flat = replace(fixes, sigmas=np.column_stack([fixes.sigmas[:, :2], np.full(len(fixes.sigmas), NO_HEIGHT)]))
-    level = found if found is not None and found.inliers.all() else fit(flat)
+    level = alignment if alignment is not None and alignment.inliers.all() else fit(flat)
     if level is None:
-        return found, fixes, faults
+        return alignment, fixes, faults
     agrees = agreeing_heights(height_levels(level.residuals[:, 2], fixes.sigmas[:, 2]), fixes.sigmas[:, 2])
     has_jump = not agrees.all()
-    gained = int(level.inliers.sum()) - (0 if found is None else int(found.inliers.sum()))
+    gained = int(level.inliers.sum()) - (0 if alignment is None else int(alignment.inliers.sum()))
     if not has_jump and gained >= max(3, LEAST_SHARE * len(fixes.stamps_ns)):
         way = np.linalg.norm(fixes.antenna - np.median(fixes.antenna, axis=0), axis=1)
         judged = np.hypot(np.hypot(fixes.sigmas[:, 2], fixes.slack), min(up_sigma, float(np.deg2rad(2.0))) * way)
         agrees = agreeing_heights(level.residuals[:, 2], judged)
     without = replace(flat, sigmas=np.where(agrees[:, None], fixes.sigmas, flat.sigmas))
     again = None if agrees.all() else fit(without)
-    if again is None or (not has_jump and found is not None and again.inliers.sum() <= found.inliers.sum()):
-        return found, fixes, faults
+    if again is None or (not has_jump and alignment is not None and again.inliers.sum() <= alignment.inliers.sum()):
+        return alignment, fixes, faults
     wrong, off = np.flatnonzero(~agrees), again.residuals[:, 2]
     if has_jump:
         off = height_levels(off, fixes.sigmas[:, 2])
         if not off.any():
-            return found, fixes, faults  # the tilt of the first alignment made it
+            return alignment, fixes, faults  # the tilt of the first alignment made it
     step = float(np.median(off[wrong]) - np.median(off[agrees]))
     at = wrong[0] if wrong[0] > 0 else wrong[-1]
     since = f"{'from' if wrong[0] > 0 else 'until'} {(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"
-    said = (
+    text = (
         f"GNSS: the heights of {len(wrong)} of {len(off)} fixes are {abs(step):.1f} m {'above' if step > 0 else 'below'} the "
         f"others, {since}, "
         "where odometry does not climb: they are left out, east and north count"
     )
     if len(wrong) >= AMBIGUOUS * len(off):
-        said += "; they may as well be the right ones"
-    return again, without, faults.and_another(said, heights_left_out=len(wrong))
+        text += "; they may as well be the right ones"
+    return again, without, faults.and_another(text, heights_left_out=len(wrong))
 
 
 def _axes(sigmas: Floats) -> str:

@@ -115,23 +115,23 @@ def place(
     if isinstance(fixes, str):
         return Placement(problem=fixes)
     fixes, faults = with_actual_sigmas(fixes, level, config.gnss.max_sigma, config.graph.probability, faults)
-    found, fixes, faults = aligned(fixes, direction, sigma, config.gnss.min_fixes, faults)
-    if found is None:
+    alignment, fixes, faults = aligned(fixes, direction, sigma, config.gnss.min_fixes, faults)
+    if alignment is None:
         return Placement(
             faults=faults,
             problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and "
             f"{config.gnss.min_fixes} at the least (gnss.min_fixes): all rejected",
         )
-    georeference, shift = _at_first(found, fixes, config.gnss)
+    georeference, shift = _at_first(alignment, fixes, config.gnss)
     log.info(
         "GNSS: %d of %d fixes are inliers, %.2f m rms from the antenna horizontally, %.2f m vertically",
         georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
     )  # fmt: skip
     fix_noise, walk = None, 0.0
     if config.gnss.mode == "graph":
-        fix_noise, walk = _fix_noise(fixes, found, keyframes, graph, config)
-    factors = _as_factors(fixes, found, shift, results, keyframes, fix_noise)
-    problem = _elsewhere(found) or contradicted(found, fixes)
+        fix_noise, walk = _fix_noise(fixes, alignment, keyframes, graph, config)
+    factors = _as_factors(fixes, alignment, shift, results, keyframes, fix_noise)
+    problem = _elsewhere(alignment) or contradicted(alignment, fixes)
     return Placement(georeference, factors, fix_noise, walk, problem, faults=faults)
 
 
@@ -183,7 +183,7 @@ def _usable(
     stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, UNSTATED), config.min_sigma)
     inside = (stream.stamps_ns >= stamps[0]) & (stream.stamps_ns <= stamps[-1])
     good = inside & stream.is_place & (stated <= config.max_sigma)
-    given = int(inside.sum())
+    count = int(inside.sum())
     if len(stamps) < 2 or good.sum() < config.min_fixes:
         return (
             f"GNSS: {int(good.sum())} of {len(stream)} fixes were taken during the run, are places and state at most "
@@ -202,23 +202,23 @@ def _usable(
     sigmas = stated[good, None] * [1.0, 1.0, config.vertical]
     antenna = np.einsum("fij,j->fi", at[:, :3, :3], arm) + at[:, :3, 3]
     is_stated = config.sigma is None and bool((np.isfinite(stream.sigma) & (stream.sigma > 0))[good].all())
-    return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, given, is_stated)
+    return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, count, is_stated)
 
 
-def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
+def _at_first(alignment: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[Georeference, Floats]:
     """The georeference with its origin at the first inlier fix, and that shift of origin, (4, 4)."""
-    first = fixes.positions[int(np.argmax(found.inliers))]
+    first = fixes.positions[int(np.argmax(alignment.inliers))]
     origin = geodesy.from_local(first[None], fixes.origin)[0]
     shift = geodesy.frame_change(fixes.origin, origin)
-    residuals = found.residuals[found.inliers]
-    heights = found.residuals[found.inliers & fixes.has_height, 2]
+    residuals = alignment.residuals[alignment.inliers]
+    heights = alignment.residuals[alignment.inliers & fixes.has_height, 2]
     return Georeference(
         origin=origin,
-        T_enu_world=shift @ found.T_enu_world,
+        T_enu_world=shift @ alignment.T_enu_world,
         epsg=config.crs,
         method="graph" if config.mode == "graph" else "fit",
         fixes=fixes.given,
-        used=int(found.inliers.sum()),
+        used=int(alignment.inliers.sum()),
         rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((heights**2).mean())) if len(heights) else float("nan"),
         height_epsg=config.height_crs,
@@ -226,67 +226,67 @@ def _at_first(found: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tuple[G
     ), shift
 
 
-def _elsewhere(found: GnssAlignment) -> str:
+def _elsewhere(alignment: GnssAlignment) -> str:
     """A sentence about fixes in another part of the world, or nothing."""
-    away = int((np.linalg.norm(found.residuals, axis=1) > ELSEWHERE).sum())
+    away = int((np.linalg.norm(alignment.residuals, axis=1) > ELSEWHERE).sum())
     if not away:
         return ""
     return (
-        f"GNSS: {away} of {len(found.residuals)} fixes lie more than {ELSEWHERE / 1e3:g} km from the others and are left "
+        f"GNSS: {away} of {len(alignment.residuals)} fixes lie more than {ELSEWHERE / 1e3:g} km from the others and are left "
         "out: has their latitude or longitude lost its sign?"
     )
 
 
-def contradicted(found: GnssAlignment, fixes: Fixes) -> str:
+def contradicted(alignment: GnssAlignment, fixes: Fixes) -> str:
     """A sentence about fixes that odometry rejects, and whether they agree with each other; empty where insignificant."""
     from scipy.special import bdtrc, chdtrc
 
-    wrong = np.flatnonzero(~found.inliers)
-    n, k = len(found.residuals), len(wrong)
+    wrong = np.flatnonzero(~alignment.inliers)
+    n, k = len(alignment.residuals), len(wrong)
     if not k:
         return ""
     sigmas = np.hypot(fixes.sigmas, fixes.slack[:, None])
-    farthest = float(((found.residuals / sigmas)[wrong] ** 2).sum(1).max())
+    farthest = float(((alignment.residuals / sigmas)[wrong] ** 2).sum(1).max())
     if bdtrc(k - 1, n, FALSE_REJECTION) > CHANCE and n * chdtrc(3, farthest) > CHANCE:
         return ""
-    off = found.residuals[wrong]
+    off = alignment.residuals[wrong]
     middle = np.median(off, axis=0)
     worst = wrong[int(np.argmax(np.linalg.norm(off, axis=1)))]
-    said = (
-        f"GNSS: odometry contradicts {k} of {n} fixes, the farthest by {np.linalg.norm(found.residuals[worst]):.1f} m, "
+    text = (
+        f"GNSS: odometry contradicts {k} of {n} fixes, the farthest by {np.linalg.norm(alignment.residuals[worst]):.1f} m, "
         f"{(fixes.stamps_ns[worst] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first"
     )
     is_together = (((off - middle) / sigmas[wrong]) ** 2).sum(1) <= quantile(1.0 - FALSE_REJECTION, 3)
     first, last = int(wrong[0]), int(wrong[-1])
     if k < 3 or is_together.mean() < 0.8 or last - first + 1 != k or (first > 0 and last < n - 1):
-        return f"{said}: they are left out, look at their receiver or state their true sigmas"
+        return f"{text}: they are left out, look at their receiver or state their true sigmas"
     where = "before" if first == 0 else "from then on"
     at = first if first > 0 else last + 1
-    said = (
+    text = (
         f"GNSS: all fixes jump by {np.linalg.norm(middle):.1f} m together "
         f"{(fixes.stamps_ns[at] - fixes.stamps_ns[0]) * 1e-9:.1f} s after the first, where odometry does not: the {k} of {n} "
         f"{where} are left out"
     )
-    return said + (", but they may as well be the right ones" if k >= AMBIGUOUS * n else "")
+    return text + (", but they may as well be the right ones" if k >= AMBIGUOUS * n else "")
 
 
 def _fix_noise(
-    fixes: Fixes, found: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: Config
+    fixes: Fixes, alignment: GnssAlignment, keyframes: Many[Keyframe], graph: PoseGraph, config: Config
 ) -> tuple[GaussMarkovNoise | None, float]:
     """Correlated noise of the fixes and the factor on odometry's drift, from the inliers.
 
     Neither where the recording states no sigmas.
     """
-    good = found.inliers
+    good = alignment.inliers
     if not (fixes.is_stated or fixes.is_refuted):
         return None, 0.0
-    known, unit = (noise.rotated(chain, found.T_enu_world[:3, :3]) for chain in chains(graph, config.graph))
+    constant, unit = (noise.rotated(chain, alignment.T_enu_world[:3, :3]) for chain in chains(graph, config.graph))
     metre = drift_covariance(1.0, config.graph)
-    places = se3.apply(found.T_enu_world, graph.poses[:, :3, 3])
-    drift = DriftOfFixes(known + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])
+    places = se3.apply(alignment.T_enu_world, graph.poses[:, :3, 3])
+    drift = DriftOfFixes(constant + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])
     fix_noise, walk = fit_gauss_markov(
-        1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), found.residuals[good], fixes.sigmas[good],
-        (fixes.positions - found.residuals)[good], config.graph.probability, drift,
+        1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), alignment.residuals[good], fixes.sigmas[good],
+        (fixes.positions - alignment.residuals)[good], config.graph.probability, drift,
         config.gnss.max_sigma if fixes.is_refuted else None,
     )  # fmt: skip
     if fix_noise is not None:
@@ -309,18 +309,18 @@ def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
 
 
 def _as_factors(
-    fixes: Fixes, found: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe],
+    fixes: Fixes, alignment: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe],
     fix_noise: GaussMarkovNoise | None,
 ) -> tuple[PositionFix, ...]:  # fmt: skip
     """Position factors, each from the keyframe before the fix; gross outliers are left out."""
-    near = np.linalg.norm(found.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
+    near = np.linalg.norm(alignment.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
     owners = _owners(fixes, keyframes)
     positions = se3.apply(shift, fixes.positions)
     seconds = 1e-9 * (fixes.stamps_ns - fixes.stamps_ns[0])
     out = []
     for i in np.flatnonzero(near).tolist():
         keyframe = keyframes[int(owners[i])]
-        seen = se3.apply(se3.inverse(results[keyframe.scan].T_world_lidar), fixes.antenna[i][None])[0]
+        antenna = se3.apply(se3.inverse(results[keyframe.scan].T_world_lidar), fixes.antenna[i][None])[0]
         instant = None if fix_noise is None else int(np.argmin(np.abs(fix_noise.seconds - seconds[i])))
-        out.append(PositionFix(keyframe.number, positions[i], fixes.sigmas[i], seen, instant))
+        out.append(PositionFix(keyframe.number, positions[i], fixes.sigmas[i], antenna, instant))
     return tuple(out)

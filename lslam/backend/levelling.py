@@ -57,26 +57,27 @@ class Level:
 
 def find_level(sequence: Sequence, results: list[ScanResult], config: Config) -> Level:
     """The level that `input.level` asks for: by gravity from an IMU, by the ground under the first scan, or none."""
-    wanted = config.input.level
-    if wanted == "auto":
-        wanted = "gravity" if config.imu.use else "none"
-    if wanted == "none":
+    mode = config.input.level
+    if mode == "auto":
+        mode = "gravity" if config.imu.use else "none"
+    if mode == "none":
         return Level(np.eye(3), f"{ORIGIN}, not levelled")
     sigma = 0.0
-    if wanted == "gravity":
+    if mode == "gravity":
         up, sigma = _up_by_gravity(results)
         what, why = "gravity", "no scan has a direction of gravity: it takes --imu, and an IMU that is not refused"
     else:
         up = _up_by_ground(sequence, results, config)
         what, why = "the ground under the first scan", "no ground plane is seen there"
     if up is None:
-        problem = "" if config.input.level == "auto" else f"input.level = {wanted}: {why}; the world is not levelled"
+        problem = "" if config.input.level == "auto" else f"input.level = {mode}: {why}; the world is not levelled"
         return Level(np.eye(3), f"{ORIGIN}, not levelled", problem)
     R = so3.least_rotation(up, Z) if up[2] > NEAR_Z else so3.level_frame(up)
-    tilt, known = np.rad2deg(float(so3.angle(R))), np.rad2deg(sigma)
-    if tilt < SIGNIFICANT * known:
+    tilt, sigma_deg = np.rad2deg(float(so3.angle(R))), np.rad2deg(sigma)
+    if tilt < SIGNIFICANT * sigma_deg:
         return Level(
-            np.eye(3), f"{ORIGIN}, not levelled: its tilt of {tilt:.2f} deg is none to {what}, known to {known:.2f} deg"
+            np.eye(3),
+            f"{ORIGIN}, not levelled: its tilt of {tilt:.2f} deg is none to {what}, known to {sigma_deg:.2f} deg",
         )
     log.info("the world is levelled by %s: turned by %.2f deg", what, tilt)
     return Level(R, f"{ORIGIN}, levelled by {what} (turned by {tilt:.2f} deg)")
@@ -132,14 +133,14 @@ MOST = 0.8
 
 def up_directions(keyframes: Many[Keyframe], results: Many[ScanResult], config: GraphConfig) -> list[UpDirection]:
     """One per keyframe with a direction of gravity; those within the correlation time count as one measurement."""
-    known = [(k, g) for k in keyframes if (g := results[k.scan].imu.gravity) is not None]
-    stamps = np.array([k.stamp_ns for k, _ in known], np.int64)
+    gravities = [(k, g) for k in keyframes if (g := results[k.scan].imu.gravity) is not None]
+    stamps = np.array([k.stamp_ns for k, _ in gravities], np.int64)
     half = round(0.5e9 * MEMORY_S)
     alike = np.searchsorted(stamps, stamps + half, side="right") - np.searchsorted(stamps, stamps - half)
     least = np.deg2rad(config.gravity_deg)
     return [
         UpDirection(k.number, -g.direction, float(max(g.sigma, least)), 1 / float(count))
-        for (k, g), count in zip(known, alike, strict=True)
+        for (k, g), count in zip(gravities, alike, strict=True)
     ]
 
 

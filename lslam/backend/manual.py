@@ -143,16 +143,16 @@ def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
     rows = ["point,stamp_ns,east_m,north_m,up_m,sigma_m,sigma_up_m,sigmas"]
     for one in residuals:
         (east, north, up), (sigma, _, sigma_up) = one.residual.tolist(), one.point.sigma.tolist()
-        said = one.point.at.said.replace(",", "")
-        rows.append(f"{said},{one.stamp_ns},{east:.4f},{north:.4f},{up:.4f},{sigma:g},{sigma_up:g},{one.size:.2f}")
+        name = one.point.at.said.replace(",", "")
+        rows.append(f"{name},{one.stamp_ns},{east:.4f},{north:.4f},{up:.4f},{sigma:g},{sigma_up:g},{one.size:.2f}")
     write_text(path, "\n".join(rows) + "\n")
 
 
 def _seen(row: _Row) -> Floats:
-    seen = [row.number(f"lidar_{axis}", f"lidar_{axis}_m") for axis in "xyz"]
-    if any(value is None for value in seen) and any(value is not None for value in seen):
+    values = [row.number(f"lidar_{axis}", f"lidar_{axis}_m") for axis in "xyz"]
+    if any(value is None for value in values) and any(value is not None for value in values):
         raise row.error("lidar_x, lidar_y and lidar_z go together")
-    return np.array([value or 0.0 for value in seen])
+    return np.array([value or 0.0 for value in values])
 
 
 def _is_comment(line: str, names: set[str]) -> bool:
@@ -244,12 +244,12 @@ def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes:
             stamp = stamp_of(instant, results)
             ends.append((int(np.abs(stamps - stamp).argmin()), stamp))
         (a, _), (b, _) = ends
-        taken = {(known.a, known.b) for known in found.known}
+        numbers = {(known.a, known.b) for known in found.known}
         if a == b:
             found.problems.append(f"{pair.first.said}: both scans belong to one keyframe: there is no loop to close")
         elif pair.verdict == "forbidden":
             found.forbidden.append((min(a, b), max(a, b)))
-        elif (min(a, b), max(a, b)) in taken:
+        elif (min(a, b), max(a, b)) in numbers:
             found.problems.append(f"{pair.first.said}: the pair is named twice, it counts once")
         else:
             found.known.append(_known(pair, ends, results, keyframes))

@@ -102,16 +102,16 @@ def _with_residuals(
     """The outcome with what is left of the control points; what contradicts them is one of the problems."""
     config, points, results = given.config, given.points, given.results
     geoid, probability = config.gnss.geoid, config.graph.probability
-    left = control_residuals(points, out.results, georeference, geoid)
+    residuals = control_residuals(points, out.results, georeference, geoid)
     given.problems.extend(against_odometry(points, results, given.store.keyframes, drift, probability, geoid))
-    given.problems.extend(contradicting(left, probability))
+    given.problems.extend(contradicting(residuals, probability))
     single, facts = redundancy(*as_surveyed_and_seen(points, results, geoid), is_level)
     if single and config.gnss.mode == "off":
         log.warning("%s", single)
     if sequence.gnss is not None and len(sequence.gnss):
         fixes = final_fixes(sequence, out.results, config)
         given.problems.append("" if fixes is None else fixes_against_points(fixes, points, georeference))
-    return replace(out, control=left, facts=out.facts | {"control_points": control_facts(left) | facts})
+    return replace(out, control=residuals, facts=out.facts | {"control_points": control_facts(residuals) | facts})
 
 
 def _compared_with_map(out: BackEnd, graph: PoseGraph, given: Given) -> BackEnd:
@@ -119,18 +119,18 @@ def _compared_with_map(out: BackEnd, graph: PoseGraph, given: Given) -> BackEnd:
     config, place = given.config, out.georeference
     if place is None or place.method not in ("graph", "control") or out.solution is None:
         return out
-    without, kept = graph.poses, [c for c in out.candidates if c.is_accepted and c.constraint is not None]
-    if kept and given.points:
+    without, loops = graph.poses, [c for c in out.candidates if c.is_accepted and c.constraint is not None]
+    if loops and given.points:
         try:
             without = optimise(graph, config.graph).poses
         except (GraphError, np.linalg.LinAlgError) as error:
             log.debug("the graph without control points: %s", error)
             return out
     held_by = "control points" if given.points else "GNSS"
-    said, facts = thicker_map(thickening(given.store, without, out.keyframes), held_by, config.graph.probability)
-    if said and len(given.points) > 2:
-        said += _without_one(graph, without, given)
-    given.problems.append(said)
+    text, facts = thicker_map(thickening(given.store, without, out.keyframes), held_by, config.graph.probability)
+    if text and len(given.points) > 2:
+        text += _without_one(graph, without, given)
+    given.problems.append(text)
     return replace(out, facts=out.facts | facts)
 
 
@@ -171,8 +171,8 @@ def _placed(sequence: Sequence, graph: PoseGraph, given: Given, modes: tuple[str
 
 def _said(placement: Placement, given: Given) -> Placement:
     """The placement; its problems are those of the run."""
-    said = (*placement.faults.problems, placement.problem)
-    given.problems.extend(problem for problem in said if problem and problem not in given.problems)
+    texts = (*placement.faults.problems, placement.problem)
+    given.problems.extend(problem for problem in texts if problem and problem not in given.problems)
     given.facts.update(placement.faults.facts or {})
     return placement
 
@@ -232,10 +232,10 @@ def _graph(given: Given, inertial: InertialChain | None) -> PoseGraph:
             "(graph.floor = false looks for none)"
         )
     # Odometry that a smoother estimated knows of the IMU: beside its factors it weighs as much as its points.
-    told = results if inertial is None else [result.by_points for result in results]
+    by_points = results if inertial is None else [result.by_points for result in results]
     return PoseGraph(
         poses=poses,
-        odometry=odometry_constraints(store.keyframes, told, config.graph, fitness),
+        odometry=odometry_constraints(store.keyframes, by_points, config.graph, fitness),
         loops=loops,
         floors=floors,
         distances=distances,

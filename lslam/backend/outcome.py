@@ -106,9 +106,9 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     free = [not fix.is_held for fix in graph.fixes]
     accepted_fixes = int(solution.fix_inliers[free].sum())
     if any(free) and accepted_fixes < config.gnss.min_fixes:
-        said = f"GNSS: the pose graph accepts {accepted_fixes} of {sum(free)} fixes"
+        text = f"GNSS: the pose graph accepts {accepted_fixes} of {sum(free)} fixes"
         given.problems.append(
-            f"{said}: all rejected" if all(free) else f"{said}, the control points contradict the others"
+            f"{text}: all rejected" if all(free) else f"{text}, the control points contradict the others"
         )
         if all(free):
             return None
@@ -128,8 +128,8 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
         given.results, given.store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph
     )
     # As they were solved: odometry's covariance may be singular and has no information matrix then.
-    kept = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *accepted)]
-    return BackEnd(moved, judged, solution.poses, kept, georeference, T, solution=solution, facts=facts)
+    constraints = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *accepted)]
+    return BackEnd(moved, judged, solution.poses, constraints, georeference, T, solution=solution, facts=facts)
 
 
 def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
@@ -238,12 +238,12 @@ def _drift_facts(drift: EstimatedDrift) -> dict[str, Any]:
     names = _OF_WALLS if len(drift.rates) == len(_OF_WALLS) else _OF_LOOPS
     units = np.array([100.0 if name.endswith("percent") else np.degrees(100.0) for name in names])
     columns = {"estimate": drift.rates, "sigma": drift.sigma} | ({} if drift.rms is None else {"rms": drift.rms})
-    told: dict[str, Any] = {
+    facts: dict[str, Any] = {
         name: {column: round(float(unit * rates[i]), 4) for column, rates in columns.items()}
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
     }
-    told |= {"log_likelihood_gain": round(0.5 * drift.gain, 1), "gain_by_chance": round(0.5 * drift.chance, 1)}
-    return {"wandering_drift" if drift.is_varying else "steady_drift": told}
+    facts |= {"log_likelihood_gain": round(0.5 * drift.gain, 1), "gain_by_chance": round(0.5 * drift.chance, 1)}
+    return {"wandering_drift" if drift.is_varying else "steady_drift": facts}
 
 
 def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopView | None:

@@ -115,7 +115,7 @@ def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[i
     measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
     weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
     owners = np.array([m.building for m in matches], np.intp)
-    found = np.zeros(len(matches), bool)
+    agrees = np.zeros(len(matches), bool)
     for k, match in enumerate(checking(matches)):
         values, axes = np.linalg.eigh(weights[k])
         own = axes[:, values > FREE * values[-1]]
@@ -123,10 +123,10 @@ def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[i
         away = measured[others] - measured[k]
         away[:, 2] = se2.wrapped(away[:, 2])
         is_near = np.einsum("mi,ij,mj->m", away, weights[k], away) <= quantile(PROBABILITY, max(match.rank, 1))
-        seen = np.einsum("ia,mij,ja->ma", own, weights[others], own)
-        knows = (seen >= ALIKE * np.einsum("ia,ij,ja->a", own, weights[k], own)).all(axis=1)
-        found[k] = (is_near & knows).sum() >= SUPPORT
-    return found
+        shared = np.einsum("ia,mij,ja->ma", own, weights[others], own)
+        knows = (shared >= ALIKE * np.einsum("ia,ij,ja->a", own, weights[k], own)).all(axis=1)
+        agrees[k] = (is_near & knows).sum() >= SUPPORT
+    return agrees
 
 
 def _in_map(information: Floats, yaw: float) -> Floats:
@@ -148,13 +148,13 @@ def _linear(
     # d_i = C_i (pull_i + own (shift, 0)), so each building informs the shift by its matches alone.
     through = own[:2, :2]
     common = np.diag(1.0 / map_prior.shift_sigma**2)
-    seen = through @ (np.linalg.inv(through) - covariances[:, :2, :2]) @ through
-    told = (through @ (covariances @ pull[:, :, None])[:, :2])[:, :, 0]
-    spread = np.linalg.inv(common + seen.sum(axis=0))
-    shift = spread @ (common @ map_prior.shift + told.sum(axis=0))
-    found = (covariances @ (pull + own[:, :2] @ shift)[:, :, None])[:, :, 0]
+    shared = through @ (np.linalg.inv(through) - covariances[:, :2, :2]) @ through
+    pulls = (through @ (covariances @ pull[:, :, None])[:, :2])[:, :, 0]
+    spread = np.linalg.inv(common + shared.sum(axis=0))
+    shift = spread @ (common @ map_prior.shift + pulls.sum(axis=0))
+    offsets = (covariances @ (pull + own[:, :2] @ shift)[:, :, None])[:, :, 0]
     by_shift = covariances @ own[:, :2]
-    return found, covariances + by_shift @ spread @ np.swapaxes(by_shift, -1, -2), shift
+    return offsets, covariances + by_shift @ spread @ np.swapaxes(by_shift, -1, -2), shift
 
 
 def _squared(
@@ -250,21 +250,21 @@ def _insert(values: Any, key: int, pose: Floats) -> None:
 
 def _solution(
     middles: Floats,
-    seen: list[int],
+    which: list[int],
     places: Floats,
     spread: Floats,
     inliers: Bools,
     map_prior: MapPrior | None,
 ) -> BuildingSolution:
     """Displacements of all buildings; those without a match follow the shift of the others."""
-    found, covariances = (
+    solution, covariances = (
         np.zeros((len(middles), 3)),
         np.tile(np.diag(_sigma(map_prior, False) ** 2), (len(middles), 1, 1)),
     )
-    if seen:
-        found[seen] = se2.of_se3(places) - np.column_stack([middles[seen], np.zeros(len(seen))])
-        covariances[seen] = spread[:, factors.PLANAR][:, :, factors.PLANAR]
-    shift = found[seen, :2].mean(axis=0) if seen else (np.zeros(2) if map_prior is None else map_prior.shift)
-    unseen = np.setdiff1d(np.arange(len(middles)), seen)
-    found[unseen, :2] = 0.0 if map_prior is None else shift
-    return BuildingSolution(found, covariances, shift, inliers)
+    if which:
+        solution[which] = se2.of_se3(places) - np.column_stack([middles[which], np.zeros(len(which))])
+        covariances[which] = spread[:, factors.PLANAR][:, :, factors.PLANAR]
+    shift = solution[which, :2].mean(axis=0) if which else (np.zeros(2) if map_prior is None else map_prior.shift)
+    unseen = np.setdiff1d(np.arange(len(middles)), which)
+    solution[unseen, :2] = 0.0 if map_prior is None else shift
+    return BuildingSolution(solution, covariances, shift, inliers)

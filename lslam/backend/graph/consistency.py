@@ -73,10 +73,10 @@ def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
     for i in np.flatnonzero(~near).tolist():
         off = float(np.linalg.norm(twists[i, :3]))
         reasons[i] = f"{off:.1f} m from where odometry is, {np.sqrt(errors[i] / limit):.1f} times what it may drift"
-    kept = np.flatnonzero(near)
-    if len(kept) > 1:
-        for i, share in _voted_out(graph, ends.select(kept), drift, limit):
-            reasons[kept[i]] = f"only {share:.0%} of the loops around it agree with it"
+    near_loops = np.flatnonzero(near)
+    if len(near_loops) > 1:
+        for i, share in _voted_out(graph, ends.select(near_loops), drift, limit):
+            reasons[near_loops[i]] = f"only {share:.0%} of the loops around it agree with it"
     return reasons
 
 
@@ -117,26 +117,26 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
 
     where = np.column_stack([drift.distances[ends.a], drift.distances[ends.b]])
     k = min(NEIGHBOURS, len(where) - 1)
-    _, found = cKDTree(where).query(where, k + 1, p=1)
-    others = np.array([row[row != i][:k] for i, row in enumerate(np.asarray(found))])
+    _, neighbours = cKDTree(where).query(where, k + 1, p=1)
+    others = np.array([row[row != i][:k] for i, row in enumerate(np.asarray(neighbours))])
     first = np.repeat(np.arange(len(where)), k)
     errors, sharpness = _cycle_errors(graph, ends, drift, first, others.ravel())
     agrees = (errors <= limit).reshape(others.shape)
     # Far neighbours agree with anything, as odometry drifts far between: votes are weighted.
     votes = sharpness.reshape(others.shape)
     alive = np.ones(len(where), bool)
-    gone: list[tuple[int, float]] = []
+    outliers: list[tuple[int, float]] = []
     while True:
         check_stop()
-        asked = np.where(alive[others], votes, 0.0)
-        total = asked.sum(1)
-        share = np.where(total > 0, (agrees * asked).sum(1) / np.where(total > 0, total, 1.0), 1.0)
+        alive_votes = np.where(alive[others], votes, 0.0)
+        total = alive_votes.sum(1)
+        share = np.where(total > 0, (agrees * alive_votes).sum(1) / np.where(total > 0, total, 1.0), 1.0)
         share[~alive] = 1.0
         worst = float(share.min())
         if worst >= SHARE:
-            return gone
+            return outliers
         out = np.flatnonzero(share == worst)
-        gone += [(int(i), worst) for i in out]
+        outliers += [(int(i), worst) for i in out]
         alive[out] = False
 
 

@@ -55,13 +55,13 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
     on_map = _as_fixes(graph)
     if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
         return 0.0
-    known, drift = chains(graph, config)
-    by_loops = _of_loops(graph, loops, known, drift) if loops else 0.0
+    noise, drift = chains(graph, config)
+    by_loops = _of_loops(graph, loops, noise, drift) if loops else 0.0
     # Where the noise of fixes was estimated, odometry's drift was beside it: `graph.walk`.
     fixes = graph.fixes if graph.fix_noise is None else ()
-    by_fixes = _of_fixes(graph.poses, fixes, 3, known, drift, config.probability)
-    by_map = _of_fixes(graph.poses, on_map, 2, known, drift)
-    return max(by_loops, by_fixes, by_map, _of_ups(graph, known, drift, config))
+    by_fixes = _of_fixes(graph.poses, fixes, 3, noise, drift, config.probability)
+    by_map = _of_fixes(graph.poses, on_map, 2, noise, drift)
+    return max(by_loops, by_fixes, by_map, _of_ups(graph, noise, drift, config))
 
 
 def tilt_factor(graph: PoseGraph, config: GraphConfig) -> float:
@@ -80,13 +80,13 @@ def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
 
 def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
     """Planar priors that observe both coordinates, as positions; their height is meaningless."""
-    found = []
+    out = []
     for prior in graph.map_priors:
         if prior.rank == 3:
             sigma = np.sqrt(np.diag(np.linalg.inv(prior.information)) + graph.map_sigma**2)
             place, spread = np.array([*prior.pose[:2], 0.0]), np.array([*sigma[:2], np.inf])
-            found.append(PositionFix(prior.keyframe, place, spread, np.zeros(3)))
-    return found
+            out.append(PositionFix(prior.keyframe, place, spread, np.zeros(3)))
+    return out
 
 
 def _accumulated(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
@@ -102,7 +102,7 @@ def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.in
     return np.asarray(chain[b] - noise.transported(chain[a], poses[b, :3, 3] - poses[a, :3, 3]))
 
 
-def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], known: Floats, drift: Floats) -> float:
+def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drift: Floats) -> float:
     few = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
     a, b = np.array([c.a for c in few]), np.array([c.b for c in few])
     T = np.stack([c.T_a_b for c in few])
@@ -111,13 +111,13 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], known: Floats, drif
     turn = so3.log(T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2))
     error = np.concatenate([T[:, :3, 3] - odometry[:, :3, 3], turn], axis=1)
     own, grown = (
-        noise.rotated(_between(chain, graph.poses, a, b), np.swapaxes(R_a, -1, -2)) for chain in (known, drift)
+        noise.rotated(_between(chain, graph.poses, a, b), np.swapaxes(R_a, -1, -2)) for chain in (white, drift)
     )
     return _fitting(error, own + np.stack([c.covariance for c in few]), grown)
 
 
 def _of_fixes(
-    poses: Floats, fixes: Sequence[PositionFix], dim: int, known: Floats, drift: Floats, probability: float = 0.0
+    poses: Floats, fixes: Sequence[PositionFix], dim: int, white: Floats, drift: Floats, probability: float = 0.0
 ) -> float:
     """By pairs of fixes, half the fixes apart: difference between their displacement and odometry's, along `dim` axes.
 
@@ -134,7 +134,7 @@ def _of_fixes(
     own = np.stack([f.sigma for f in fixes])[:, :dim] ** 2
     a, b = k[first], k[first + half]
     noise_of_pair = (own[first] + own[first + half])[:, :, None] * np.eye(dim)
-    moved, grown = (_between(chain, poses, a, b)[:, :dim, :dim] for chain in (known, drift))
+    moved, grown = (_between(chain, poses, a, b)[:, :dim, :dim] for chain in (white, drift))
     error, known_of_pair = off[first + half] - off[first], moved + noise_of_pair
     median = float(np.median(squared_distances(error, known_of_pair)))
     if chance_of_median(median, dim, len(first)) < probability:
@@ -142,7 +142,7 @@ def _of_fixes(
     return _fitting(error, known_of_pair, grown)
 
 
-def _of_ups(graph: PoseGraph, known: Floats, drift: Floats, config: GraphConfig) -> float:
+def _of_ups(graph: PoseGraph, white: Floats, drift: Floats, config: GraphConfig) -> float:
     """By all measurements of up: their tilt in the world of odometry relative to the first.
 
     Gravity is mostly less accurate than odometry: only a significant tilt counts.
@@ -160,7 +160,7 @@ def _of_ups(graph: PoseGraph, known: Floats, drift: Floats, config: GraphConfig)
         single = level @ (chain[keyframes[1:], 3:, 3:] - chain[keyframes[0], 3:, 3:]) @ level.T
         return np.asarray(single[shared].swapaxes(1, 2).reshape(1, 2 * count, 2 * count))
 
-    own = together(known) + np.kron(np.diag(variances[1:]) + variances[0], np.eye(2))
+    own = together(white) + np.kron(np.diag(variances[1:]) + variances[0], np.eye(2))
     surprise = float(tilt[0] @ np.linalg.solve(own[0], tilt[0]))
     return _fitting(tilt, own, together(drift)) if surprise > quantile(config.probability, 2 * count) else 0.0
 

@@ -39,8 +39,8 @@ def well_conditioned(covariance: Floats) -> Floats:
     """Symmetric, positive definite (..., 6, 6): no sigma is below `SMALLEST`."""
     scaled = covariance / np.outer(SMALLEST, SMALLEST)
     values, vectors = np.linalg.eigh(0.5 * (scaled + np.swapaxes(scaled, -1, -2)))
-    kept = (vectors * np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return np.asarray(kept * np.outer(SMALLEST, SMALLEST))
+    lifted = (vectors * np.maximum(values, 1.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(lifted * np.outer(SMALLEST, SMALLEST))
 
 
 def between(constraint: Constraint, scale: float = 1.0, kernel: Any = None) -> Any:
@@ -169,9 +169,9 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
 
 def _relative(graph: PoseGraph) -> list[Any]:
     """Odometry, held loop closures and the IMU between keyframes."""
-    held = [loop for loop in graph.loops if loop.is_held]
+    manual = [loop for loop in graph.loops if loop.is_held]
     imu = [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up)
-    return [*between_all([*graph.odometry, *held]), *imu]
+    return [*between_all([*graph.odometry, *manual]), *imu]
 
 
 def _start(graph: PoseGraph, may_tilt: bool) -> Any:
@@ -179,15 +179,15 @@ def _start(graph: PoseGraph, may_tilt: bool) -> Any:
     import gtsam
 
     sigma_m, sigma_rad = HELD if graph.is_anchored else FREE
-    held = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
+    prior = np.diag(np.repeat([sigma_m**2, sigma_rad**2], 3))
     if not graph.is_anchored:
-        held[TILT, TILT] = graph.tilt_sigma**2
+        prior[TILT, TILT] = graph.tilt_sigma**2
     if graph.start_sigma is not None:
-        held[PLANAR, PLANAR] = graph.start_sigma**2
+        prior[PLANAR, PLANAR] = graph.start_sigma**2
     if may_tilt:
-        held[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
+        prior[3:, 3:] += TILTING**2 * (np.eye(3) - np.outer(graph.world_up, graph.world_up))
     first = graph.poses[0] if graph.start is None else _seen_from_above(graph.start, graph.poses[0])
-    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(held, first))
+    start = gtsam.noiseModel.Gaussian.Covariance(noise.to_body(prior, first))
     return gtsam.PriorFactorPose3(0, gtsam.Pose3(first), start)
 
 
@@ -239,13 +239,13 @@ def _add_fix_noise(factors: Any, fix_noise: GaussMarkovNoise) -> None:
     import gtsam
 
     steps = np.minimum(np.diff(fix_noise.seconds) / fix_noise.memory, LONG)
-    kept, driven = np.exp(-steps), -np.expm1(-2 * steps)
-    own = np.append(1.0, 1 / (1 + kept))
-    own[:-1] -= kept / (1 + kept)
+    memory, driven = np.exp(-steps), -np.expm1(-2 * steps)
+    own = np.append(1.0, 1 / (1 + memory))
+    own[:-1] -= memory / (1 + memory)
     for i, weight in enumerate(own.tolist()):
         model = gtsam.noiseModel.Diagonal.Sigmas(fix_noise.sigma / np.sqrt(weight))
         factors.add(gtsam.PriorFactorPoint3(FIX_NOISE + i, np.zeros(3), model))
-    for i, ratio in enumerate((driven / kept).tolist()):
+    for i, ratio in enumerate((driven / memory).tolist()):
         model = gtsam.noiseModel.Diagonal.Sigmas(fix_noise.sigma * np.sqrt(ratio))
         factors.add(gtsam.BetweenFactorPoint3(FIX_NOISE + i, FIX_NOISE + i + 1, np.zeros(3), model))
 

@@ -65,8 +65,8 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
         there = antenna_at(seconds + offset)[:, :2]
         return moved - _turned(there[last] - there[first], moved)
 
-    tried = np.arange(-LARGEST_S, LARGEST_S + 0.5 * STEP_S, STEP_S)
-    sizes = np.stack([np.linalg.norm(off(float(offset)), axis=1) for offset in tried])
+    offsets = np.arange(-LARGEST_S, LARGEST_S + 0.5 * STEP_S, STEP_S)
+    sizes = np.stack([np.linalg.norm(off(float(offset)), axis=1) for offset in offsets])
     inside = np.isfinite(sizes)
     costs = np.array([
         np.median(row[ok]) if ok.sum() >= max(FEWEST, 0.6 * len(first)) else np.inf
@@ -78,8 +78,8 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
         return None
     # Displacements that share a second share their errors.
     shared = max(float(np.median(last - first)), 1.0)
-    noise = _spread(off(float(tried[best]))[both])
-    at, sigma, is_curved = float(tried[best]), 2.0 * STEP_S, False
+    noise = _spread(off(float(offsets[best]))[both])
+    at, sigma, is_curved = float(offsets[best]), 2.0 * STEP_S, False
     for _ in range(4):
         around = at + 4.0 * max(sigma, 1e-3) * np.linspace(-1.0, 1.0, 17)
         there = [off(float(offset)) for offset in around]
@@ -175,15 +175,15 @@ def _noise_beside_outliers(steps: Floats, probability: float) -> float:
     """
     sizes = np.abs(steps - np.median(steps))
     wide = 1.0 / (np.maximum(sizes, 1.0) * 2.0 * (1.0 + np.log(max(float(sizes.max()), 2.0))))
-    tried = np.concatenate([[1.0], np.geomspace(1.05, max(float(sizes.max()), 1.1), 80)])
+    factors = np.concatenate([[1.0], np.geomspace(1.05, max(float(sizes.max()), 1.1), 80)])
     fits = []
-    for factor in tried:
+    for factor in factors:
         narrow = np.exp(-0.25 * (sizes / factor) ** 2) / (factor * np.sqrt(4.0 * np.pi))
         fits.append(max(float(np.log((1 - share) * narrow + share * wide).sum()) for share in OUTLIERS))
     best = int(np.argmax(fits))
     # Adjacent differences share an error.
     gain = 2.0 * (fits[best] - fits[0]) / 1.5
-    return float(tried[best]) if gain > quantile(probability, 1) else 1.0
+    return float(factors[best]) if gain > quantile(probability, 1) else 1.0
 
 
 def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floats:

@@ -165,14 +165,14 @@ def _likeliest(
     return float(memories[m]), float(slow[v]), float(FACTORS[possible][f])
 
 
-def _interpolated(tried: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, Floats]:
-    """Positive numbers between those `tried`, and a cubic spline of the logarithms of their likelihoods along `axis`."""
+def _interpolated(grid: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, Floats]:
+    """Positive numbers between those `grid`, and a cubic spline of the logarithms of their likelihoods along `axis`."""
     from scipy.interpolate import CubicSpline
 
-    if len(tried) == 1:
-        return tried, likelihoods
-    dense = np.geomspace(tried[0], tried[-1], 1 + round(float(np.log(tried[-1] / tried[0])) / STEP))
-    return dense, np.asarray(CubicSpline(np.log(tried), likelihoods, axis=axis)(np.log(dense)))
+    if len(grid) == 1:
+        return grid, likelihoods
+    dense = np.geomspace(grid[0], grid[-1], 1 + round(float(np.log(grid[-1] / grid[0])) / STEP))
+    return dense, np.asarray(CubicSpline(np.log(grid), likelihoods, axis=axis)(np.log(dense)))
 
 
 def _lasting(metre: Floats, places: Floats) -> Floats:

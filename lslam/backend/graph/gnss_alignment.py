@@ -75,11 +75,11 @@ def _consensus(a: Floats, fixes: Floats, sigmas: Floats) -> Floats | None:
     best: Floats | None = None
     most = (0, 0.0)
     for i, j in rng.integers(0, len(a), (TRIALS, 2)):
-        own, seen = a[j] - a[i], fixes[j] - fixes[i]
+        own, other = a[j] - a[i], fixes[j] - fixes[i]
         away = float(np.hypot(own[0], own[1]))
-        if away < max(APART_SHARE * reach, 0.5) or not np.isfinite(seen).all():
+        if away < max(APART_SHARE * reach, 0.5) or not np.isfinite(other).all():
             continue
-        R = so3.exp(np.array([0.0, 0.0, np.arctan2(seen[1], seen[0]) - np.arctan2(own[1], own[0])]))
+        R = so3.exp(np.array([0.0, 0.0, np.arctan2(other[1], other[0]) - np.arctan2(own[1], own[0])]))
         T = se3.make(R, 0.5 * (fixes[i] + fixes[j]) - R @ (0.5 * (a[i] + a[j])))
         # The hypothesis has the noise of two fixes.
         count = int(_fits(T, a, fixes, np.sqrt(3) * sigmas).sum())

@@ -29,10 +29,10 @@ def preintegrated(
     params.setIntegrationCovariance(INTEGRATION * one)
     params.setBiasAccCovariance(imu_noise.accel_walk**2 * one)
     params.setBiasOmegaCovariance(imu_noise.gyro_walk**2 * one)
-    felt = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(accel_bias, gyro_bias))
+    measured = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias(accel_bias, gyro_bias))
     for accel, rate, seconds in zip(step.accel, step.rates, step.seconds.tolist(), strict=True):
-        felt.integrateMeasurement(accel, rate, seconds)
-    return felt
+        measured.integrateMeasurement(accel, rate, seconds)
+    return measured
 
 
 SPEED_KEY, BIAS_KEY = 1 << 41, 1 << 42
@@ -51,20 +51,20 @@ def inertial_factors(chain: InertialChain, world_up: Floats) -> list[Any]:
     """The factors of all links; world_up : (3,) unit, in the world of the graph."""
     import gtsam
 
-    made: list[Any] = []
+    factors: list[Any] = []
     gravity = -GRAVITY * world_up
     bias = gtsam.imuBias.ConstantBias(chain.accel_bias, chain.gyro_bias)
     about = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([FORCE_BIAS, RATE_BIAS], 3))
     before = -1
     for link in chain.links:
         if link.a != before:
-            made.append(gtsam.PriorFactorConstantBias(BIAS_KEY + link.a, bias, about))
+            factors.append(gtsam.PriorFactorConstantBias(BIAS_KEY + link.a, bias, about))
         before = link.b
-        felt = preintegrated(link.step, chain.accel_bias, chain.gyro_bias, gravity, chain.noise)
+        measured = preintegrated(link.step, chain.accel_bias, chain.gyro_bias, gravity, chain.noise)
         a, b = link.a, link.b
         names = (a, SPEED_KEY + a, b, SPEED_KEY + b, BIAS_KEY + a, BIAS_KEY + b)
-        made.append(gtsam.CombinedImuFactor(*names, felt))
-    return made
+        factors.append(gtsam.CombinedImuFactor(*names, measured))
+    return factors
 
 
 def insert_inertial(values: Any, chain: InertialChain, poses: Floats) -> None:

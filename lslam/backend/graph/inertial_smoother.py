@@ -88,11 +88,11 @@ class InertialSmoother(Stateful):
         before = self.newest
         assert before is not None
         k = len(self._steps)
-        felt = preintegrated(step, before.accel_bias, before.gyro_bias, before.gravity, self._noise)
+        increments = preintegrated(step, before.accel_bias, before.gyro_bias, before.gravity, self._noise)
         names = (4 * k, 4 * k + 1, 4 * k + 4, 4 * k + 5, 4 * k + 2, 4 * k + 6)
         factors = gtsam.NonlinearFactorGraph()
-        factors.add(gtsam.CombinedImuFactorWithGravityVector(*names, GRAVITY_KEY, felt))
-        T, velocity = _predicted(before, felt)
+        factors.add(gtsam.CombinedImuFactorWithGravityVector(*names, GRAVITY_KEY, increments))
+        T, velocity = _predicted(before, increments)
         if step.T_world_imu is not None and step.covariance is not None:
             body = noise.to_body(well_conditioned(step.covariance), step.T_world_imu)
             model = gtsam.noiseModel.Gaussian.Covariance(body)
@@ -106,8 +106,8 @@ class InertialSmoother(Stateful):
             self._solver.update(factors, values)
             self.newest = self._estimate(k + 1)
         except RuntimeError as failure:
-            said = str(failure).strip() or "nothing is said why"
-            raise GraphError(f"the smoother of poses and IMU cannot be solved: {said.splitlines()[0]}") from None
+            message = str(failure).strip() or "nothing is said why"
+            raise GraphError(f"the smoother of poses and IMU cannot be solved: {message.splitlines()[0]}") from None
         return self.newest
 
     def _estimate(self, k: int) -> InertialState:
@@ -141,13 +141,13 @@ def _values(k: int, state: InertialState) -> Any:
     return values
 
 
-def _predicted(before: InertialState, felt: Any) -> tuple[Floats, Floats]:
-    """Pose (4, 4) and velocity (3,) at the end of what was `felt`, by the mean of the state before."""
+def _predicted(before: InertialState, increments: Any) -> tuple[Floats, Floats]:
+    """Pose (4, 4) and velocity (3,) at the end of what was `increments`, by the mean of the state before."""
     import gtsam
 
     start = gtsam.NavState(gtsam.Pose3(before.T_world_imu), before.velocity)
-    found = felt.predict(start, gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias))
-    return se3.normalise(found.pose().matrix()), found.velocity()
+    state = increments.predict(start, gtsam.imuBias.ConstantBias(before.accel_bias, before.gyro_bias))
+    return se3.normalise(state.pose().matrix()), state.velocity()
 
 
 def _prior(state: InertialState) -> Any:

@@ -58,15 +58,15 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     loops = [loops[i] for i in np.unique(np.linspace(0, len(loops) - 1, MOST).round().astype(int))]
     at_knots = linear_basis(graph.distances, _apart(graph.distances))
     does_last = np.repeat(LASTS, len(SIZES)) > 0.5
-    straight, found = graph, np.zeros(6 * at_knots.shape[1])
+    straight, drift = graph, np.zeros(6 * at_knots.shape[1])
     turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
     for _ in range(ROUNDS):
-        fit = _Fit(straight, loops, found, turned, config)
+        fit = _Fit(straight, loops, drift, turned, config)
         gain = float(fit.negative_log_likelihood[:, 0].min() - fit.negative_log_likelihood[:, 1:][:, does_last].min())
         if gain <= 0.0:
             return graph
-        found, covariance, walk = fit.likeliest()
-        rates = at_knots @ found.reshape(-1, 6)
+        drift, covariance, walk = fit.likeliest()
+        rates = at_knots @ drift.reshape(-1, 6)
         turned = _turned(rates[:, 3:], np.diff(graph.distances))
         straight = correct_drift(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
     chance = quantile(config.probability, 6)
@@ -75,7 +75,7 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     share = np.diff(graph.distances) / np.ptp(graph.distances)
     mean = np.kron(share @ at_knots, np.eye(6))
     sigma = np.sqrt(np.diag(mean @ covariance @ mean.T)).astype(np.float64)
-    estimated_drift = EstimatedDrift(-np.asarray(mean @ found, np.float64), sigma, gain, chance)
+    estimated_drift = EstimatedDrift(-np.asarray(mean @ drift, np.float64), sigma, gain, chance)
     return replace(straight, spread=fit.spread(covariance, walk), walk=walk, estimated_drift=estimated_drift)
 
 
@@ -115,9 +115,9 @@ class _Fit:
     def likeliest(self) -> tuple[Floats, Floats, float]:
         """(6 n,) rates at the knots, their covariance (6 n, 6 n), and the random walk beside them."""
         prior, walk = self._choice()
-        seen = self._rows @ prior
-        gain = np.linalg.solve(self._walked(walk) + seen @ self._rows.T, seen).T
-        return np.asarray(gain @ self._off), np.asarray(prior - gain @ seen), walk
+        design = self._rows @ prior
+        gain = np.linalg.solve(self._walked(walk) + design @ self._rows.T, design).T
+        return np.asarray(gain @ self._off), np.asarray(prior - gain @ design), walk
 
     def spread(self, covariance: Floats, walk: float) -> Floats:
         """(K, 6, 6) covariances of poses due to the `covariance` (6 n, 6 n) of the rates, as those of `Solution`.
@@ -126,12 +126,12 @@ class _Fit:
         cannot tell it from a random walk.
         """
         known, walked = self._chains
-        chain, taken = known + walk * walked, np.linalg.solve(self._walked(walk), self._rows)
+        chain, weights = known + walk * walked, np.linalg.solve(self._walked(walk), self._rows)
         about_middle = np.empty((len(self._poses), 6, 6))
         for k, effects in _effects(self._poses, *self._way):
-            left = effects - _walked_along(chain, np.arange(len(chain))[k], self._ends) @ taken
-            spread = (left.reshape(-1, len(covariance)) @ covariance).reshape(left.shape)
-            about_middle[k] = spread @ np.swapaxes(left, -1, -2)
+            rest = effects - _walked_along(chain, np.arange(len(chain))[k], self._ends) @ weights
+            spread = (rest.reshape(-1, len(covariance)) @ covariance).reshape(rest.shape)
+            about_middle[k] = spread @ np.swapaxes(rest, -1, -2)
         return noise.transported(about_middle, self._poses[:, :3, 3])
 
     def _choice(self) -> tuple[Floats, float]:

@@ -56,16 +56,16 @@ def in_plane(covariance: Floats) -> Floats:
     return flat
 
 
-def fitness_score(seen: NDArray[np.float32], other: NDArray[np.float32], T: Floats) -> float:
+def fitness_score(points: NDArray[np.float32], other: NDArray[np.float32], T: Floats) -> float:
     """Mean squared distance, m2, of the points (N, 3) of one keyframe to the nearest of another's (M, 3), at T (4, 4) from it.
 
     PCL's `getFitnessScore`, which hdl_graph_slam takes of its keyframes; infinite without points.
     """
     from scipy.spatial import cKDTree
 
-    if not len(seen) or not len(other):
+    if not len(points) or not len(other):
         return float("inf")
-    away, _ = cKDTree(other).query(se3.apply(T, seen.astype(np.float64)))
+    away, _ = cKDTree(other).query(se3.apply(T, points.astype(np.float64)))
     return float(np.mean(np.square(away)))
 
 

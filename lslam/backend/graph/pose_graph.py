@@ -43,10 +43,10 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     reasons = judge_loops(graph, config) if config.is_pairwise else [""] * len(graph.loops)
     reasons = ["" if loop.is_held else reason for loop, reason in zip(graph.loops, reasons, strict=True)]
     stages = [LoopStage.CONSISTENCY if reason else LoopStage.GRAPH for reason in reasons]
-    kept = [i for i, reason in enumerate(reasons) if not reason]
-    drift = 0.0 if graph.is_rigid else max(drift_factor(graph, [graph.loops[i] for i in kept], config), graph.walk)
-    kept = [i for i in kept if not graph.loops[i].is_held]
-    loops, fixes = [graph.loops[i] for i in kept], [fix for fix in graph.fixes if not fix.is_held]
+    accepted = [i for i, reason in enumerate(reasons) if not reason]
+    drift = 0.0 if graph.is_rigid else max(drift_factor(graph, [graph.loops[i] for i in accepted], config), graph.walk)
+    accepted = [i for i in accepted if not graph.loops[i].is_held]
+    loops, fixes = [graph.loops[i] for i in accepted], [fix for fix in graph.fixes if not fix.is_held]
     graph = replace(graph, odometry=with_drift(graph, drift, config))
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
@@ -79,7 +79,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         else f"{np.sqrt(squared / limit):.1f} times as far as it may be from where all others put it"
         for weight, squared, limit in zip(solved.weights, solved.squared, solved.limits, strict=True)
     ]
-    for i, rejection in zip(kept, rejections, strict=False):
+    for i, rejection in zip(accepted, rejections, strict=False):
         reasons[i] = reasons[i] or rejection
     rest = len(loops) + len(fixes)
     fix_inliers = np.ones(len(graph.fixes), np.bool_)

@@ -40,13 +40,13 @@ def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
         params.setMaxIterations(config.max_iterations)
         params.iterationHook = lambda iteration, before, after: check_stop()
         optimizer: Any = gtsam.DoglegOptimizer if is_dogleg else gtsam.LevenbergMarquardtOptimizer
-        found = optimizer(factors, values, params).optimize()
-        error = float(factors.error(found))
+        solution = optimizer(factors, values, params).optimize()
+        error = float(factors.error(solution))
     except RuntimeError as failure:
         raise GraphError(f"the pose graph cannot be optimised: {_first_line(failure)}") from None
     if not np.isfinite(error):
         raise GraphError("the pose graph cannot be optimised: its error is not finite")
-    return found
+    return solution
 
 
 def refine(factors: Any, values: Any, config: GraphConfig) -> Any:
@@ -140,14 +140,14 @@ def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
     """
     import gtsam
 
-    wanted = list(keys)
+    needed = list(keys)
     try:
         net = factors.linearize(values).eliminateSequential(gtsam.Ordering.OrderingType.COLAMD)
-        found = dict(checking(selected_inverse(net, wanted)))
-        return np.stack([found[key] for key in wanted])
+        blocks = dict(checking(selected_inverse(net, needed)))
+        return np.stack([blocks[key] for key in needed])
     except RuntimeError:
         # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
-        return scaled_blocks(factors, values, wanted)
+        return scaled_blocks(factors, values, needed)
 
 
 def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:

@@ -72,7 +72,7 @@ def keyframe_cloud(
     """
     plain = preprocess.model_copy(update={"remove_ground": False, "denoise": False})
     raw = as_cloud(scan.points)
-    kept = gate_points(raw, plain)
-    times = scan.times[kept] if scan.times is not None and preprocess.deskew else None
-    centroids = voxel.means(deskew_points(voxel.take(raw, kept), times, motion), NO_TIMES, config.voxel)[0]
+    index = gate_points(raw, plain)
+    times = scan.times[index] if scan.times is not None and preprocess.deskew else None
+    centroids = voxel.means(deskew_points(voxel.take(raw, index), times, motion), NO_TIMES, config.voxel)[0]
     return np.asarray(np.round(centroids / np.float32(GRAIN)) * np.float32(GRAIN), np.float32)

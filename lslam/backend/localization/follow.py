@@ -79,22 +79,22 @@ class MapFollower(Stateful):
         if points is None or len(points.source) < MIN_SOURCE_POINTS:
             return self._carried("unread", "no usable points")
         alignment = self.view.at(self.T[:3, 3])
-        found = self._align(alignment, points, self.T)
-        status, reason = self._judge(found)
+        result = self._align(alignment, points, self.T)
+        status, reason = self._judge(result)
         if reason and self.search is not None and self._spread() > self.config.registration.coarse_kernel:
             T = self.search(position, self.T, self._spread())
             if T is not None:
-                found = self._align(self.view.at(T[:3, 3]), points, T)
-                status, reason = self._judge(found)
-        move, turn = correction(self.T, found.T_world_lidar)
+                result = self._align(self.view.at(T[:3, 3]), points, T)
+                status, reason = self._judge(result)
+        move, turn = correction(self.T, result.T_world_lidar)
         if reason:
             if status == "changed":
                 self.usual.relax()
-            return self._carried(status, reason, found)
-        assert found.covariance is not None
-        self.usual.observe(found.inlier_share)
-        self.T, self.P, self.way = found.T_world_lidar, found.covariance + self._floor, 0.0
-        return MapFix(self.T, self.P, "held", found.overlap, found.inlier_share, (move, turn))
+            return self._carried(status, reason, result)
+        assert result.covariance is not None
+        self.usual.observe(result.inlier_share)
+        self.T, self.P, self.way = result.T_world_lidar, result.covariance + self._floor, 0.0
+        return MapFix(self.T, self.P, "held", result.overlap, result.inlier_share, (move, turn))
 
     def _align(self, alignment: MapAlignment, points: PreparedPoints, start: Floats) -> RegistrationResult:
         """Registration from the prior with its information, the kernel as wide as the prior is uncertain.
@@ -110,19 +110,19 @@ class MapFollower(Stateful):
             start = alignment.coarse_to_fine(points, start, width).T_world_lidar
         return alignment.refine(points, start, c.kernel_max, c.max_iterations)
 
-    def _judge(self, found: RegistrationResult) -> tuple[FixStatus, str]:
+    def _judge(self, result: RegistrationResult) -> tuple[FixStatus, str]:
         """What the map says of a scan, and why not more."""
         limits = Acceptance(
             MAP_MIN_OVERLAP, MAP_MIN_INLIERS, needs_covariance=True, usual=self.usual, is_usual_of_matches=True
         )
-        rejection = limits.rejection(found)
+        rejection = limits.rejection(result)
         if rejection is not None:
             return "beyond" if rejection.test in ("solution", "overlap") else "changed", rejection.reason
-        d = se3_difference(self.T, found.T_world_lidar)
+        d = se3_difference(self.T, result.T_world_lidar)
         # A scan that fits as well as those before has found its place, and odometry is worse than its covariance.
         is_outlier = float(d @ np.linalg.solve(self.covariance + self._floor, d)) > self._gate
-        if is_outlier and self.usual.is_less(found.inlier_share):
-            move, turn = correction(self.T, found.T_world_lidar)
+        if is_outlier and self.usual.is_less(result.inlier_share):
+            move, turn = correction(self.T, result.T_world_lidar)
             return "changed", f"the map would move it by {move:.2f} m and {np.rad2deg(turn):.1f} deg"
         return "held", ""
 
@@ -132,8 +132,8 @@ class MapFollower(Stateful):
         position, turn = (float(np.linalg.eigvalsh(part)[-1]) for part in (P[:3, :3], P[3:, 3:]))
         return SIGMAS * float(np.sqrt(position + LEVER_M**2 * turn))
 
-    def _carried(self, status: FixStatus, reason: str, found: RegistrationResult | None = None) -> MapFix:
-        overlap, share = (0.0, 0.0) if found is None else (found.overlap, found.inlier_share)
+    def _carried(self, status: FixStatus, reason: str, result: RegistrationResult | None = None) -> MapFix:
+        overlap, share = (0.0, 0.0) if result is None else (result.overlap, result.inlier_share)
         return MapFix(self.T, self.covariance, status, overlap, share, reason=reason)
 
 

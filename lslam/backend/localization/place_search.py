@@ -94,16 +94,16 @@ class PlaceSearch:
     def _peaks(self, score: Image, turn: Image, region: Region | None) -> list[tuple[Floats, float]]:
         """Shift (2,) m and yaw of the best cells in the region, none near another."""
         shifts = self.grid.shifts()
-        left = score.copy()
+        rest = score.copy()
         if region is not None:
             x, y = region.centre[:2]
-            left[(shifts[:, None] - x) ** 2 + (shifts[None, :] - y) ** 2 > max(region.radius, CELL) ** 2] = 0.0
-        found: list[tuple[Floats, float]] = []
-        while len(found) < GUESSES and left.max() > 0:
-            r, c = np.unravel_index(int(left.argmax()), left.shape)
-            found.append((np.array([shifts[r], shifts[c]]), float(turn[r, c])))
-            left[np.ix_(np.abs(shifts - shifts[r]) < APART, np.abs(shifts - shifts[c]) < APART)] = 0.0
-        return found
+            rest[(shifts[:, None] - x) ** 2 + (shifts[None, :] - y) ** 2 > max(region.radius, CELL) ** 2] = 0.0
+        peaks: list[tuple[Floats, float]] = []
+        while len(peaks) < GUESSES and rest.max() > 0:
+            r, c = np.unravel_index(int(rest.argmax()), rest.shape)
+            peaks.append((np.array([shifts[r], shifts[c]]), float(turn[r, c])))
+            rest[np.ix_(np.abs(shifts - shifts[r]) < APART, np.abs(shifts - shifts[c]) < APART)] = 0.0
+        return peaks
 
     def _pose(self, query: LevelSubmap, shift: Floats, yaw: float) -> Floats:
         """(4, 4) with the median height difference of the ground in common."""
@@ -115,8 +115,8 @@ class PlaceSearch:
         return se3.make(R, np.array([*shift, float(np.median(climb[both])) if both.any() else 0.0]))
 
 
-def _centred(image: Image, seen: Image) -> Image:
+def _centred(image: Image, cover: Image) -> Image:
     """The image less its mean over the observed cells; 0 elsewhere."""
-    observed = seen > 0
+    observed = cover > 0
     mean = image[observed].mean() if observed.any() else np.float32(0)
     return np.where(observed, image - mean, np.float32(0))

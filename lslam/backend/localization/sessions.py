@@ -136,11 +136,11 @@ class Chain:
         session, last = self.sessions[n], int(self.firsts[n]) - 1
         T = se3.relative(self._whole[n - 1][-1], self._whole[n][0])
         assert session.start is not None
-        found = session.start.vote.keyframe
-        at = self._whole[n][found][:3, 3]
+        keyframe = session.start.vote.keyframe
+        at = self._whole[n][keyframe][:3, 3]
         before = np.concatenate(self._whole[:n])[:, :3, 3]
         near = int(np.linalg.norm(before - at, axis=1).argmin())
-        own = session.keyframes[found].distance - session.keyframes[0].distance
+        own = session.keyframes[keyframe].distance - session.keyframes[0].distance
         old = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(before, axis=0), axis=1))])
         way = own + float(old[-1] - old[near])
         c = self.config.loops
@@ -177,8 +177,8 @@ def tie(
     if start is None and expected is not None:
         return None, "it is not where its georeference puts it among them"
     if start is None:
-        said = [reason.split(",")[0] for reason in finder.reasons]
-        return None, max(set(said), key=said.count) if said else "its keyframes do not agree on a place"
+        reasons = [reason.split(",")[0] for reason in finder.reasons]
+        return None, max(set(reasons), key=reasons.count) if reasons else "its keyframes do not agree on a place"
     return replace(session, T_town_session=prior_map.T_map_level @ start.vote.T_level_odometry, start=start), ""
 
 

@@ -120,14 +120,14 @@ class PlaceFinder:
     def vote(self, b: int, region: Region | None) -> Vote | None:
         """The place of keyframe `b` in the map, None with one more of the `reasons` when there is none or more than one."""
         query = make_level_submap(self._cloud(b), self.config.registration)
-        tried = sorted(
+        trials = sorted(
             (self._try(query, guess) for guess in self.search.guesses(query, region)), key=lambda found: -found[0]
         )
-        if not tried:
+        if not trials:
             self.reasons.append("nothing stands up there")
             return None
-        support, rough = tried[0]
-        rivals = [s for s, T in tried[1:] if is_elsewhere(rough, T)]
+        support, rough = trials[0]
+        rivals = [s for s, T in trials[1:] if is_elsewhere(rough, T)]
         r, c = self.config.registration, self.config.loops
         if rivals and rivals[0] > c.max_ambiguity * support:
             self.reasons.append(f"another place fits {rivals[0] / support:.0%} as well")

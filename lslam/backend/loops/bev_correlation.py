@@ -40,10 +40,10 @@ class BevGrid:
 
     def cover(self, *clouds: Floats, R: Floats = UNTURNED) -> Image:
         """(size, size) visibility: 1 in cells that hold a point, turned by R (2, 2), and in their neighbours, else 0."""
-        seen = np.zeros((self.size, self.size), np.float32)
+        covered = np.zeros((self.size, self.size), np.float32)
         for points in clouds:
-            bev.mark(points, R, CELL, seen)
-        return seen
+            bev.mark(points, R, CELL, covered)
+        return covered
 
     def lowest(self, points: Floats) -> Floats:
         """(size * size,) least z per cell, m, inf where there is none."""

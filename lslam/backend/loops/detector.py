@@ -140,12 +140,12 @@ class Detector:
         yaws = np.arange(-spread, spread, TURN_STEP)
         expected = self.keyframes[a].T_world_lidar[:3, :3] @ pair.place
         within = self.config.known_within if pair.within is None else pair.within
-        found = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
-        closed = self._constraint(a, b, found)
+        check = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
+        closed = self._constraint(a, b, check)
         return LoopCandidate(
-            a, b, self._away(a, b), float("nan"), Verdict.REJECTED if found.reason else Verdict.ACCEPTED,
-            found.stage if found.reason else LoopStage.MANUAL, found.reason, found.rmse, found.overlap,
-            None if closed is None else replace(closed, is_held=not found.reason),
+            a, b, self._away(a, b), float("nan"), Verdict.REJECTED if check.reason else Verdict.ACCEPTED,
+            check.stage if check.reason else LoopStage.MANUAL, check.reason, check.rmse, check.overlap,
+            None if closed is None else replace(closed, is_held=not check.reason),
         )  # fmt: skip
 
     def _due_after(self, b: int, gated: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
@@ -197,8 +197,8 @@ class Detector:
 
     def _thinned(self, older: Longs, b: int, wait: float) -> LoopCandidate:
         a = self._nearest(older, b)
-        said = f"the last one tried was less than {wait:g} m ago"
-        return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, said)
+        reason = f"the last one tried was less than {wait:g} m ago"
+        return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, reason)
 
     def _nearest(self, older: Longs, b: int) -> int:
         away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
@@ -246,11 +246,11 @@ class Detector:
 
     def _apart(self, matches: list[PlaceMatch]) -> list[PlaceMatch]:
         """The first few matches, none near another."""
-        kept: list[PlaceMatch] = []
+        chosen: list[PlaceMatch] = []
         for match in matches:
-            if len(kept) < RIVALS and all(self._away(match.number, k.number) > NEAR for k in kept):
-                kept.append(match)
-        return kept
+            if len(chosen) < RIVALS and all(self._away(match.number, k.number) > NEAR for k in chosen):
+                chosen.append(match)
+        return chosen
 
     def _examine(self, match: PlaceMatch, b: int) -> LoopCandidate:
         """Verify the loop of keyframe `b` with the match."""
@@ -258,16 +258,16 @@ class Detector:
         uncertainty = self.uncertainty.between(b, np.array([a]))
         expected = self.uncertainty.positions[b] - self.uncertainty.positions[a]
         yaws = self._yaws(match, self._turn(uncertainty))
-        found = self.verifier.verify(
+        check = self.verifier.verify(
             self._submaps.get(a), self._submaps.get(b), expected, self._reach(uncertainty), yaws
         )
-        stage, reason = found.stage, found.reason
+        stage, reason = check.stage, check.reason
         if not reason:
-            reason = self._beyond(found, expected, uncertainty)
+            reason = self._beyond(check, expected, uncertainty)
             stage = LoopStage.GATE if reason else stage
         return LoopCandidate(
-            a, b, self._away(a, b), match.distance, Verdict.REJECTED if reason else Verdict.ACCEPTED, stage, reason, found.rmse,
-            found.overlap, self._constraint(a, b, found),
+            a, b, self._away(a, b), match.distance, Verdict.REJECTED if reason else Verdict.ACCEPTED, stage, reason, check.rmse,
+            check.overlap, self._constraint(a, b, check),
         )  # fmt: skip
 
     def _reach_between(self, older: int, newer: int) -> float:
@@ -290,11 +290,11 @@ class Detector:
         count = int(np.ceil(spread / TURN_STEP))
         return np.asarray(centre + TURN_STEP * np.arange(-count, count + 1))
 
-    def _beyond(self, found: Verification, expected: Floats, uncertainty: RelativeUncertainty) -> str:
+    def _beyond(self, check: Verification, expected: Floats, uncertainty: RelativeUncertainty) -> str:
         """Why the pose found lies outside the gate of odometry; empty inside."""
-        assert found.T_a_b is not None
-        shift = found.T_a_b[:3, 3] - expected
-        turn = float(so3.angle(found.T_a_b[:3, :3]))
+        assert check.T_a_b is not None
+        shift = check.T_a_b[:3, 3] - expected
+        turn = float(so3.angle(check.T_a_b[:3, :3]))
         if turn > self._turn(uncertainty):
             return f"odometry would be wrong by {np.rad2deg(turn):.1f} deg"
         if self.config.radius is not None:
@@ -306,14 +306,14 @@ class Detector:
             return f"odometry would be wrong by {np.linalg.norm(shift):.1f} m"
         return ""
 
-    def _constraint(self, a: int, b: int, found: Verification) -> Constraint | None:
+    def _constraint(self, a: int, b: int, check: Verification) -> Constraint | None:
         """Pose and covariance of the loop closure, from level axes to those of the keyframes."""
-        if found.T_a_b is None or found.covariance is None:
+        if check.T_a_b is None or check.covariance is None:
             return None
         R_a, R_b = (self.keyframes[k].T_world_lidar[:3, :3] for k in (a, b))
-        T = se3.make(R_a.T @ found.T_a_b[:3, :3] @ R_b, R_a.T @ found.T_a_b[:3, 3])
+        T = se3.make(R_a.T @ check.T_a_b[:3, :3] @ R_b, R_a.T @ check.T_a_b[:3, 3])
         turn = np.kron(np.eye(2), R_a.T)
-        return Constraint(a, b, T, turn @ found.covariance @ turn.T)
+        return Constraint(a, b, T, turn @ check.covariance @ turn.T)
 
     def _make_submap(self, number: int) -> LevelSubmap:
         return make_level_submap(self._clouds.get(number), self.registration)

@@ -56,8 +56,8 @@ def find_loops(
     detector = _detector(store, at, config, registration, submap_size, forbidden, up)
     candidates = detector.find(clocks, should_stop, threads)
     accepted = sum(c.is_accepted for c in candidates)
-    tried = sum(c.stage != LoopStage.THINNED for c in candidates)
-    log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, tried, len(store))
+    attempts = sum(c.stage != LoopStage.THINNED for c in candidates)
+    log.info("loop closures: %d of %d candidates accepted, %d keyframes", accepted, attempts, len(store))
     return candidates
 
 
@@ -70,12 +70,12 @@ def verify_known(
     Raises InterruptedRunError when `should_stop` said so between two.
     """
     detector = _detector(store, store.keyframes, config, registration, submap_size, up=up)
-    found = []
+    loops = []
     for pair in pairs:
         if should_stop():
             raise InterruptedRunError("interrupted while known pairs were verified")
-        found.append(detector.verify_known(pair))
-    return found
+        loops.append(detector.verify_known(pair))
+    return loops
 
 
 def _detector(

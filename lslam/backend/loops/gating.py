@@ -145,12 +145,12 @@ def resolve_ambiguity(
     for other in accepted[1:]:
         gap = float(np.linalg.norm(_put(other, keyframes) - _put(first, keyframes)))
         if gap > reach(min(first.a, other.a), max(first.a, other.a)):
-            said = f"keyframes {first.a} and {other.a} fit, at places {gap:.1f} m apart"
-            return [_ambiguous(c, said) for c in examined]
-    said = f"closed with keyframe {first.a} already"
+            reason = f"keyframes {first.a} and {other.a} fit, at places {gap:.1f} m apart"
+            return [_ambiguous(c, reason) for c in examined]
+    reason = f"closed with keyframe {first.a} already"
     extra = {c.a for c in accepted[1:]}
     return [
-        replace(c, verdict=Verdict.REJECTED, stage=LoopStage.THINNED, reason=said) if c.a in extra else c
+        replace(c, verdict=Verdict.REJECTED, stage=LoopStage.THINNED, reason=reason) if c.a in extra else c
         for c in examined
     ]
 
@@ -189,13 +189,13 @@ class SharedResults(Generic[T]):
     def get(self, number: int) -> T:
         """The result for `number`; raises what making it raised."""
         with self._lock:
-            known = self._made.get(number)
-            result = Future() if known is None else known
+            future = self._made.get(number)
+            result = Future() if future is None else future
             self._made[number] = result
             self._made.move_to_end(number)
             if self._kept is not None and len(self._made) > self._kept:
                 self._made.popitem(last=False)
-        if known is None:
+        if future is None:
             try:
                 result.set_result(self._make(number))
             except BaseException as error:

@@ -27,11 +27,11 @@ def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float
     all get the same image of a place.
     """
     image = polar_image(np.ascontiguousarray(points, np.float32), rings, sectors, reach)
-    seen = np.isfinite(image)
-    if not seen.any():
+    is_seen = np.isfinite(image)
+    if not is_seen.any():
         return np.zeros_like(image)
-    ground = np.quantile(image[seen], GROUND_SHARE)
-    return np.where(seen, np.maximum(image - ground, 0) + LIFT, 0).astype(np.float32)
+    ground = np.quantile(image[is_seen], GROUND_SHARE)
+    return np.where(is_seen, np.maximum(image - ground, 0) + LIFT, 0).astype(np.float32)
 
 
 def distances(query: Images, images: Images) -> Floats:

@@ -75,14 +75,14 @@ def _peaks(
     Not only local maxima: along a ridge, as of a street, other cells score as well as the maximum.
     """
     away2 = (shifts[:, None] - expected[0]) ** 2 + (shifts[None, :] - expected[1]) ** 2
-    left = np.where(away2 <= max(reach, CELL) ** 2, score, np.float32(0))
-    best = float(left.max())
-    found: list[tuple[Floats, float, float]] = []
-    while len(found) < STARTS and left.max() > NEARLY * best:
-        r, c = np.unravel_index(int(left.argmax()), left.shape)
-        found.append((np.array([shifts[r], shifts[c]]), float(turn[r, c]), float(score[r, c])))
-        left[(shifts[:, None] - shifts[r]) ** 2 + (shifts[None, :] - shifts[c]) ** 2 < APART**2] = 0
-    return found
+    rest = np.where(away2 <= max(reach, CELL) ** 2, score, np.float32(0))
+    best = float(rest.max())
+    peaks: list[tuple[Floats, float, float]] = []
+    while len(peaks) < STARTS and rest.max() > NEARLY * best:
+        r, c = np.unravel_index(int(rest.argmax()), rest.shape)
+        peaks.append((np.array([shifts[r], shifts[c]]), float(turn[r, c]), float(score[r, c])))
+        rest[(shifts[:, None] - shifts[r]) ** 2 + (shifts[None, :] - shifts[c]) ** 2 < APART**2] = 0
+    return peaks
 
 
 def _pose(grid: BevGrid, a: LevelSubmap, b: LevelSubmap, shift: Floats, yaw: float, expected_z: float) -> Floats:
@@ -133,8 +133,8 @@ class Verifier:
         starts = find_initial_guesses(a, b, expected, reach, yaws)
         if not starts:
             return Verification(LoopStage.OVERLAP, "nothing stands up there")
-        seen = LARGE.cover(a.non_ground, a.ground).ravel() > 0
-        tried = sorted((self._try(a, b, seen, start.T_a_b) for start in starts), key=lambda found: -found[0])
+        view = LARGE.cover(a.non_ground, a.ground).ravel() > 0
+        tried = sorted((self._try(a, b, view, start.T_a_b) for start in starts), key=lambda found: -found[0])
         support, rough = tried[0]
         others = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]
         forward = self._refine(a, b, rough)
@@ -149,14 +149,14 @@ class Verifier:
         backward = self._refine(b, a, se3.inverse(rough))
         return self._agree(facts, forward, backward)
 
-    def _try(self, a: LevelSubmap, b: LevelSubmap, seen: Bools, start: Floats) -> tuple[float, Floats]:
+    def _try(self, a: LevelSubmap, b: LevelSubmap, view: Bools, start: Floats) -> tuple[float, Floats]:
         """Inlier share of the upright points after registration from `start`, 0 to 1, and the pose found."""
         r = self.registration
         few = thin(b.source, FEW)
         slow = Annealing(CATCH, r.kernel_max / 2, r.coarse_decay, self.config.max_iterations)
         coarse = self._solve(a, few, start, slow, coarse_only=True)
         fine = self._solve(a, few, coarse.T_world_lidar, Annealing(r.kernel_max, r.kernel_min, 0.7, 15))
-        return self._support(a, b.upright, seen, fine.T_world_lidar), fine.T_world_lidar
+        return self._support(a, b.upright, view, fine.T_world_lidar), fine.T_world_lidar
 
     def _refine(self, a: LevelSubmap, b: LevelSubmap, start: Floats) -> RegistrationResult:
         r = self.registration
@@ -168,27 +168,29 @@ class Verifier:
     ) -> RegistrationResult:
         return solve((a.coarse if coarse_only else a.fine,), points, start, annealing, self.registration)
 
-    def _support(self, a: LevelSubmap, upright: PreparedPoints, seen: Bools, T_a_b: Floats) -> float:
+    def _support(self, a: LevelSubmap, upright: PreparedPoints, view: Bools, T_a_b: Floats) -> float:
         """Inlier share among the points in cells that a observed: unlike their number, it does not depend on the shift."""
         cells, inside = LARGE.cells_of(se3.apply(T_a_b, upright.source))
-        comparable = int((inside & seen[cells]).sum())
+        comparable = int((inside & view[cells]).sum())
         width = 2 * self.registration.kernel_min
         inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
         return 0.0 if comparable < SHARED * len(upright.source) else inliers / comparable
 
-    def _judge(self, a: LevelSubmap, b: LevelSubmap, found: RegistrationResult) -> Verification:
+    def _judge(self, a: LevelSubmap, b: LevelSubmap, result: RegistrationResult) -> Verification:
         """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""
         c = self.config
-        if not found.ok or found.covariance is None:
-            return Verification(LoopStage.REGISTRATION, found.reason or "nothing matches")
-        T = found.T_world_lidar
+        if not result.ok or result.covariance is None:
+            return Verification(LoopStage.REGISTRATION, result.reason or "nothing matches")
+        T = result.T_world_lidar
         there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
         back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
         worse = min(there, back, key=lambda one: one.overlap)
-        both = replace(found, rmse=max(there.rmse, back.rmse), matched=worse.matched, source_points=worse.source_points)
+        both = replace(
+            result, rmse=max(there.rmse, back.rmse), matched=worse.matched, source_points=worse.source_points
+        )
         limits = Acceptance(c.min_overlap, max_rmse=c.max_rmse, needs_all_directions=True, target="other submap")
         rejection = limits.rejection(both)
-        facts = Verification(LoopStage.REGISTRATION, "", T, found.covariance, both.rmse, both.overlap)
+        facts = Verification(LoopStage.REGISTRATION, "", T, result.covariance, both.rmse, both.overlap)
         if rejection is None:
             return facts
         stage = LoopStage.OVERLAP if rejection.test == "overlap" else LoopStage.REGISTRATION
@@ -202,8 +204,8 @@ class Verifier:
         gap = se3.log(forward.T_world_lidar @ backward.T_world_lidar)
         move, turn = float(np.linalg.norm(gap[:3])), float(np.linalg.norm(gap[3:]))
         if move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
-            said = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
-            return facts.rejected(LoopStage.AGREEMENT, said)
+            reason = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
+            return facts.rejected(LoopStage.AGREEMENT, reason)
         floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
         assert forward.covariance is not None
         disagreement = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)

@@ -76,8 +76,8 @@ class WorkingMemory:
             return np.arange(keyframe)
         after = int(self._begins[self._newest + 1])
         parts = [np.arange(self._begins[p], self._begins[p + 1]) for p in self._members]
-        known = np.concatenate([*parts, np.arange(after, keyframe)])
-        return np.asarray(known[known < keyframe])
+        searchable = np.concatenate([*parts, np.arange(after, keyframe)])
+        return np.asarray(searchable[searchable < keyframe])
 
     def _enter(self, place: int) -> None:
         at = bisect_left(self._members, place)

@@ -12,8 +12,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
-from lslam.core.types.scan_result import ScanResult, Status
-from lslam.core.types.scan_result import StageClock
+from lslam.core.types.scan_result import ScanResult, StageClock, Status
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Odometry, Resumable
 from lslam.odometry.frontend import joint
