@@ -122,8 +122,10 @@ def shared_towns(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def shared_starts(request: pytest.FixtureRequest) -> Iterator[None]:
+def shared_starts(request: pytest.FixtureRequest, made_once: MadeOnce) -> Iterator[None]:
     """A first step is sought once, however many runs take it, for all tests but those of registration."""
+    STARTS.folder = made_once.folder / "starts"
+    STARTS.folder.mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name != "registration":
             patch.setattr("lslam.registration.start_search.held_by_non_ground", STARTS.held_by_non_ground)

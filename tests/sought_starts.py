@@ -1,10 +1,12 @@
-"""The first step of a drive is sought once, however many runs of a worker take it."""
+"""The first step of a drive is sought once, however many runs take it, of whichever worker."""
 
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
-from copy import deepcopy
+from pathlib import Path
+from threading import get_ident
 
 from lslam.registration.attempt import Attempt
 from lslam.registration.solver import RegistrationResult
@@ -15,11 +17,12 @@ from lslam.registration.voxel_target import VoxelTarget
 class SoughtStarts:
     """Stands in for the search of a scan among a few others, which takes as long as ten scans that follow.
 
-    A search is known by all that it is given, to the byte: scan, map, history, settings, and what was found before.
+    A search is known by all that it is given, to the byte: scan, map, history, settings, and what was found before. What it
+    finds lies in `folder`, where all workers look.
     """
 
     def __init__(self) -> None:
-        self._held: dict[str, RegistrationResult | None] = {}
+        self.folder = Path()
 
     def held_by_non_ground(
         self, attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False
@@ -33,8 +36,11 @@ class SoughtStarts:
             attempt.T_prior, attempt.is_near, result, is_lost,
         )  # fmt: skip
         key = hashlib.sha256(pickle.dumps(given)).hexdigest()
-        if key not in self._held:
+        path = self.folder / key
+        if not path.exists():
             found = held_by_non_ground(attempt, result, is_lost=is_lost)
-            self._held[key] = None if found is result else found
-        known = self._held[key]
-        return result if known is None else deepcopy(known)
+            part = path.with_suffix(f".{os.getpid()}-{get_ident()}")
+            part.write_bytes(pickle.dumps(None if found is result else found))
+            part.replace(path)
+        known: RegistrationResult | None = pickle.loads(path.read_bytes())
+        return result if known is None else known

@@ -19,7 +19,7 @@ from kills.compare import TIMED_FILES, differences
 from kills.trial import OUT, Kill, Run, faults_after_kill, run
 from kills.whole import torn
 
-COUNT = 6
+COUNT = 4
 
 
 @pytest.fixture(scope="module")

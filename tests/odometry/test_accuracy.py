@@ -15,7 +15,7 @@ from lslam.registration.solver import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 CENTIMETRE = 0.01
-LONG = [("street", 1, 35), ("street", 2, 35), ("street", 3, 35), ("block", 0, 95), ("block", 1, 95), ("block", 2, 95)]
+LONG = [("street", 1, 35), ("street", 2, 35), ("block", 0, 95), ("block", 1, 95)]
 
 
 @pytest.mark.parametrize(("scenario", "seed", "count"), LONG)
@@ -26,7 +26,7 @@ def test_error_stays_under_a_centimetre(scenario: str, seed: int, count: int) ->
     assert ate(poses_of(results), d.truth) < CENTIMETRE
 
 
-@pytest.mark.parametrize(("scenario", "seed", "count"), [LONG[0], LONG[3]])
+@pytest.mark.parametrize(("scenario", "seed", "count"), [LONG[0], LONG[2]])
 def test_no_sentinel_passes_the_gate(scenario: str, seed: int, count: int) -> None:
     truth = drive(scenario, seed, count).truth
     assert ate(truth, truth) < 1e-9

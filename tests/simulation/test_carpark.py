@@ -89,7 +89,7 @@ def test_it_stands_drives_off_turns_and_comes_back_in_151_metres() -> None:
     np.testing.assert_allclose(truth.poses[-1, :2, 0], [-1, 0], atol=0.02)
 
 
-@pytest.mark.parametrize("speed", [2, 5, 12, 30])
+@pytest.mark.parametrize("speed", [2, 12, 30])
 def test_every_speed_is_reached_from_rest_and_given_up_for_the_turn(speed: int) -> None:
     drive = at_speed(speed)
     v = speeds(drive)
