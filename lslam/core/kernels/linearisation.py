@@ -32,10 +32,3 @@ Search = tuple[Longs, Ints, Ints, Floats, Flags, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]
 Sums = tuple[Floats, Floats, Floats, Floats]
-
-# Indices in `facts`, an array of COUNT sums over the points beside the normal equations:
-# information of the correspondences, 1/m2; squared residuals times robust weights, m2; points within the kernel's width;
-# points with a correspondence; information times squared lever arm; robust weights; relative weights of the points, 0 for
-# residuals without them, see `gauss_newton.scale_by_population`.
-INFORMATION, SQUARED, INLIERS, MATCHED, LEVER, ROBUST, POPULATION = range(7)
-COUNT = 7

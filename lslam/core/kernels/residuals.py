@@ -6,25 +6,11 @@ import math
 
 import numpy as np
 
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen
-from lslam.core.kernels.linearisation import (
-    INFORMATION,
-    INLIERS,
-    LEVER,
-    MATCHED,
-    ROBUST,
-    SQUARED,
-    Floats,
-    Ints,
-    Longs,
-    Pose,
-    Search,
-    Settings,
-    Sums,
-    Width,
-)
+from lslam.core.kernels.linearisation import Floats, Ints, Longs, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.voxel import index_of, pack
 
 # Rows of planes, keys and table, see `gaussians`.

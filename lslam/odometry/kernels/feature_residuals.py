@@ -12,9 +12,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
-from lslam.core.kernels.linearisation import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED, Pose, Sums, Width
+from lslam.core.kernels.linearisation import Pose, Sums, Width
 from lslam.core.kernels.residuals import add_row, add_surface
 from lslam.core.kernels.voxel import index_of, pack
 from lslam.odometry.kernels.feature_grid import nearest

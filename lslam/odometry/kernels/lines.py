@@ -13,9 +13,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
-from lslam.core.kernels.linearisation import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED, Pose, Sums, Width
+from lslam.core.kernels.linearisation import Pose, Sums, Width
 from lslam.core.kernels.residuals import TILT, add_row, octant_slots
 from lslam.core.kernels.voxel import MASK, OFFSET
 

@@ -7,22 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, FREE
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import invert_symmetric, plane_of
-from lslam.core.kernels.linearisation import (
-    INFORMATION,
-    INLIERS,
-    LEVER,
-    MATCHED,
-    ROBUST,
-    SQUARED,
-    Pose,
-    Search,
-    Settings,
-    Sums,
-    Width,
-)
+from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import Voxels, add_information, add_surface, octant_slots
 from lslam.registration.kernels.discs import disc
 

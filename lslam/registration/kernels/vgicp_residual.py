@@ -5,22 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linalg import invert_symmetric, rotate_symmetric
-from lslam.core.kernels.linearisation import (
-    INFORMATION,
-    INLIERS,
-    LEVER,
-    MATCHED,
-    POPULATION,
-    ROBUST,
-    SQUARED,
-    Pose,
-    Search,
-    Settings,
-    Sums,
-    Width,
-)
+from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import (
     add_information,
     add_surface,
