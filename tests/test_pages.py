@@ -128,7 +128,7 @@ def test_keys_in_the_text_exist() -> None:
     from lslam.core.config.config import Config
 
     sections = {name: type(getattr(Config(), name)) for name in Config.model_fields}
-    files = ("csv", "html", "json", "md", "npz", "ply", "py", "toml", "txt")
+    files = ("csv", "html", "json", "laz", "md", "npz", "ply", "py", "toml", "txt")
     # Results speak of keys of the manifest, too.
     for shown in (shown for shown in PAGES if shown.name not in ("docs/results.md", "docs/notes.md")):
         for section, key in re.findall(r"`([a-z]+)\.([a-z_]+)\b(?!\.)[^`]*`", shown.prose):
