@@ -125,7 +125,7 @@ def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
     changes = [
         *_things("appeared", after, before, new),
         *_things("vanished", before, after, new),
-    ]  # fmt: skip
+    ]
     same = after.occupied[_beside(after.occupied, before.blocked)]
     return ChangedCells(
         tuple(changes), _cells(same, new), new.voxel, len(after.occupied), len(before.occupied),
@@ -194,9 +194,7 @@ def _steps() -> list[int]:
     """Differences of keys to the 27 cells about one, rising; the cell itself is in the middle."""
     from lslam.maps.kernels.voxel_average import AXIS_BITS
 
-    return [
-        (x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)
-    ]  # fmt: skip
+    return [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 
 
 def _among(keys: Keys, others: Keys) -> Bools:

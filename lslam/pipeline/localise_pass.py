@@ -141,9 +141,7 @@ class Reanchoring:
         return None if vote is None else vote.T_level_odometry @ self._results[position].T_world_lidar
 
 
-def _find_start(
-    sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, config: Config, watch: Watch
-) -> Start:  # fmt: skip
+def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, config: Config, watch: Watch) -> Start:
     """Raises RunFailedError when there is none, InterruptedRunError when the user asked to stop."""
     prior, said = _prior_of(sequence, prior_map, config)
     log.info("searching the drive in the map, %s", said)

@@ -141,9 +141,7 @@ class MapMaker:
     up : (3,) unit vector, up in the world of the scans
     """
 
-    def __init__(
-        self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: Floats = Z
-    ) -> None:  # fmt: skip
+    def __init__(self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: Floats = Z) -> None:
         self._section = section
         self._merger = MapMerger(
             section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,

@@ -367,4 +367,4 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[Any, StudyResult, Sequence[CurveR
     ("stages", "Stages of registration", _STAGES, _stages),
     ("law", "Laws of total time", _LAW, draw_laws),
     ("efficiency", "Efficiency", _EFFICIENCY, _efficiency),
-)  # fmt: skip
+)

@@ -35,7 +35,7 @@ def localization_rows(record: RunRecord, evaluation: Evaluation | None) -> list[
         ("in the map", f"{about.get('map', '')}: it holds {len(held)} of {counted(len(fixes), 'scan')}"),
         ("", f"{shares:.0%} of the points agree, odometry is corrected by {metres(moves)} m a scan (medians)"),
         ("start", f"found by {start.get('votes')} of {counted(start.get('tried', 0), 'keyframe')} tried"),
-    ]  # fmt: skip
+    ]
     if evaluation is not None and evaluation.odometry is not None:
         rows.append(("", before_and_after(evaluation, evaluation.odometry, "localisation")))
     return rows

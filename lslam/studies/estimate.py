@@ -213,9 +213,7 @@ def _pilots(job: Job, recording: _PilotRecording) -> list[_Pilot]:
     long = min(_LONG, most)
     pilots = []
     for scans in (max(1, min(_SHORT, long // 2)), long):
-        config = job.config.model_copy(
-            update={"input": job.config.input.model_copy(update={"count": scans})}
-        )  # fmt: skip
+        config = job.config.model_copy(update={"input": job.config.input.model_copy(update={"count": scans})})
         pilots.append(_Pilot(replace(job, path=recording.path, config=config, scene=None), scans))
     return pilots
 

@@ -139,9 +139,7 @@ def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
     d2 = dx * dx + dy * dy + dz * dz
     if d2 < 1e-12:
         return 0.0
-    along = (
-        xx * dx * dx + yy * dy * dy + zz * dz * dz + 2.0 * (xy * dx * dy + xz * dx * dz + yz * dy * dz)
-    ) / d2  # fmt: skip
+    along = (xx * dx * dx + yy * dy * dy + zz * dz * dz + 2.0 * (xy * dx * dy + xz * dx * dz + yz * dy * dz)) / d2
     total = xx + yy + zz - along
     product = (
         (yy * zz - yz * yz) * dx * dx + (xx * zz - xz * xz) * dy * dy + (xx * yy - xy * xy) * dz * dz

@@ -169,9 +169,7 @@ def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     )
 
 
-def _examine_time(
-    sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: list[Finding]
-) -> int:  # fmt: skip
+def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: list[Finding]) -> int:
     """Rate, order, gaps and overlap; the number of gaps."""
     if median > 0 and is_slow(1 / median):
         what = f"IMU: {1 / median:.1f} Hz, too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
