@@ -15,7 +15,7 @@ from lslam.odometry.feature_solver import joint_step
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.odometry.map_method import MapMethod
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features
+from lslam.registration.preprocessing.features import Features, extract_features
 from lslam.registration.preprocessing.ground import up_of
 from lslam.registration.registration import Registration
 from lslam.registration.solver import RegistrationResult
@@ -85,18 +85,7 @@ class Loam(MapMethod):
 
 def deskewed(features: Features, prior: MotionPrior) -> Features:
     """The features as seen from the pose at the stamp."""
-
-    def moved(part: FeaturePoints) -> FeaturePoints:
-        return replace(part, points=deskew_points(part.points, part.times, prior))
-
-    return replace(
-        features,
-        edges=moved(features.edges),
-        less_edges=moved(features.less_edges),
-        planes=moved(features.planes),
-        less_planes=moved(features.less_planes),
-        neither=moved(features.neither),
-    )
+    return features.each(lambda part: replace(part, points=deskew_points(part.points, part.times, prior)))
 
 
 def _room() -> Scan:

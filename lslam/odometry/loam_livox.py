@@ -79,10 +79,7 @@ def between(features: Features, begin: float, end: float) -> Features:
         within = (points.times >= begin) & (points.times < end)
         return FeaturePoints(points.points[within], points.rings[within], points.times[within])
 
-    return replace(
-        features, edges=part(features.edges), less_edges=part(features.less_edges), planes=part(features.planes),
-        less_planes=part(features.less_planes), neither=part(features.neither),
-    )  # fmt: skip
+    return features.each(part)
 
 
 def joined(

@@ -26,31 +26,28 @@ class AdaptiveThreshold(Stateful):
 
     The prediction error of a scan is its correction in metres at the rms lever arm (KISS-ICP, section III-C, measures
     the same at the far end of the scan). Three times the rms of recent errors covers nearly all of the next ones.
+
+    mean_square : of the recent prediction errors, m2
     """
 
-    STATE = ("_mean_square",)
+    STATE = ("mean_square",)
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = low, high
-        self._mean_square = (high / 3) ** 2
+        self.mean_square = (high / 3) ** 2
 
     @property
     def width(self) -> float:
         """Kernel width for the next scan, m."""
-        return min(max(3 * math.sqrt(self._mean_square), self.low), self.high)
-
-    @property
-    def mean_square(self) -> float:
-        """Of the recent prediction errors, m2."""
-        return self._mean_square
+        return min(max(3 * math.sqrt(self.mean_square), self.low), self.high)
 
     def observe(self, error: float) -> None:
         """Learn from one registered scan's prediction error, m."""
-        self._mean_square = FORGETTING * self._mean_square + (1 - FORGETTING) * error**2
+        self.mean_square = FORGETTING * self.mean_square + (1 - FORGETTING) * error**2
 
     def widen(self) -> None:
         """Reset to the widest after a failed scan."""
-        self._mean_square = (self.high / 3) ** 2
+        self.mean_square = (self.high / 3) ** 2
 
 
 class UsualAgreement(Stateful):

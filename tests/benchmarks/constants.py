@@ -33,10 +33,9 @@ from lslam.core.config.config import load_config
 # What a scan passes: files, and which runs tell of their numbers.
 PATH: dict[str, tuple[str, ...]] = {
     "points": (
-        "registration/*.py", "odometry/frontend/tracker.py", "odometry/frontend/segments.py", "odometry/frontend/joint.py",
+        "registration/*.py", "odometry/frontend/tracker.py", "odometry/frontend/segments.py",
         "odometry/frontend/scene_scale.py", "odometry/inertial/constant_velocity.py", "odometry/scan_outcome.py",
-        "odometry/uncertainty.py", "odometry/uncertainty.py", "odometry/frontend/windows.py",
-        "odometry/inertial/course.py", "odometry/scan_outcome.py", "odometry/icp.py",
+        "odometry/uncertainty.py", "odometry/frontend/windows.py", "odometry/inertial/course.py", "odometry/icp.py",
         "registration/preprocessing/prepare.py", "registration/preprocessing/deskew.py",
         "registration/preprocessing/ground.py", "registration/preprocessing/weather_filter.py",
         "core/kernels/gauss_newton.py", "core/kernels/gaussians.py", "core/kernels/residuals.py", "core/kernels/ground.py",
@@ -49,8 +48,7 @@ PATH: dict[str, tuple[str, ...]] = {
     ),
     "imu": (
         "odometry/inertial/fusion.py", "odometry/inertial/gyroscope.py", "odometry/inertial/imu_estimate.py",
-        "odometry/inertial/gyroscope.py", "odometry/inertial/saturation.py", "odometry/inertial/initialise.py",
-        "odometry/inertial/integrate.py",
+        "odometry/inertial/saturation.py", "odometry/inertial/initialise.py", "odometry/inertial/integrate.py",
     ),
     "checks": ("odometry/integrity/*.py", "core/types/scan_result.py"),
 }  # fmt: skip

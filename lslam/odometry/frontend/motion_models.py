@@ -26,12 +26,9 @@ def smoother_noise(noise: ImuNoise) -> SmootherNoise:
     return SmootherNoise(noise.force, noise.accel_walk, noise.gyro_walk, GRAVITY_WALK)
 
 
-def _loose(opening: InertialStart, config: Config) -> InertialMotion:
-    return InertialMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
-
-
-def _filter(opening: InertialStart, config: Config) -> InertialMotion:
-    return FilterMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
+def _plain(kind: type[InertialMotion]) -> Callable[[InertialStart, Config], InertialMotion]:
+    """Makes a model that takes nothing but the IMU and its section."""
+    return lambda opening, config: kind(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
 
 
 def _smoother(opening: InertialStart, config: Config) -> InertialMotion:
@@ -43,21 +40,17 @@ def _window(opening: InertialStart, config: Config) -> InertialMotion:
     return WindowMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, config.lio_mapping.window)
 
 
-def _planes(opening: InertialStart, config: Config) -> InertialMotion:
-    return LinkedMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
-
-
 MOTION_MODELS: dict[str, Callable[[InertialStart, Config], InertialMotion]] = {
-    "fast-lio2": _filter,
+    "fast-lio2": _plain(FilterMotion),
     "lio-sam": _smoother,
     "lio-mapping": _window,
-    "lips": _planes,
+    "lips": _plain(LinkedMotion),
 }
 
 
 def motion_of(opening: InertialStart, config: Config) -> InertialMotion:
     """The motion model that the method asks for."""
-    return MOTION_MODELS.get(config.odometry.method, _loose)(opening, config)
+    return MOTION_MODELS.get(config.odometry.method, _plain(InertialMotion))(opening, config)
 
 
 def copy_of(motion: InertialMotion, opening: InertialStart, config: Config) -> InertialMotion:

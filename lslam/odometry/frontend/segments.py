@@ -52,13 +52,14 @@ class SegmentTracker(Stateful):
     the new one, the map holds, and the scans since were bad ones. Where they do not, or where the second registers more scans in
     a row than initialise a map, the scans since are a new segment. Scans that agree far less than those before do not count.
 
+    present : the tracker of the present segment
     begin : None for a method that has one map only; initial_scans : that initialise a map
     """
 
-    STATE = ("_tracker", "_segment", "_usual")
+    STATE = ("present", "_segment", "_usual")
 
     def __init__(self, tracker: Tracker, begin: Begin | None = None, initial_scans: int = 5) -> None:
-        self._tracker, self._begin, self.initial_scans = tracker, begin, initial_scans
+        self.present, self.begin, self.initial_scans = tracker, begin, initial_scans
         self._segment = 0
         # What scans agreed with their maps: by less than a share of that, scans of nothing agree as well.
         self._usual = UsualAgreement(RegistrationConfig().min_agreement)
@@ -69,34 +70,24 @@ class SegmentTracker(Stateful):
     @property
     def odometry(self) -> Odometry:
         """The method with the map of the present segment."""
-        return self._tracker.odometry
+        return self.present.odometry
 
     @property
     def middle(self) -> tuple[int, Floats]:
         """Instant, ns, and pose of the middle of the newest sweep."""
-        return self._tracker.middle
+        return self.present.middle
 
     @property
     def has_middles(self) -> bool:
         """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
-        return isinstance(self.odometry, Deskewing) and isinstance(self._tracker.motion, ConstantVelocity)
-
-    @property
-    def begin(self) -> Begin | None:
-        """Begins an empty map; None for a method that has one map only."""
-        return self._begin
-
-    @property
-    def present(self) -> Tracker:
-        """The tracker of the present segment."""
-        return self._tracker
+        return isinstance(self.odometry, Deskewing) and isinstance(self.present.motion, ConstantVelocity)
 
     def decide(self, loaded: Loaded, result: ScanResult) -> list[Tracked]:
         """The scans that are decided with the next one, in order: none while two hypotheses are open.
 
         result : of the present tracker
         """
-        first = self._tracked(self._tracker, loaded, result, self._segment)
+        first = self._tracked(self.present, loaded, result, self._segment)
         other = None if self._other is None else self._trial(self._other, loaded)
         is_held = first.result.status == "ok"
         if is_held:
@@ -108,9 +99,9 @@ class SegmentTracker(Stateful):
                 return self.finish()
             return self._new_segment() if is_held or len(self._open) > self.initial_scans else []
         decided = self.finish()
-        if is_held or self._begin is None or loaded.scan is None:
+        if is_held or self.begin is None or loaded.scan is None:
             return [*decided, first]
-        self._other = self._begin(first.result.T_world_lidar)
+        self._other = self.begin(first.result.T_world_lidar)
         other = self._trial(self._other, loaded)
         self._open = [(first, other)]
         return decided if other.result.status == "ok" else [*decided, *self.finish()]
@@ -124,7 +115,7 @@ class SegmentTracker(Stateful):
     @property
     def is_settled(self) -> bool:
         """Whether nothing waits for the next scan, so that `state` is complete."""
-        return self._other is None and self._tracker.is_settled
+        return self._other is None and self.present.is_settled
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
@@ -135,10 +126,10 @@ class SegmentTracker(Stateful):
         assert self._other is not None
         registered = [other for _, other in self._open]
         # The motion model is known to others by its first object.
-        motion = self._tracker.motion
+        motion = self.present.motion
         motion.restore(self._other.motion.state())
         self._other.motion = motion
-        self._tracker, self._other, self._open = self._other, None, []
+        self.present, self._other, self._open = self._other, None, []
         self._segment += 1
         return registered
 

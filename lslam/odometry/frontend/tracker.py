@@ -14,9 +14,9 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
 from lslam.core.types.scan_result import ScanResult, StageClock, Status
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.base import Deskewing, Odometry, Resumable
-from lslam.odometry.frontend import joint
+from lslam.odometry.base import Deskewing, Odometry, Resumable, Windowed
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
+from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.odometry.scan_outcome import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.solver import RegistrationResult
@@ -156,7 +156,7 @@ class Tracker(Stateful):
     ) -> RegistrationResult:  # fmt: skip
         """The registration fused with the IMU; rejected where no vehicle gets to its pose from the last one."""
         with clock.stage("imu"):
-            fused = joint.fuse(odometry, self.motion, stamp_ns, located, prior)
+            fused = _fuse(odometry, self.motion, stamp_ns, located, prior)
         if expected is None or not fused.is_accepted:
             return fused
         reason = fault(fused.T_world_lidar, stamp_ns, self._last)
@@ -169,7 +169,8 @@ class Tracker(Stateful):
         with clock.stage("imu"):
             self.sweep = self.motion.refine(prior, result.stamp_ns, pose) if is_blind else prior
             self.motion.correct(result.stamp_ns, pose, prior, is_ok)
-            joint.settle(self.odometry, self.motion)
+            if isinstance(self.odometry, Windowed):
+                self.odometry.settle(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
         middle, instant_ns = middle_of(prior, result.stamp_ns, pose)
         self.middle = (instant_ns, middle)
 
@@ -256,6 +257,21 @@ class Tracker(Stateful):
         odometry.restart()
         odometry.update(first, prior, odometry.register(first, prepared, prior))
         return again
+
+
+def _fuse(
+    odometry: Deskewing, motion: MotionModel, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
+) -> RegistrationResult:
+    """The registration fused with the motion model; of a window, once more where that moves its scans."""
+    if not (isinstance(odometry, Windowed) and isinstance(motion, WindowMotion)):
+        return motion.fuse(stamp_ns, result, prior)
+    motion.take(odometry.equations(stamp_ns, result))
+    fused = motion.fuse(stamp_ns, result, prior)
+    again = odometry.equations_at(motion.stale())
+    if not again:
+        return fused
+    motion.take(again)
+    return motion.fuse(stamp_ns, result, prior)
 
 
 def _both(first: RegistrationResult, second: RegistrationResult) -> RegistrationResult:

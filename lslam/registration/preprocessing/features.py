@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +74,12 @@ class Features:
         """All of them (N, 3), m, LiDAR frame."""
         parts = (self.less_planes, self.planes, self.less_edges, self.neither)
         return np.concatenate([part.points for part in parts], dtype=np.float32)
+
+    def each(self, change: Callable[[FeaturePoints], FeaturePoints]) -> Features:
+        """With all parts changed alike."""
+        names = ("edges", "less_edges", "planes", "less_planes", "neither")
+        parts: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
+        return replace(self, **parts)
 
 
 @dataclass(frozen=True)
