@@ -47,7 +47,7 @@ class AllPoints(Stateful):
         icp = self._of_recent(attempt.history)
         points = prepare_points(attempt.points.cloud, icp.preprocess)
         better = held_by_non_ground(icp.attempt(points, T_start), result)
-        return result if better is result else attempt.placed(better, ALL_POINTS)
+        return result if better is result else attempt.credit(better, ALL_POINTS)
 
     def instead(
         self, attempt: Attempt, by_features: RegistrationResult, own: RegistrationResult | None

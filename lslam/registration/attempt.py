@@ -105,7 +105,7 @@ class Attempt:
         )  # fmt: skip
         return limits.accepted(result, self.T_prior if T_prior is None else T_prior)
 
-    def placed(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:
+    def credit(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:
         """The result of the policy `pose_source`, with its correction of the prior."""
         return replace(result, prior_error=correction(self.T_prior, result.T_world_lidar), pose_source=pose_source)
 

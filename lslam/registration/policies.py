@@ -54,7 +54,7 @@ class AtRest:
             return result
         if not rest.votes(attempt.target.cloud(attempt.points), T_registered).is_standing:
             return result
-        return attempt.placed(result.moved(rest.T_world_lidar.copy(), result.covariance), self.name)
+        return attempt.credit(result.moved(rest.T_world_lidar.copy(), result.covariance), self.name)
 
 
 def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:

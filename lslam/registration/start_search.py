@@ -107,7 +107,7 @@ class StartSearch:
         if attempt.config.start_reach == 0 or is_settled:
             return result
         better = held_by_non_ground(attempt, result, is_lost=attempt.history.inserted == 1)
-        return attempt.placed(better, self.name) if better is not result and better.ok else better
+        return attempt.credit(better, self.name) if better is not result and better.ok else better
 
 
 def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False) -> RegistrationResult:

@@ -21,6 +21,26 @@ TILT = 4.0
 
 
 @inline
+def place(source: Floats, i: int, R: Floats, t: Floats) -> tuple[float, float, float, float, float, float]:
+    """Source point i as seen from the sensor, world axes, and in the world, m."""
+    a, b, c = source[i, 0], source[i, 1], source[i, 2]
+    rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+    ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+    rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+    return rx, ry, rz, rx + t[0], ry + t[1], rz + t[2]
+
+
+@inline
+def add_facts(facts: Floats, information: float, squared: float, robust: float, rx: float, ry: float,
+              rz: float) -> None:  # fmt: skip
+    """Sums of one residual at a point r, seen from the sensor: its information, its weighted square and its robust weight."""
+    facts[INFORMATION] += information
+    facts[SQUARED] += squared
+    facts[LEVER] += information * (rx * rx + ry * ry + rz * rz)
+    facts[ROBUST] += robust
+
+
+@inline
 def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: Longs,
                  slots: Ints, keys: Longs, table: Ints) -> bool:  # fmt: skip
     """Look up the slots (8,) of the voxels around point i at x, y, z, world, when it has left its octant cell; True then."""
@@ -126,11 +146,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
     for i in range(len(source)):
         if is_done[i]:
             continue
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
             asked[i, 3] = -1.0
         best, best_d, blob, blob_d = nearest(x, y, z, i, slots, chosen, asked, planes)
@@ -159,10 +175,7 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
             w = plane_weight * robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
             j3, j4, j5 = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
             add_row(H, g, w, r, nx, ny, nz, j3, j4, j5)
-            facts[INFORMATION] += w
-            facts[SQUARED] += robust * r * r
-            facts[LEVER] += w * (rx * rx + ry * ry + rz * rz)
-            facts[ROBUST] += robust
+            add_facts(facts, w, robust * r * r, robust, rx, ry, rz)
         elif blob >= 0 and blob_weight > 0.0:
             is_done[i] = True
             p = planes[blob]

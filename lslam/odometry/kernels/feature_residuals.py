@@ -12,11 +12,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
+from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linearisation import Pose, Sums, Width
-from lslam.core.kernels.residuals import add_row, add_surface
+from lslam.core.kernels.residuals import add_facts, add_row, add_surface, place
 from lslam.core.kernels.voxel import index_of, pack
 from lslam.odometry.kernels.feature_grid import nearest
 from lslam.odometry.kernels.lines import add_line
@@ -51,11 +51,8 @@ def _add_point(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: fl
     add_row(H, g, w, ex, 1.0, 0.0, 0.0, 0.0, rz, -ry)
     add_row(H, g, w, ey, 0.0, 1.0, 0.0, -rz, 0.0, rx)
     add_row(H, g, w, ez, 0.0, 0.0, 1.0, ry, -rx, 0.0)
-    facts[INFORMATION] += 3.0 * w
-    facts[SQUARED] += robust * d2
+    add_facts(facts, 3.0 * w, robust * d2, robust, rx, ry, rz)
     facts[MATCHED] += 1.0
-    facts[LEVER] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
-    facts[ROBUST] += robust
     if d2 < c2:
         facts[INLIERS] += 1.0
 
@@ -68,11 +65,8 @@ def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: flo
     robust *= robust
     w = robust / variance
     add_row(H, g, w, e, nx, ny, nz, ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx)
-    facts[INFORMATION] += w
-    facts[SQUARED] += robust * e * e
+    add_facts(facts, w, robust * e * e, robust, rx, ry, rz)
     facts[MATCHED] += 1.0
-    facts[LEVER] += w * (rx * rx + ry * ry + rz * rz)
-    facts[ROBUST] += robust
     if abs(e) < math.sqrt(c2):
         facts[INLIERS] += 1.0
     return w
@@ -91,11 +85,7 @@ def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: 
     E = np.zeros((6, 6))
     c2 = scale * scale
     for i in range(len(source)):
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         j, _ = nearest(x, y, z, size, limit, 0, -1, -1, edges, rings, starts, keys, table)
         if j < 0:
             continue
@@ -160,11 +150,7 @@ def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, 
     c2 = scale * scale
     unused = np.zeros(6)
     for i in range(len(source)):
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         j, _ = nearest(x, y, z, size, limit, 0, -1, -1, surface, rings, starts, keys, table)
         if j < 0:
             continue

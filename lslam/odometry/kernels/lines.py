@@ -13,11 +13,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
+from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
 from lslam.core.kernels.linearisation import Pose, Sums, Width
-from lslam.core.kernels.residuals import TILT, add_row, octant_slots
+from lslam.core.kernels.residuals import TILT, add_facts, add_row, octant_slots, place
 from lslam.core.kernels.voxel import MASK, OFFSET
 
 Floats = NDArray[np.float64]
@@ -91,11 +91,8 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
     qx, qy, qz = uy * pz - uz * py, uz * px - ux * pz, ux * py - uy * px
     add_row(H, g, w, ex * px + ey * py + ez * pz, px, py, pz, ry * pz - rz * py, rz * px - rx * pz, rx * py - ry * px)
     add_row(H, g, w, ex * qx + ey * qy + ez * qz, qx, qy, qz, ry * qz - rz * qy, rz * qx - rx * qz, rx * qy - ry * qx)
-    facts[INFORMATION] += 2.0 * w
-    facts[SQUARED] += robust * d2
+    add_facts(facts, 2.0 * w, robust * d2, robust, rx, ry, rz)
     facts[MATCHED] += 1.0
-    facts[LEVER] += 2.0 * w * (rx * rx + ry * ry + rz * rz)
-    facts[ROBUST] += robust
     if d2 < c2:
         facts[INLIERS] += 1.0
 
@@ -121,11 +118,7 @@ def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[f
     inverse = 1.0 / size
     c2 = scale * scale
     for i in range(len(source)):
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
         best = -1
         best_d = 1e300

@@ -5,22 +5,48 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
-from lslam.core.kernels.jit import kernel
+from lslam.core.kernels.facts import INLIERS, MATCHED
+from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import invert_symmetric, rotate_symmetric
 from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import (
     Voxels,
+    add_facts,
     add_information,
     add_surface,
     nearest,
     octant_slots,
+    place,
     thin_information,
     variance_of,
 )
 from lslam.registration.kernels.discs import EXTENT2, disc
 
 Floats = NDArray[np.float64]
+
+
+@inline
+def certainty_of_pair(p: Floats, is_plane: bool, ex: float, ey: float, ez: float,
+                      spread: tuple[float, float, float, float, float, float], sigma2: float,
+                      extent2: float) -> tuple[float, float, float, float, float, float, float]:  # fmt: skip
+    """Inverse xx..zz of the sum of both covariances, and the squared Mahalanobis distance, m2, scaled by `thin`.
+
+    p : (8,) row of `planes`; e : from its mean to the point, m; spread : m2, of the point, world axes
+    thin : m2, the variance of the pair along a common normal
+    """
+    if is_plane:
+        across = variance_of(p, p[3] * ex + p[4] * ey + p[5] * ez, ex * ex + ey * ey + ez * ez) + sigma2
+        dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across, extent2)
+        thin = across + sigma2
+    else:
+        dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
+        thin = p[6] + sigma2
+    sxx, sxy, sxz, syy, syz, szz = spread
+    mxx, mxy, mxz, myy, myz, mzz = invert_symmetric(sxx + dxx, sxy + dxy, sxz + dxz, syy + dyy, syz + dyz, szz + dzz)
+    away = thin * (
+        mxx * ex * ex + myy * ey * ey + mzz * ez * ez + 2.0 * (mxy * ex * ey + mxz * ex * ez + myz * ey * ez)
+    )
+    return mxx, mxy, mxz, myy, myz, mzz, away
 
 
 @kernel
@@ -49,36 +75,20 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
     for i in range(len(source)):
         if is_done[i]:
             continue
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
             asked[i, 3] = -1.0
-        best, best_d, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
+        best, _, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best < 0:
             if blob < 0 or blob_weight <= 0.0:
                 continue
             best = blob
         is_done[i] = True
         p = planes[best]
-        sxx, sxy, sxz, syy, syz, szz = rotate_symmetric(R, covariance[i])
-        if p[7] >= 0.0:
-            off = p[3] * (x - p[0]) + p[4] * (y - p[1]) + p[5] * (z - p[2])
-            across = variance_of(p, off, best_d) + sigma2
-            dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across, extent2)
-            share, thin = plane_weight, across + sigma2
-        else:
-            dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
-            share, thin = blob_weight, p[6] + sigma2
-        mxx, mxy, mxz, myy, myz, mzz = invert_symmetric(
-            sxx + dxx, sxy + dxy, sxz + dxz, syy + dyy, syz + dyz, szz + dzz
-        )
+        is_plane = p[7] >= 0.0
         ex, ey, ez = x - p[0], y - p[1], z - p[2]
-        away = thin * (
-            mxx * ex * ex + myy * ey * ey + mzz * ez * ez + 2.0 * (mxy * ex * ey + mxz * ex * ez + myz * ey * ez)
-        )
+        spread = rotate_symmetric(R, covariance[i])
+        mxx, mxy, mxz, myy, myz, mzz, away = certainty_of_pair(p, is_plane, ex, ey, ez, spread, sigma2, extent2)
         away2[i] = away
         facts[MATCHED] += 1.0
         if away < c2:
@@ -87,15 +97,12 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
             continue
         robust = c2 / (c2 + away)
         robust *= robust
-        w = robust * share
+        w = robust * (plane_weight if is_plane else blob_weight)
         add_information(H, g, w, mxx, mxy, mxz, myy, myz, mzz, ex, ey, ez, rx, ry, rz)
         trace = w * (mxx + myy + mzz)
-        if p[7] >= 0.0:
+        if is_plane:
             along = w * thin_information(p, mxx, mxy, mxz, myy, myz, mzz)
             add_surface(S, unused, along, p[3], p[4], p[5], rx, ry, rz)
         else:
             add_information(S, unused, w, mxx, mxy, mxz, myy, myz, mzz, 0.0, 0.0, 0.0, rx, ry, rz)
-        facts[INFORMATION] += trace
-        facts[SQUARED] += robust * away
-        facts[LEVER] += trace * (rx * rx + ry * ry + rz * rz)
-        facts[ROBUST] += robust
+        add_facts(facts, trace, robust * away, robust, rx, ry, rz)

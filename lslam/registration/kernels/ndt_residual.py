@@ -12,7 +12,7 @@ from lslam.core.kernels.gaussians import BLOB, FREE
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import invert_symmetric, plane_of
 from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
-from lslam.core.kernels.residuals import Voxels, add_information, add_surface, octant_slots
+from lslam.core.kernels.residuals import Voxels, add_information, add_surface, octant_slots, place
 from lslam.registration.kernels.discs import disc
 
 Floats = NDArray[np.float64]
@@ -102,11 +102,7 @@ def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, sea
     for i in range(len(source)):
         if is_done[i]:
             continue
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
         best, best_score = 1e300, 0.0
         for k in range(8):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
+from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.gaussians import BLOB
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
-from lslam.core.kernels.residuals import Voxels, add_information, octant_slots
+from lslam.core.kernels.residuals import Voxels, add_facts, add_information, octant_slots, place
 
 Floats = NDArray[np.float64]
 
@@ -38,11 +38,7 @@ def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Set
     for i in range(len(source)):
         if is_done[i]:
             continue
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
         best = -1
         best_d = 1e300
@@ -68,7 +64,4 @@ def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Set
         robust *= robust
         w = robust * information
         add_information(H, g, w, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, x - p[0], y - p[1], z - p[2], rx, ry, rz)
-        facts[INFORMATION] += 3.0 * w
-        facts[SQUARED] += robust * best_d
-        facts[LEVER] += 3.0 * w * (rx * rx + ry * ry + rz * rz)
-        facts[ROBUST] += robust
+        add_facts(facts, 3.0 * w, robust * best_d, robust, rx, ry, rz)

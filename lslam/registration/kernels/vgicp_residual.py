@@ -7,17 +7,18 @@ from numpy.typing import NDArray
 
 from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
 from lslam.core.kernels.jit import kernel
-from lslam.core.kernels.linalg import invert_symmetric, rotate_symmetric
+from lslam.core.kernels.linalg import rotate_symmetric
 from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import (
     add_information,
     add_surface,
     nearest,
     octant_slots,
+    place,
     thin_information,
-    variance_of,
 )
-from lslam.registration.kernels.discs import EXTENT2, disc
+from lslam.registration.kernels.discs import EXTENT2
+from lslam.registration.kernels.gicp_residual import certainty_of_pair
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -47,14 +48,10 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
     for i in range(len(source)):
         if is_done[i]:
             continue
-        a, b, c = source[i, 0], source[i, 1], source[i, 2]
-        rx = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
-        ry = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-        rz = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-        x, y, z = rx + t[0], ry + t[1], rz + t[2]
+        rx, ry, rz, x, y, z = place(source, i, R, t)
         if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
             asked[i, 3] = -1.0
-        sxx, sxy, sxz, syy, syz, szz = rotate_symmetric(R, covariance[i])
+        spread = rotate_symmetric(R, covariance[i])
         best, _, blob, _ = nearest(x, y, z, i, slots, chosen, asked, planes)
         if best < 0 and (blob < 0 or blob_weight <= 0.0):
             continue
@@ -66,20 +63,8 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
                 continue
             p = planes[v]
             ex, ey, ez = x - p[0], y - p[1], z - p[2]
-            if best >= 0:
-                off = p[3] * ex + p[4] * ey + p[5] * ez
-                across = variance_of(p, off, ex * ex + ey * ey + ez * ez) + sigma2
-                dxx, dxy, dxz, dyy, dyz, dzz = disc(p[3], p[4], p[5], across, extent2)
-                n, thin = plane_weight * counts[v], across + sigma2
-            else:
-                dxx, dxy, dxz, dyy, dyz, dzz = p[6], 0.0, 0.0, p[6], 0.0, p[6]
-                n, thin = blob_weight * counts[v], p[6] + sigma2
-            mxx, mxy, mxz, myy, myz, mzz = invert_symmetric(
-                sxx + dxx, sxy + dxy, sxz + dxz, syy + dyy, syz + dyz, szz + dzz
-            )
-            away = thin * (
-                mxx * ex * ex + myy * ey * ey + mzz * ez * ez + 2.0 * (mxy * ex * ey + mxz * ex * ez + myz * ey * ez)
-            )
+            n = (plane_weight if best >= 0 else blob_weight) * counts[v]
+            mxx, mxy, mxz, myy, myz, mzz, away = certainty_of_pair(p, best >= 0, ex, ey, ez, spread, sigma2, extent2)
             robust = c2 / (c2 + away)
             robust *= robust
             if away < closest:
