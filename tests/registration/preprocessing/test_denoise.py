@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
-from lslam.registration.preprocessing.prepare import gate_points
-from lslam.registration.preprocessing.weather_filter import dense_points
+from lslam.registration.preprocessing.prepare import dense_points, gate_points
 
 
 def cloud(seed: int, n: int = 400) -> NDArray[np.float32]:

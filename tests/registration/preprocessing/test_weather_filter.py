@@ -10,8 +10,15 @@ from lslam import Registration
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.core.kernels import voxel
-from lslam.registration.preprocessing.prepare import NO_TIMES, prepare_points
-from lslam.registration.preprocessing.weather_filter import CLEAR, FIELD_OF_VIEW_SR, MOSTLY, WIDE_CELL, on_surfaces
+from lslam.registration.preprocessing.prepare import (
+    CLEAR,
+    FIELD_OF_VIEW_SR,
+    MOSTLY,
+    NO_TIMES,
+    WIDE_CELL,
+    on_surfaces,
+    prepare_points,
+)
 from lslam.simulation.scenarios import simulate
 
 Points = NDArray[np.float32]
