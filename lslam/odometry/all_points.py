@@ -42,7 +42,7 @@ class AllPoints(Stateful):
         icp = self._of_recent(attempt.history)
         return icp.locate(prepare_points(attempt.points.cloud, icp.preprocess), attempt.T_prior)
 
-    def held(self, attempt: Attempt, T_start: Floats, result: RegistrationResult) -> RegistrationResult:
+    def confirm(self, attempt: Attempt, T_start: Floats, result: RegistrationResult) -> RegistrationResult:
         """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
         icp = self._of_recent(attempt.history)
         points = prepare_points(attempt.points.cloud, icp.preprocess)

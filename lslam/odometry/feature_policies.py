@@ -80,7 +80,7 @@ class AllPointsInstead:
         is_far = not result.ok or result.prior_error[0] > c.recover_m
         if c.start_reach > 0 and (attempt.is_young or is_far):
             with attempt.clock.stage("start" if attempt.history.starting else "recover"):
-                result = points.held(attempt, attempt.T_prior if start is None else start.T_world_lidar, result)
+                result = points.confirm(attempt, attempt.T_prior if start is None else start.T_world_lidar, result)
         if attempt.target.map is not None and not result.is_well_constrained(c.sigma):
             with attempt.clock.stage("all-points"):
                 result = points.instead(attempt, result, start)

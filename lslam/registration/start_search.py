@@ -80,7 +80,7 @@ def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground
     return ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance, up_of(preprocess))
 
 
-def sought(points: PreparedPoints, ground: Ground) -> PreparedPoints:
+def high_points(points: PreparedPoints, ground: Ground) -> PreparedPoints:
     """What to look for among `NonGroundPoints` at some pose: the points of another scan that are high above its ground."""
     above = points.map_points[ground.above(points.map_points, HIGH)]
     return PreparedPoints(above, above.astype(np.float64), np.zeros((len(above), 6)), len(above))
@@ -117,7 +117,7 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
     """
     target, c, points, T_prior = attempt.target, attempt.config, attempt.points, attempt.T_prior
     ground = ground_under(points, target.preprocess)
-    non_ground, high = NonGroundPoints(attempt.history.recent, target.preprocess), sought(points, ground)
+    non_ground, high = NonGroundPoints(attempt.history.recent, target.preprocess), high_points(points, ground)
     if is_lost:
         result = _best_start(attempt, result, non_ground, high)
     coarser = target.coarse_maps(points, T_prior)

@@ -306,9 +306,9 @@ def test_all_points_correct_a_slide_of_features_by_non_ground_points() -> None:
     registration = driver.loam.registration
     attempt, points = registration.attempt(driver.loam.prepare(scans[8]), expected), registration.target.all_points
     right = RegistrationResult(expected)
-    assert points.held(attempt, expected, right) is right
+    assert points.confirm(attempt, expected, right) is right
     slid = RegistrationResult(expected @ se3.make(np.eye(3), np.array([2.0, 0.0, 0.0])))
-    held = points.held(attempt, expected, slid)
+    held = points.confirm(attempt, expected, slid)
     assert held.pose_source == ALL_POINTS
     assert np.linalg.norm(held.T_world_lidar[:3, 3] - expected[:3, 3]) < 0.2
 

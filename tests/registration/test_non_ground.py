@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.start_search import NEAR, NonGroundPoints, ground_under, on_ground, sought
+from lslam.registration.start_search import NEAR, NonGroundPoints, ground_under, high_points, on_ground
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -30,7 +30,7 @@ def non_ground_of(points: Points, pose: Floats) -> NonGroundPoints:
 
 def seen_in(points: Points) -> PreparedPoints:
     prepared = PreparedPoints(points, points.astype(np.float64), np.zeros((len(points), 6)), len(points))
-    return sought(prepared, ground_under(prepared, PreprocessConfig()))
+    return high_points(prepared, ground_under(prepared, PreprocessConfig()))
 
 
 def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out() -> None:
