@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.io.formats.trajectory_files import WRITTEN
+from lslam.io.formats.trajectory_formats import WRITTEN
 
 if TYPE_CHECKING:
     from lslam.core.types.sequence import Calibration, Sequence

@@ -10,7 +10,7 @@ import click
 from lslam.cli import options
 from lslam.core.errors import UsageError, nearest
 from lslam.evaluation import ALIGNMENTS, check_words, parse_delta
-from lslam.io.formats.trajectory_files import FORMATS
+from lslam.io.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:
     from lslam.core.config.outputs import EvalConfig

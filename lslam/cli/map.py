@@ -212,7 +212,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
     settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
-    from lslam.core.geometry.geodesy import parse_crs
+    from lslam.core.geometry.crs_names import parse_crs
     from lslam.core.types.gnss import OutputCrs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
     from lslam.reports.evaluations import crispness_document

@@ -19,7 +19,8 @@ from lslam.core.untrusted import whole_number
 from lslam.io.formats.kitti_layout import POS_ACC, ROLL, YAW, Oxts
 from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo
 from lslam.io.formats.text_tables import read_table
-from lslam.io.formats.trajectory_files import fits_kitti, read_matrices, read_trajectory, scans_of, without_lost
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.formats.trajectory_lines import fits_kitti, read_matrices, scans_of, without_lost
 from lslam.io.readers.listing import file_numbers, filled_stamps, rows_of
 from lslam.io.remote import RemotePath, as_path
 

@@ -21,7 +21,7 @@ from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.sequence_toml import FRAMES
 from lslam.io.formats.text_tables import utc_of
-from lslam.io.formats.trajectory_files import FORMATS, WRITTEN
+from lslam.io.formats.trajectory_formats import FORMATS, WRITTEN
 from lslam.maps.georeference import to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json
 

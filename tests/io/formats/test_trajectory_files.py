@@ -17,8 +17,6 @@ from lslam.core.geometry import se3
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.text_tables import seconds_text, seconds_to_ns
 from lslam.io.formats.trajectory_files import (
-    FORMATS,
-    WRITTEN,
     find_times,
     read_times,
     read_trajectory,
@@ -26,6 +24,7 @@ from lslam.io.formats.trajectory_files import (
     write_kitti,
     write_tum,
 )
+from lslam.io.formats.trajectory_formats import FORMATS, WRITTEN
 
 START = 1_317_042_272_349_659_964
 
