@@ -18,7 +18,7 @@ from lslam.cli.console import log, setup_logging, show
 if TYPE_CHECKING:
     from lslam.core.types.comparison import Comparison
     from lslam.core.types.trajectory import Trajectory
-    from lslam.studies.compare import Plan
+    from lslam.studies.plan import Plan
     from lslam.studies.subjects import Subject
 
 
@@ -91,8 +91,8 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
 
 def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     """The comparison that the options describe. They are checked as far as possible before heavy imports."""
-    from lslam.studies.compare import Plan, check_numbers
     from lslam.studies.output import COMPARISON, require_free
+    from lslam.studies.plan import Plan, check_numbers
 
     seeds, crop = options.seeds_of(given["seeds"]), _crop(given["crop"])
     check_numbers(seeds, given["jobs"], crop)
@@ -133,7 +133,7 @@ def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
     from lslam.cli.run import read_truth
     from lslam.core.errors import UsageError
     from lslam.io.readers import open_sequence
-    from lslam.studies.compare import ONE_TRUTH
+    from lslam.studies.plan import ONE_TRUTH
 
     if path is None:
         return None

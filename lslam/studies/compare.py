@@ -8,12 +8,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lslam.core.config.outputs import EvalConfig
-from lslam.core.errors import InterruptedRunError, LslamError, UsageError
+from lslam.core.errors import InterruptedRunError, LslamError
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Comparison, Difference, Drawing, DrawnRun, RunScore
 from lslam.core.types.sequence import Sequence as Recording
@@ -28,12 +27,10 @@ from lslam.studies.grid import Cell, Job, expand, fitted_scene, recorded_cell
 from lslam.studies.jobs import finished, pool_of, run_jobs
 from lslam.studies.output import COMPARISON, SIMULATED, lock_output, release_output
 from lslam.studies.paired import TIE_M, compare_pairs, summarise
+from lslam.studies.plan import Plan, check_plan
 from lslam.studies.results import IMU, collect_run, metrics_of
 from lslam.studies.runner import StudyProgress
 from lslam.studies.subjects import Scene, Subject, scans_needed, simulate_once, with_range
-
-if TYPE_CHECKING:
-    from lslam.studies.variants import Variant
 
 log = logging.getLogger("lslam")
 PREFERRED = EvalConfig(align=("se3", "origin"))
@@ -41,7 +38,6 @@ PREFERRED = EvalConfig(align=("se3", "origin"))
 LARGEST_TURN = 1 / 60
 # More than this many busy cores before the first run, and its times are somebody else's too.
 BUSY = 0.5
-ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and several need one each"
 
 
 @dataclass(frozen=True)
@@ -256,49 +252,3 @@ def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple
         configs={v.name: v.config.model_dump(mode="json") for v in plan.variants},
         tie=TIE_M,
     ), drawings
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What is to be compared.
-
-    truth : replaces the ground truth of the only sequence; jobs : runs at once, with more than one times cannot be compared
-    crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs, go
-        on with the others
-    data_root : where the IMU of a KITTI odometry sequence is looked for
-    """
-
-    subjects: tuple[Subject, ...]
-    variants: tuple[Variant, ...]
-    seeds: tuple[int, ...]
-    out: Path
-    jobs: int = 1
-    truth: Trajectory | None = None
-    crop: tuple[float, float, float] | None = None
-    overwrite: bool = False
-    resume: bool = False
-    data_root: Path | None = None
-    command: str = ""
-
-
-def check_plan(plan: Plan) -> None:
-    """Raise UsageError for what cannot be compared."""
-    if not plan.variants:
-        raise UsageError("no method is named")
-    if not plan.subjects:
-        raise UsageError("no sequence is named")
-    check_numbers(plan.seeds, plan.jobs, plan.crop)
-    if plan.truth is not None and (len(plan.subjects) > 1 or plan.subjects[0].scenario):
-        raise UsageError(ONE_TRUTH)
-    if plan.crop is not None and not all(v.config.map.write for v in plan.variants):
-        raise UsageError("--crop needs maps, and map.write is off")
-
-
-def check_numbers(seeds: Sequence[int], jobs: int, crop: tuple[float, float, float] | None) -> None:
-    """Raise UsageError for what of a plan makes no sense by itself."""
-    if len(set(seeds)) < len(seeds) or not seeds or min(seeds) < 0:
-        raise UsageError(f"--seeds {','.join(map(str, seeds))}: different whole numbers from 0, for example 0,1,2")
-    if jobs < 1:
-        raise UsageError(f"--jobs {jobs}: at least one run at a time")
-    if crop is not None and not crop[2] > 0:
-        raise UsageError(f"--crop: the size of {crop[2]:g} m must be above 0")

@@ -11,8 +11,8 @@ from lslam.core.types.comparison import Comparison
 from lslam.reports import compare_table
 from lslam.reports.picture import as_html
 from lslam.studies import compare as compared
-from lslam.studies.compare import Plan
 from lslam.studies.output import COMPARISON, require_free
+from lslam.studies.plan import Plan
 from lslam.studies.subjects import find_subjects
 from lslam.studies.variants import Imu, find_variants
 

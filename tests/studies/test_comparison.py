@@ -26,9 +26,10 @@ from lslam.io.readers import open_sequence
 from lslam.pipeline.watch import Watch
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.compare import Plan, _in_world_of_truth, check_plan, compare
+from lslam.studies.compare import _in_world_of_truth, compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
+from lslam.studies.plan import Plan, check_plan
 from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress, WorkerPool
 from lslam.studies.subjects import Subject
