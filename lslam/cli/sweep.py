@@ -101,7 +101,7 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
     from lslam.core.config.config import check_settings
     from lslam.core.config.study import parse_study
     from lslam.studies.output import STUDY, require_free
-    from lslam.studies.sweep import find_study
+    from lslam.studies.study_files import find_study
 
     check_settings(given["settings"])
     study = find_study(word)
@@ -146,7 +146,7 @@ def _print_verdicts(verdicts: list[str], folder: Path, rows: list[StudyRow] | No
 
 
 def _print_list(as_json: bool) -> None:
-    from lslam.studies.sweep import find_study, study_names
+    from lslam.studies.study_files import find_study, study_names
 
     if as_json:
         show(json.dumps({"studies": {name: find_study(name).summary for name in study_names()}}) + "\n")

@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lslam.core.config.config import shipped
-from lslam.core.config.study import ExpectedFinding, StudyConfig, parse_study, read_study
-from lslam.core.errors import InputError, RunFailedError, UsageError, nearest
+from lslam.core.config.study import ExpectedFinding, StudyConfig, read_study
+from lslam.core.errors import InputError, RunFailedError
 from lslam.core.printable import toml_text
 from lslam.core.types.study import StudyResult, StudyRow
-from lslam.core.untrusted import parse_toml
 from lslam.studies.expanded_study import ExpandedStudy, check_same, make_runs
 from lslam.studies.grid import cells_of, expand
 from lslam.studies.jobs import Engine
@@ -101,20 +99,3 @@ def report_folder(folder: Path) -> list[StudyResult]:
         return write_study_report(folder, rows)
     study = read_study(folder / STUDY)
     return write_study_report(folder, rows, study.finding, study.summary or study.name)
-
-
-def study_names() -> tuple[str, ...]:
-    """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
-    return tuple(sorted(shipped("lslam.studies", "ready")))
-
-
-def find_study(word: str) -> StudyConfig:
-    """The study of a TOML file, else the ready one of that name.
-
-    Raises UsageError with the nearest name for what is neither, and what `read_study` raises.
-    """
-    if word.endswith(".toml") or Path(word).is_file():
-        return read_study(Path(word))
-    if word not in study_names():
-        raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
-    return parse_study(parse_toml(shipped("lslam.studies", "ready")[word]), f"study {word!r}", word)

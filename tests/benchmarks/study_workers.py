@@ -26,7 +26,8 @@ from lslam.studies.jobs import Local
 from lslam.studies.output import OutputOptions
 from lslam.studies.results_csv import read_state
 from lslam.studies.runner import StudyProgress
-from lslam.studies.sweep import Sweep, expand_study, find_study, report_folder, run_sweep
+from lslam.studies.study_files import find_study
+from lslam.studies.sweep import Sweep, expand_study, report_folder, run_sweep
 
 GAIN = 1.8
 

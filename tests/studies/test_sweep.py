@@ -30,8 +30,9 @@ from lslam.studies.output import OutputOptions
 from lslam.studies.results import is_comparable
 from lslam.studies.results_csv import VERSION, State, read_state, read_study_csv
 from lslam.studies.runner import StudyProgress
+from lslam.studies.study_files import find_study
 from lslam.studies.subjects import used
-from lslam.studies.sweep import Sweep, expand_study, find_study, run_sweep, write_study_report
+from lslam.studies.sweep import Sweep, expand_study, run_sweep, write_study_report
 
 pytestmark = pytest.mark.usefixtures("forked_runs")
 
