@@ -127,6 +127,7 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
     """Where the poses begin to move along a direction that the scans leave open; checks one after the other make one alert."""
     spans: list[tuple[int, int, float, str]] = []
     reference: MotionCheck | None = None
+    pairs = 1.0  # since the reference, up to the first of an alert
     for check in checks:
         if not check.is_open:
             reference = check
@@ -136,10 +137,13 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
         longer = check.seconds / reference.seconds
         more = (check.claimed - se3.exp(longer * se3.log(reference.claimed)))[:3, 3]
         axis = int(np.argmax(np.abs(more)))
-        # What a shorter pair does not tell grows with the time.
-        if abs(more[axis]) <= LARGE[axis] * max(longer, 1.0):
+        # What a shorter pair does not tell grows with the time; so does the change of speed of a sensor that was on its way.
+        is_next = bool(spans) and spans[-1][1] == check.first
+        if not is_next:
+            pairs = 1.0 if _is_rest(reference.claimed) else (check.last - reference.last) / (check.last - check.first)
+        if abs(more[axis]) <= LARGE[axis] * max(longer, pairs, 1.0):
             continue
-        if spans and spans[-1][1] == check.first:
+        if is_next:
             spans[-1] = (
                 spans[-1][0],
                 check.last,

@@ -102,6 +102,11 @@ def test_poses_that_begin_to_move_where_the_scans_leave_it_open_raise_an_alert()
     assert spans(along(on, sideways, sideways)) == [(21, 30)]
     (alert,) = alerts(along(sideways), np.zeros((41, 3)), 100_000_000 * np.arange(41, dtype=np.int64))
     assert alert.why == "the scans leave open whether the sensor began to move by -1.20 m to the left, as its poses do"
+    # What was on its way may go half a metre faster in each pair; what stood, or moves so at once, may not.
+    faster = [shifted(1.4), shifted(1.8)]
+    assert spans(along(*faster)) == []
+    still = [replace(c, claimed=shifted(0.0), found=shifted(0.0)) for c in checks[:3]]
+    assert spans([*still, *along(shifted(0.4), shifted(0.8))[3:]]) == [(21, 25)]
     # The same said by scans that tell it raises none; nor does what a pair of a fifth of the time would not tell.
     told = along(sideways, sideways)
     assert spans([*told[:3], *(replace(c, sigma=SURE) for c in told[3:5]), *told[5:]]) == []
