@@ -179,9 +179,9 @@ def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     ],
 )  # fmt: skip
 def test_a_good_drive_raises_no_alert(scenario: str, lidar: str) -> None:
-    outcome = ended(drive(scenario, 60, 1, lidar))
+    outcome = ended(drive(scenario, 80, 1, lidar))
     assert problems(outcome) == []
-    assert outcome.record.manifest["integrity"]["checks"] >= 10
+    assert outcome.record.manifest["integrity"]["checks"] >= 14
 
 
 @pytest.mark.parametrize("more", [0, 1, 3])
