@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,9 @@ from lslam.core.types.sequence import Calibration, Sequence, StatedTimes
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.readers import open_sequence
 from lslam.odometry.base import Traits
+from lslam.odometry.frontend.segments import Tracked
+from lslam.odometry.frontend.tracker import Loaded
+from lslam.odometry.frontend.windows import WindowTracker
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
 
@@ -61,6 +64,13 @@ class Stub:
         if isinstance(entry, str):
             raise InputError(entry)
         return entry
+
+
+def decided_by(windows: WindowTracker, loaded: Iterable[Loaded | None]) -> Iterator[list[Tracked]]:
+    """The scans that are decided with each of the next ones, None at the end of the recording."""
+    for one in loaded:
+        windows.open(one)
+        yield windows.decide(one, None if one is None else windows.present.track(one))
 
 
 def sample(count: int, start: int = 0) -> Stub:

@@ -53,8 +53,9 @@ def command(run: Path, **given: Any) -> None:
     if given["overwrite"] and given["resume"]:
         raise UsageError("--overwrite does everything anew and --resume keeps finished parts: give one of them")
     options.require_there(given["loops_file"], given["control"], given["gt"])
-    from lslam.cli.run import make_run, read_truth
+    from lslam.cli.run import arguments_of, read_truth
     from lslam.pipeline.resume import open_again, read_for_graph, reading_of, require_another
+    from lslam.pipeline.run import run as make_run
     from lslam.pipeline.run_folder import check_target
 
     named = run if run.name not in ("", "..") else run.resolve()
@@ -66,7 +67,8 @@ def command(run: Path, **given: Any) -> None:
     opened = open_again(known, given["sequence"], **options.reading_of(given))
     truth = read_truth(given["gt"], opened)
     reading = reading_of(known, given["sequence"], **options.reading_of(given))
-    make_run(opened, known.config, out, given, earlier=known, reading=reading, ground_truth=truth)
+    with arguments_of(out, given) as arguments:
+        make_run(opened, known.config, earlier=known, reading=reading, ground_truth=truth, **arguments)
 
 
 def _settings(given: dict[str, Any]) -> list[str]:

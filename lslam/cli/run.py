@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +93,7 @@ def command(sequence: str, **given: Any) -> None:
         _check_folder(given)
         opened, config = opened_with({**given, "sequence": sequence})
         truth = read_truth(given["gt"], opened)
-        from lslam.pipeline.run import plan
+        from lslam.pipeline.run import plan, run
         from lslam.pipeline.run_folder import default_folder
 
         out = given["out"] or default_folder(opened.name, _variant(config))
@@ -101,24 +101,22 @@ def command(sequence: str, **given: Any) -> None:
             _print_plan(plan(opened, config, truth), config, out, given["as_json"])
             return
         reading = {name: text for name, text in options.reading_of(given).items() if text is not None}
-        make_run(opened, config, out, given, ground_truth=truth, reading=reading)
+        with arguments_of(out, given) as arguments:
+            run(opened, config, ground_truth=truth, reading=reading, **arguments)
 
 
-def make_run(opened: Sequence, config: Config, out: Path, given: dict[str, Any], **more: Any) -> None:
-    """Make the run that the options describe, and print its result; of one that was finished before what is there.
-
-    more : further arguments of `lslam.pipeline.run.run`
-    """
+@contextmanager
+def arguments_of(out: Path, given: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The arguments of `lslam.pipeline.run.run` that the options describe, and the result printed, of a finished run too."""
     from lslam.cli.profiling import profiled
-    from lslam.pipeline.run import run
 
     try:
         with heeded() as stop, profiled(given.get("profile")), ExitStack() as stack:
-            run(
-                opened, config, out=out, overwrite=given["overwrite"], resume=given["resume"],
-                command=shlex.join(["lslam", *sys.argv[1:]]),
-                watch=watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"])), **more,
-            )  # fmt: skip
+            watch = watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"]))
+            command = shlex.join(["lslam", *sys.argv[1:]])
+            yield {
+                "out": out, "overwrite": given["overwrite"], "resume": given["resume"], "command": command, "watch": watch
+            }  # fmt: skip
     except RunFinishedError as finished:
         log.info("%s", finished)
         _print_finished(out, given["as_json"])

@@ -2,7 +2,8 @@
 
     python tests/benchmarks/frames.py [icp loam fast-lio2]
 
-The stack is that of the last scan of a few: calls before it may be of kernels that are warmed up.
+The stack is that of the last scan, and of the first, which is registered again on the map of later ones; calls before may be
+of kernels that are warmed up.
 """
 
 from __future__ import annotations
@@ -16,27 +17,32 @@ from types import FrameType
 
 import lslam
 from lslam.cli.main import main as lslam_main
+from lslam.odometry.frontend.windows import first_pose
 from lslam.registration.optimiser import optimise
 
 PACKAGE = Path(lslam.__file__).parent
 SAMPLE = PACKAGE.parent / "sample_data"
 # Nothing but the registration of scans enters the optimiser.
 ALONE = ["--no-loops", "--set", "odometry.integrity=false", "--set", "map.write=false", "--set", "report.html=false"]
+LOOK_BACK = first_pose.__code__
 
 
-def last_stack(words: list[str]) -> list[str]:
+def last_stacks(words: list[str]) -> dict[str, list[str]]:
     """`file:function` of the frames of lslam, outermost first, when its main thread last entered the optimiser."""
-    last: list[str] = []
+    last: dict[str, list[str]] = {}
 
     def look(frame: FrameType | None, event: str, _: object) -> None:
         if event != "call" or frame is None or frame.f_code is not optimise.__code__:
             return
-        last.clear()
+        stack, which = [], "the last scan"
         while frame is not None:
             path = Path(frame.f_code.co_filename)
             if path.is_relative_to(PACKAGE):
-                last.insert(0, f"{path.relative_to(PACKAGE)}:{frame.f_code.co_qualname}")
+                stack.insert(0, f"{path.relative_to(PACKAGE)}:{frame.f_code.co_qualname}")
+            if frame.f_code is LOOK_BACK:
+                which = "the first scan"
             frame = frame.f_back
+        last[which] = stack
 
     sys.argv = ["lslam", *words]
     sys.setprofile(look)
@@ -49,9 +55,10 @@ def last_stack(words: list[str]) -> list[str]:
 def main() -> None:
     for method in sys.argv[1:] or ["icp", "loam", "fast-lio2"]:
         with tempfile.TemporaryDirectory() as out:
-            words = ["run", str(SAMPLE), "--out", f"{out}/run", "--method", method, "--imu", "--count", "12", "--quiet"]
-            stack = last_stack([*words, *ALONE])
-        print(f"{method}: {len(stack)} frames", *stack, sep="\n  ")
+            words = ["run", str(SAMPLE), "--out", f"{out}/run", "--method", method, "--imu", "--count", "30", "--quiet"]
+            last = last_stacks([*words, *ALONE])
+        for which, stack in last.items():
+            print(f"{method}, {which}: {len(stack)} frames", *stack, sep="\n  ")
 
 
 if __name__ == "__main__":

@@ -193,12 +193,12 @@ class OdometryCheckpoints:
 
     def offer(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing) -> None:
         """Write a checkpoint when one is due."""
-        if self._checkpoints.schedule.is_due and isinstance(tracker.odometry, Resumable):
+        if self._checkpoints.schedule.is_due and isinstance(tracker.present.odometry, Resumable):
             self._write(results, tracker, keyframing, is_over=False)
 
     def close(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
         """Write the last one: odometry is over, or somebody asked to stop."""
-        if (is_over and not self.is_over) or (not is_over and isinstance(tracker.odometry, Resumable)):
+        if (is_over and not self.is_over) or (not is_over and isinstance(tracker.present.odometry, Resumable)):
             self._write(results, tracker, keyframing, is_over)
 
     def _write(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:

@@ -72,7 +72,9 @@ def estimate(
         results = checkpoints.begin(windows, keyframing)
     middle = windows.middle
     ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
-    for decided in windows.decided(chain(ahead, (None,))):
+    for loaded in chain(ahead, (None,)):
+        windows.open(loaded)
+        decided = windows.decide(loaded, None if loaded is None else windows.present.track(loaded))
         for tracked in decided:
             if results and tracker.has_middles and not tracked.is_two_sided:
                 results[-1] = between_middles(results[-1], middle, tracked)

@@ -82,11 +82,13 @@ class SegmentTracker(Stateful):
         """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
         return isinstance(self.odometry, Deskewing) and isinstance(self.present.motion, ConstantVelocity)
 
-    def decide(self, loaded: Loaded, result: ScanResult) -> list[Tracked]:
-        """The scans that are decided with the next one, in order: none while two hypotheses are open.
+    def decide(self, loaded: Loaded | None, result: ScanResult | None) -> list[Tracked]:
+        """The scans that are decided with the next one, in order: none while two hypotheses are open, all at the end, None.
 
         result : of the present tracker
         """
+        if loaded is None or result is None:
+            return self._finish()
         first = self._tracked(self.present, loaded, result, self._segment)
         other = None if self._other is None else self._trial(self._other, loaded)
         is_held = first.result.status == "ok"
@@ -96,17 +98,17 @@ class SegmentTracker(Stateful):
         if other is not None and is_new:
             self._open.append((first, other))
             if is_held and not _is_less(first.result, other.result):
-                return self.finish()
+                return self._finish()
             return self._new_segment() if is_held or len(self._open) > self.initial_scans else []
-        decided = self.finish()
+        decided = self._finish()
         if is_held or self.begin is None or loaded.scan is None:
             return [*decided, first]
         self._other = self.begin(first.result.T_world_lidar)
         other = self._trial(self._other, loaded)
         self._open = [(first, other)]
-        return decided if other.result.status == "ok" else [*decided, *self.finish()]
+        return decided if other.result.status == "ok" else [*decided, *self._finish()]
 
-    def finish(self) -> list[Tracked]:
+    def _finish(self) -> list[Tracked]:
         """The scans that are open, as the first hypothesis has them."""
         bridged = [first for first, _ in self._open]
         self._other, self._open = None, []

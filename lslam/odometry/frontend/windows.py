@@ -6,7 +6,7 @@ The first scan of a run is registered again, on a map of those that follow.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 
@@ -15,10 +15,11 @@ import numpy as np
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.base import Deskewing, Odometry, Resumable
+from lslam.odometry.base import Deskewing, Resumable
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded
+from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import NEIGHBOURS, Course
 from lslam.odometry.integrity.monitor import IntegrityMonitor
@@ -122,27 +123,34 @@ class WindowTracker(Stateful):
         return tracker.begin is not None and tracker.initial_scans > 1 and isinstance(tracker.odometry, Resumable)
 
     @property
-    def odometry(self) -> Odometry:
-        """The method with the map of the present segment."""
-        return self._tracker.odometry
+    def present(self) -> Tracker:
+        """Tracks the scans of the present segment."""
+        return self._tracker.present
 
     @property
     def is_settled(self) -> bool:
         """Whether `state` is complete."""
         return bool(self._scans) or self._tracker.is_settled
 
-    def decided(self, ahead: Iterable[Loaded | None]) -> Iterator[list[Tracked]]:
-        """With each of the scans to come, None at the end, those that are decided: one, none, or all of a window."""
-        for loaded in ahead:
-            if not self._scans and not self._is_begin(loaded):
-                yield self._moved(self._track(loaded))
-                continue
-            if not self._scans:
-                self._start = deepcopy(self._tracker.state())
-            self._scans.append(loaded)
-            self._decided += self._track(loaded)
-            is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
-            yield self._close() if is_full or loaded is None else []
+    def open(self, loaded: Loaded | None) -> None:
+        """Take the next scan, None at the end, into the window that is open or begins with it, before it is tracked."""
+        if not self._scans:
+            if not self._is_begin(loaded):
+                return
+            self._start = deepcopy(self._tracker.state())
+        self._scans.append(loaded)
+
+    def decide(self, loaded: Loaded | None, result: ScanResult | None) -> list[Tracked]:
+        """The scans that are decided with the next one, None at the end: one, none, or all of a window.
+
+        result : of the present tracker
+        """
+        decided = self._tracker.decide(loaded, result)
+        if not self._scans:
+            return self._moved(decided)
+        self._decided += decided
+        is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
+        return self._close() if is_full or loaded is None else []
 
     def state(self) -> State:
         """What `restore` needs to go on from where the open window begins."""
@@ -155,19 +163,13 @@ class WindowTracker(Stateful):
             return False
         return self._world is None or (self.is_windowed and scan.span.seconds > 0)
 
-    def _track(self, loaded: Loaded | None) -> list[Tracked]:
-        # Scans that are still open at the end of the recording have their word there.
-        if loaded is None:
-            return self._tracker.finish()
-        return self._tracker.decide(loaded, self._tracker.present.track(loaded))
-
     def _close(self) -> list[Tracked]:
         """The scans of the window, the first of a run where the later ones put it."""
         is_bent = self.is_windowed and self._follow_course()
         out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
         self._before = self._middles()[-NEIGHBOURS:]
         if self._world is None:
-            out = self._look_back(out)
+            out[0] = self._look_back(out)
         self._scans, self._decided = [], []
         return self._moved(out)
 
@@ -186,7 +188,7 @@ class WindowTracker(Stateful):
         self._set_course(None)
         return is_bent
 
-    def _look_back(self, decided: list[Tracked]) -> list[Tracked]:
+    def _look_back(self, decided: list[Tracked]) -> Tracked:
         """The first scan on the map of the later ones, in the tracker's world, which turns with its pose."""
         begin, first, began = self._tracker.begin, decided[0], time.perf_counter()
         assert begin is not None
@@ -199,7 +201,7 @@ class WindowTracker(Stateful):
         pose = first_pose(decided, self._tracker.initial_scans, create)
         self._world = se3.normalise(first.result.T_world_lidar @ se3.inverse(pose))
         stages = _sum(first.result.stages, {"register": time.perf_counter() - began})
-        return [replace(first, result=replace(first.result, stages=stages)).at(pose), *decided[1:]]
+        return replace(first, result=replace(first.result, stages=stages)).at(pose)
 
     def _moved(self, decided: list[Tracked]) -> list[Tracked]:
         """In the world of the first pose."""
@@ -222,14 +224,17 @@ class WindowTracker(Stateful):
         earlier = [tracked.result for tracked in self._decided]
         self._tracker.restore(deepcopy(self._start))
         self._set_course(course)
-        self._decided = [tracked for loaded in self._scans for tracked in self._track(loaded)]
+        self._decided = []
+        for loaded in self._scans:
+            result = None if loaded is None else self.present.track(loaded)
+            self._decided += self._tracker.decide(loaded, result)
         for k, (tracked, before) in enumerate(zip(self._decided, earlier, strict=False)):
             now = tracked.result
             work = replace(now, stages=_sum(now.stages, before.stages), iterations=now.iterations + before.iterations)
             self._decided[k] = replace(tracked, result=work)
 
     def _set_course(self, course: Course | None) -> None:
-        motion = self._tracker.present.motion
+        motion = self.present.motion
         assert isinstance(motion, ConstantVelocity)
         motion.course = course
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from stub_sequences import Stub
+from stub_sequences import Stub, decided_by
 
 from lslam.core.config import Config, load_config
 from lslam.core.geometry import se3, so3
@@ -63,7 +63,7 @@ def windows_of(method: str, initial_scans: int = FIRST) -> WindowTracker:
 
 
 def decided(windows: WindowTracker, loaded: tuple[Loaded, ...]) -> list[list[Tracked]]:
-    return list(windows.decided(chain(loaded, (None,))))
+    return list(decided_by(windows, chain(loaded, (None,))))
 
 
 @cache
@@ -107,7 +107,7 @@ def test_the_world_stays_that_of_the_first_pose_and_no_later_step_changes() -> N
 @pytest.mark.parametrize("left_off", [7, WINDOW + 2])
 def test_a_run_goes_on_in_the_same_world(tmp_path: Path, left_off: int) -> None:
     windows, loaded = windows_of("icp"), scans("icp", 0)
-    known = [t for now in windows.decided(loaded[:left_off]) for t in now]
+    known = [t for now in decided_by(windows, loaded[:left_off]) for t in now]
     write_state(tmp_path / "state.npz", windows.state())
     other = windows_of("icp")
     other.restore(read_state(tmp_path / "state.npz", STATE_CLASSES))

@@ -36,7 +36,7 @@ def tracked(old: dict[int, int], *new: dict[int, int], count: int, unread: tuple
     scan = Scan(np.ones((3, 3), np.float32), 0, 0)
     every = [Loaded(i, i, None if i in unread else scan) for i in range(count)]
     out = [tracker.decide(loaded, tracker.present.track(loaded)) for loaded in every]
-    return [*out, tracker.finish()]
+    return [*out, tracker.decide(None, None)]
 
 
 def outcomes(decided: list[list[Tracked]]) -> list[tuple[int, str, int]]:

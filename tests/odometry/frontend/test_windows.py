@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from stub_sequences import Stub
+from stub_sequences import Stub, decided_by
 
 from lslam.core.config import Config, load_config
 from lslam.core.geometry import se3, so3
@@ -62,7 +62,7 @@ def windows_of(config: Config, *, is_windowed: bool = True) -> WindowTracker:
 
 
 def tracked(windows: WindowTracker, loaded: tuple[Loaded, ...]) -> Iterator[list[Tracked]]:
-    yield from windows.decided(chain(loaded, (None,)))
+    yield from decided_by(windows, chain(loaded, (None,)))
 
 
 def poses_of(decided: list[list[Tracked]]) -> Floats:
@@ -110,7 +110,7 @@ def test_what_moves_evenly_or_cannot_follow_keeps_its_bytes(method: str) -> None
 def test_a_run_goes_on_from_where_its_window_began(tmp_path: Path, left_off: int) -> None:
     whole = poses_of(walked(is_windowed=True))
     windows = windows_of(configured())
-    known = [t for now in windows.decided(scans("walk")[:left_off]) for t in now]
+    known = [t for now in decided_by(windows, scans("walk")[:left_off]) for t in now]
     write_state(tmp_path / "state.npz", windows.state())
     other = windows_of(configured())
     other.restore(read_state(tmp_path / "state.npz", STATE_CLASSES))
