@@ -1,7 +1,7 @@
 """Tables of the documents, each made by a benchmark: `python tests/benchmarks/NAME.py --write docs/results.md`.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`, with the command that made it and a caption that names
-scans, seeds and alignment. Writing replaces what stands there, and nothing else.
+scans, seeds and alignment. Writing replaces what stands there, and nothing else; `ages.py` keeps what made it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
+from ages import Ages
 
 SEEDS = "100,101,102,103,104"
 WIDTH = 132
@@ -96,3 +97,4 @@ def table(name: str, caption: str, header: Sequence[str], rows: Iterable[Sequenc
     if not block.search(document):
         sys.exit(f"{write} has no table {name}: it wants the lines <!-- table {name} --> and <!-- end -->")
     write.write_text(block.sub(lambda m: f"{m[1]}{text}\n{m[2]}", document), encoding="utf-8")
+    Ages().stamp(name, command(), write)
