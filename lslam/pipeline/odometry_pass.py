@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.loops import find_loops
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.kernels import jit
@@ -19,10 +18,8 @@ from lslam.core.types.constraint import Turn
 from lslam.core.types.imu import InertialChain
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
-from lslam.maps import crispness, merge
 from lslam.odometry import create_odometry
-from lslam.odometry.base import Deskewing, Odometry, Resumable
-from lslam.odometry.frontend import inertial_start
+from lslam.odometry.base import Deskewing, Resumable
 from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.odometry.frontend.inertial_start import (
     Inertial,
@@ -43,11 +40,10 @@ from lslam.odometry.inertial.smoothing import SmootherMotion
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector
-from lslam.osm import wall_match
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.precompile import helped
+from lslam.pipeline.precompile import helped, load_kernels
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.pipeline.segments import checks_within, join_segments
 
@@ -194,34 +190,11 @@ def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: I
         jit.announced(log, start_helper),
     ):  # fmt: skip
         if alike not in _warmed:
-            _load_kernels(job.odometry, stationary, monitor, config, is_over)
+            trackers = [one for one in (job.odometry, stationary, monitor) if one is not None]
+            load_kernels(config, trackers, is_over=is_over)
             _warmed.add(alike)
         with suppress(InputError):
             measurable(job.sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn
-
-
-def _load_kernels(
-    odometry: Odometry,
-    stationary: StationaryDetector | None,
-    monitor: IntegrityMonitor | None,
-    config: Config,
-    is_over: bool,
-) -> None:
-    if not is_over:
-        odometry.warm_up()
-    if stationary is not None:
-        stationary.warm_up()
-    if monitor is not None and not is_over:
-        monitor.warm_up()
-    if config.loops.use or config.localize.map:
-        find_loops.warm_up(config.loops)
-    if config.osm.extract:
-        wall_match.warm_up()
-    if config.map.write:
-        merge.warm_up()
-        crispness.warm_up()
-    if config.imu.use and not is_over:
-        inertial_start.warm_up()
 
 
 def _begin_imu(job: PreparedRun) -> Inertial:

@@ -1,18 +1,83 @@
-"""Cold start: a second process compiles what the first comes to last, on a core that would be idle meanwhile.
+"""The kernels of a run, compiled or loaded before its first scan: one table says which part of a run calls which.
 
-The compiler has one lock for all threads of a process. Both keep their kernels in the same cache, and load what is there.
+Cold start: a second process compiles what the first comes to last, on a core that would be idle meanwhile. The compiler has one
+lock for all threads of a process. Both keep their kernels in the same cache, and load what is there.
 """
 
 from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
 
+from lslam.backend.loops import find_loops
 from lslam.core.config import Config
 from lslam.core.kernels import jit
 from lslam.core.machine import available_cores
+from lslam.maps import crispness, merge
+from lslam.odometry.frontend import inertial_start
+from lslam.osm import wall_match
+from lslam.registration import optimiser
+from lslam.registration.preprocessing import ground
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Kernels of one part of a run.
+
+    is_called : whether a run as configured calls them
+    warm_up : compiles or loads them; ahead : those of them that a second process compiles
+    is_of_scans : not called where all scans are registered
+    """
+
+    is_called: Callable[[Config], bool]
+    warm_up: Callable[[Config], object] = lambda config: None
+    ahead: Callable[[Config], object] | None = None
+    is_of_scans: bool = False
+
+
+def _of_map(config: Config) -> None:
+    merge.warm_up()
+    crispness.warm_up()
+
+
+def _last_of_method(config: Config) -> None:
+    optimiser.warm_up()
+    ground.warm_up()
+
+
+KERNELS = {
+    # A method has a `warm_up` of its own.
+    "method": Kernels(lambda config: True, ahead=_last_of_method, is_of_scans=True),
+    "loops": Kernels(
+        lambda config: config.loops.use or bool(config.localize.map),
+        lambda config: find_loops.warm_up(config.loops),
+        lambda config: find_loops.warm_up_candidates(config.loops),
+    ),
+    "walls": Kernels(lambda config: bool(config.osm.extract), lambda config: wall_match.warm_up()),
+    "map": Kernels(lambda config: config.map.write, _of_map, _of_map),
+    "imu": Kernels(lambda config: config.imu.use, lambda config: inertial_start.warm_up(), is_of_scans=True),
+}
+
+
+class Warmed(Protocol):
+    """What has kernels of its own."""
+
+    def warm_up(self) -> None:
+        """Compile or load them."""
+        ...
+
+
+def load_kernels(config: Config, trackers: Iterable[Warmed], *, is_over: bool = False) -> None:
+    """Compile or load what a run calls; trackers : what sees its scans; is_over : all of these are registered."""
+    for tracker in () if is_over else trackers:
+        tracker.warm_up()
+    for part in KERNELS.values():
+        if part.is_called(config) and not (is_over and part.is_of_scans):
+            part.warm_up(config)
 
 
 @contextmanager
@@ -26,7 +91,7 @@ def helped(config: Config) -> Iterator[Callable[[], None]]:
     def start() -> None:
         if started or available_cores() < 2 or jit.lock_file() is None or not sys.executable:
             return
-        words = [word for word, is_wanted in (("map", config.map.write), ("loops", config.loops.use)) if is_wanted]
+        words = [name for name, part in KERNELS.items() if part.ahead and part.is_called(config)]
         command = [sys.executable, "-P", "-m", "lslam.pipeline.precompile", *words]
         nowhere = subprocess.DEVNULL
         try:
@@ -42,20 +107,12 @@ def helped(config: Config) -> Iterator[Callable[[], None]]:
             process.wait()
 
 
-def main(words: list[str]) -> None:
-    """Compile the optimiser's step and the ground's kernels, and those of the map and of loop candidates where named."""
-    from lslam.backend.loops import find_loops
-    from lslam.maps import crispness, merge
-    from lslam.registration import optimiser
-    from lslam.registration.preprocessing import ground
-
-    optimiser.warm_up()
-    ground.warm_up()
-    if "map" in words:
-        merge.warm_up()
-        crispness.warm_up()
-    if "loops" in words:
-        find_loops.warm_up_candidates(Config().loops)
+def main(names: list[str]) -> None:
+    """Compile what the parts of that name have for the second process."""
+    for name in names:
+        ahead = KERNELS[name].ahead
+        if ahead is not None:
+            ahead(Config())
 
 
 if __name__ == "__main__":

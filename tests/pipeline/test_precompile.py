@@ -10,9 +10,7 @@ from typing import Any
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from lslam.backend.loops import find_loops
 from lslam.core.config import Config
-from lslam.maps import crispness, merge
 from lslam.odometry import create_odometry
 from lslam.pipeline import precompile
 
@@ -26,12 +24,9 @@ def signatures() -> set[tuple[str, str]]:
 
 def test_it_compiles_nothing_that_the_run_does_not_need() -> None:
     config = Config()
-    create_odometry(config).warm_up()
-    find_loops.warm_up(config.loops)
-    merge.warm_up()
-    crispness.warm_up()
+    precompile.load_kernels(config, [create_odometry(config)])
     of_run = signatures()
-    precompile.main(["map", "loops"])
+    precompile.main([name for name, part in precompile.KERNELS.items() if part.is_called(config)])
     assert signatures() == of_run
 
 
