@@ -59,9 +59,9 @@ def compare_drives(target: Path, given: dict[str, Any]) -> None:
 
 
 def of_the_map(settings: Iterable[str]) -> list[str]:
-    """The settings of --set; raises UsageError for one that is none of the map."""
+    """The settings of --set; raises UsageError for one that is none of the map, nor says which points it has."""
     for setting in settings:
-        if not setting.startswith("map."):
+        if not setting.startswith(("map.", "preprocess.drop_labels=")):
             raise UsageError(f"--set {setting}: only keys of the map can be changed after the run")
     return list(settings)
 

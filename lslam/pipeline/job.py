@@ -24,6 +24,7 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.frames import main_axis
 from lslam.io.readers import open_sequence
 from lslam.io.readers.kitti_raw import with_streams
+from lslam.io.readers.labels import with_labels
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
@@ -41,7 +42,7 @@ from lslam.pipeline.manifest import Manifest, describe_deskew
 from lslam.pipeline.prior_map_files import require_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.pipeline.watch import Watch
-from lslam.registration.preprocessing.views import with_rings
+from lslam.registration.preprocessing.views import WithoutClasses, with_rings
 
 log = logging.getLogger("lslam")
 
@@ -133,14 +134,20 @@ def _with_scene_of(earlier: Config, config: Config) -> Config:
 
 
 def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequence:
-    """What --start, --count and --skip-frames leave, with the times of points, and rings where the method needs them.
+    """What --start, --count and --skip-frames leave, without points of `preprocess.drop_labels`, with the times of the
+    others, and rings where the method needs them.
 
-    Raises UsageError when nothing is left, InputError naming --rings when there are no rings to be found, and when stated
-    times do not fit.
+    Raises UsageError when nothing is left, InputError naming --rings when there are no rings to be found, when stated
+    times do not fit, and when labels are needed and there are none.
     """
+    dropped = config.preprocess.drop_labels
+    if dropped:
+        sequence = with_labels(sequence, "preprocess.drop_labels")
     sequence = with_point_times(sequence, config.preprocess)
     if odometry.needs_rings:
         sequence = with_rings(sequence, config.input.rings)
+    # Rules for times and rings know where in its scan a point stands.
+    sequence = WithoutClasses(sequence, dropped) if dropped else sequence
     return select(sequence, config.input.start, config.input.count, config.input.skip_frames)
 
 

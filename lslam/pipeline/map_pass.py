@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -86,7 +86,9 @@ def build_map(
         if loaded.prepared is not None:
             maker.add(k, loaded.prepared)
     with asking(should_stop, INTERRUPTED):
-        return maker.finish()
+        built = maker.finish()
+    dropped = ", ".join(config.preprocess.drop_labels)
+    return replace(built, done=(*built.done, f"without points of {dropped}")) if dropped else built
 
 
 def scans_again(

@@ -37,6 +37,7 @@ from lslam.io.formats.point_files import MAP_SUFFIXES, read_cloud
 from lslam.io.formats.state_files import read_npz
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
+from lslam.io.readers.labels import with_labels
 from lslam.io.remote import as_path
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
@@ -56,7 +57,7 @@ from lslam.pipeline.map_files import (
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.registration.preprocessing.sweep_clock import SweepClock
-from lslam.registration.preprocessing.views import Clocked
+from lslam.registration.preprocessing.views import Clocked, WithoutClasses
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.reports.recording import ViewedRun
@@ -154,7 +155,10 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
     known = run.topics if sequence is None else {}
     given = {name: value for name, value in reading.items() if value is not None}
     opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **(known | given))
-    chosen = select(_clocked(run, opened), section.start, section.count, section.skip_frames)
+    dropped = run.config.preprocess.drop_labels
+    opened = _clocked(run, with_labels(opened, "preprocess.drop_labels") if dropped else opened)
+    opened = WithoutClasses(opened, dropped) if dropped else opened
+    chosen = select(opened, section.start, section.count, section.skip_frames)
     count = len(run.trajectory)
     if len(chosen) < count or np.any(np.abs(chosen.stamps_ns[:count] - run.trajectory.stamps_ns) > 1000):
         raise InputError(

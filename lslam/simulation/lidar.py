@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.geometry import portable
+from lslam.core.labels import CLASSES
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import Scan
 from lslam.simulation.lidar_models import LidarModel
@@ -35,11 +36,34 @@ for _surface, _share in {
     Surface.HEDGE: 0.45,
 }.items():
     REFLECTIVITY[_surface] = _share
+# Class of each surface, where it stands and where it moves.
+LABELS = np.zeros((2, len(Surface)), np.uint16)
+for _surface, _name in {
+    Surface.ROAD: "road",
+    Surface.PAVEMENT: "sidewalk",
+    Surface.LAWN: "terrain",
+    Surface.WALL: "building",
+    Surface.GLASS: "building",
+    Surface.ROOF: "building",
+    Surface.FOLIAGE: "vegetation",
+    Surface.TRUNK: "trunk",
+    Surface.POLE: "pole",
+    Surface.CAR: "car",
+    Surface.FENCE: "fence",
+    Surface.PERSON: "person",
+    Surface.CROWN: "vegetation",
+    Surface.HEDGE: "vegetation",
+}.items():
+    LABELS[0, _surface] = CLASSES[_name]
+LABELS[1, [Surface.CAR, Surface.GLASS, Surface.PERSON]] = [
+    CLASSES[f"moving-{_name}"] for _name in ("car", "car", "person")
+]
 # Light that a rough surface, its facets tilted by 0.6 rad, sends back where it came from: A cos + B sin^2 of the incidence
 # (Oren and Nayar 1994). KITTI's intensities of roads hardly fall from 4 m to 20 m, as they would by the cosine alone.
 ROUGH_A, ROUGH_B = 1 - 0.5 * 0.36 / (0.36 + 0.33), 0.45 * 0.36 / (0.36 + 0.09)
 
 
+MOVES = -2  # in place of a face, which is of the city; others that are of none are -1
 BODY_STEP = 0.004  # s between the poses of a moving body
 
 
@@ -108,7 +132,7 @@ def trace(
 
     Returns
     -------
-    The points that came back, with intensity 0..1 in steps of 0.01, rings and, for distorted scans, times.
+    The points that came back, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
     """
     # A stream of its own: without these effects every scan stays as it is.
     extra = rng.spawn(1)[0] if returns is not None else rng
@@ -132,7 +156,8 @@ def trace(
     points = directions[kept] * distance[kept, None]
     points[:, 2] += heights[kept]
     times = since[kept].astype(np.float32) if moving else None
-    return Scan(points, stamp_ns, index, intensity[kept], times, ring[kept].astype(np.uint16))
+    labels = LABELS[(hits.face[kept] == MOVES).astype(np.intp), hits.surface[kept]]
+    return Scan(points, stamp_ns, index, intensity[kept], times, ring[kept].astype(np.uint16), labels=labels)
 
 
 @dataclass(frozen=True)
@@ -237,7 +262,7 @@ def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits
     hits.distance[met] = far[nearer]
     hits.cosine[met] = np.abs(np.einsum("ij,ij->i", body.scene.mesh.normals[face], local[nearer]))
     hits.surface[met] = body.scene.mesh.surfaces[face]
-    hits.face[met] = -1
+    hits.face[met] = MOVES
 
 
 def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.float32], hits: Hits) -> None:

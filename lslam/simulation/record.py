@@ -23,7 +23,16 @@ from lslam.core.types.scan import Scan
 from lslam.core.untrusted import parse_json
 from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.kitti_layout import PER_POINT, POINTS, in_camera, scan_files, write_calib, write_scan, write_times
+from lslam.io.formats.kitti_layout import (
+    PER_POINT,
+    POINTS,
+    in_camera,
+    label_file,
+    scan_files,
+    write_calib,
+    write_scan,
+    write_times,
+)
 from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.io.formats.trajectory_files import write_kitti
 from lslam.simulation import NUMBER, check_target, part_of
@@ -148,29 +157,36 @@ def lidars_of(drive: SimulatedDrive, folder: Path) -> list[tuple[SimulatedDrive,
     return [(drive, folder), *((other, folder / mount.name) for other, mount in mounts)]
 
 
-def write_scans(drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None) -> int:
+def write_scans(
+    drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None, is_labelled: bool = False
+) -> int:
     """Write every scan that is not in `folder` yet, as KITTI's .bin with times and rings beside; the number of points of all.
 
+    is_labelled : with the classes of points
     `on_scan` is called with the index of every scan, in order, when it is on disk, and those of further LiDARs beside it.
     """
     jobs = [
-        (lidar, index, scan_files(place, index)[1])
+        (lidar, index, place)
         for index in range(len(drive))
         for lidar, place in lidars_of(drive, folder)
         if index < len(lidar)
     ]
-    fresh = _traced([(lidar, index) for lidar, index, beside in jobs if not beside.is_file()])
+
+    def is_there(place: Path, index: int) -> bool:
+        return scan_files(place, index)[1].is_file() and (not is_labelled or label_file(place, index).is_file())
+
+    fresh = _traced([(lidar, index) for lidar, index, place in jobs if not is_there(place, index)])
     total = 0
-    for (_, index, beside), following in zip(jobs, [*jobs[1:], None], strict=True):
-        place = beside.parents[1]
-        if beside.is_file():
+    for (_, index, place), following in zip(jobs, [*jobs[1:], None], strict=True):
+        if is_there(place, index):
             total += scan_files(place, index)[0].stat().st_size // 16
         else:
             scan = next(fresh)
             total += len(scan)
             # All rays of a compensated scan were fired at its stamp.
             times = np.zeros(len(scan), np.float32) if scan.times is None else scan.times
-            write_scan(place, index, scan.points, scan.intensity, times, scan.rings)
+            labels = scan.labels if is_labelled else None
+            write_scan(place, index, scan.points, scan.intensity, times, scan.rings, labels)
         if on_scan is not None and (following is None or following[1] != index):
             on_scan(index)
     return total
@@ -208,12 +224,13 @@ def record(
     on_scan: Callable[[int], None] | None = None,
     resume: bool = False,
     command: str = "",
+    is_labelled: bool = False,
 ) -> Recorded:
     """Trace all scans of `drive` and write `out`/sequences/00 and `out`/poses/00.txt.
 
     The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan. What
     is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes. Last comes the
-    sequence's `manifest.json`, with `command`, what was typed.
+    sequence's `manifest.json`, with `command`, what was typed. `is_labelled` adds the class of every point.
 
     Raises
     ------
@@ -235,7 +252,7 @@ def record(
             folder.mkdir(parents=True, exist_ok=True)
         _check_space(out, part, drive)
         write_mark(part, drive)
-        points = write_scans(drive, part, on_scan)
+        points = write_scans(drive, part, on_scan, is_labelled)
         _write_sides(drive, part)
         truth, T_cam0_lidar = drive.ground_truth, drive.calibration.T_cam0_lidar
         assert truth is not None

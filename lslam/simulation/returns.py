@@ -64,7 +64,7 @@ class Rays:
 class Hits:
     """What rays meet first: distance (N,), m, inf for nothing; cosine of incidence (N,); surface (N,).
 
-    face : (N,) of the scene that stands, -1 for nothing, a leaf, or what moves
+    face : (N,) of the scene that stands, below 0 for nothing, a leaf, or what moves
     """
 
     distance: NDArray[np.float32]

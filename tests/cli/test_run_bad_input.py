@@ -347,3 +347,8 @@ def test_a_name_that_is_no_utf8(tmp_path: Path) -> None:
     assert "000003.bin" in (out / "log.txt").read_text()
     assert manifest(out)["sequence"]["path"] == str(sequence)
     assert strict_json(done.stdout)["manifest"]["counts"]["scans"] == 5
+
+
+def test_labels_that_are_not_there(sequence: Path, tmp_path: Path) -> None:
+    refuse(sequence, tmp_path, 3, "drop_labels needs labels", "--set", "preprocess.drop_labels=moving")
+    refuse(sequence, tmp_path, 2, "is no class of points", "--set", "preprocess.drop_labels=tree")

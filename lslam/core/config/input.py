@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from lslam.core.config.section import Section
+from lslam.core.labels import parse_classes
 from lslam.core.machine import available_cores
 
 RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
@@ -90,6 +91,11 @@ class PreprocessConfig(Section):
         None,
         description="up in the LiDAR frame, of any length; absent: z, unless the IMU, or the ground under the first scans, is "
         "more than 45 deg off",
+    )
+    drop_labels: Annotated[tuple[str, ...], BeforeValidator(parse_classes)] = Field(
+        (),
+        description="classes of points that are left out of everything, by SemanticKITTI's names (moving: all that move), or "
+        "by number where the recording has others; needs labels of points",
     )
     remove_ground: bool = Field(False, description="take out the points that lie on the ground")
     ground_slope: float = Field(0.2, gt=0, lt=1, description="m/m; steepest ground against the plane under the sensor")

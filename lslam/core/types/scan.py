@@ -58,6 +58,7 @@ class Scan:
     times : (N,) float32 seconds from the stamp, negative before it, or None; None means compensated or unknown
     rings : (N,) uint16, `NO_RING` where a point has none, or None
     fault : what is wrong with the scan though it is of use, a sentence without its number; empty: nothing
+    labels : (N,) uint16, class of each point, see `lslam.core.labels`; None where the recording has none
     lidars : (N,) uint8, which LiDAR of several measured each point, 0 for the leading one; None where there is but one
     """
 
@@ -68,6 +69,7 @@ class Scan:
     times: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     fault: str = ""
+    labels: NDArray[np.uint16] | None = None
     lidars: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
@@ -81,13 +83,14 @@ class Scan:
         return Span(float(np.fmin.reduce(self.times, initial=0.0)), float(np.fmax.reduce(self.times, initial=0.0)))
 
     def select(self, mask: NDArray[Any]) -> Scan:
-        """The points that `mask` (bool or indices) keeps, together with their intensity, time and ring."""
+        """The points that `mask` (bool or indices) keeps, together with what is known of each."""
         return replace(
             self,
             points=self.points[mask],
             intensity=None if self.intensity is None else self.intensity[mask],
             times=None if self.times is None else self.times[mask],
             rings=None if self.rings is None else self.rings[mask],
+            labels=None if self.labels is None else self.labels[mask],
             lidars=None if self.lidars is None else self.lidars[mask],
         )
 

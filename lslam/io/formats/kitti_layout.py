@@ -15,7 +15,7 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import whole_number
 from lslam.io.formats.atomic import atomic_write, write_text
-from lslam.io.formats.point_files import write_bin
+from lslam.io.formats.point_files import LABELS, write_bin, write_labels
 from lslam.io.formats.text_tables import seconds_text
 from lslam.io.formats.time_columns import read_stamps
 
@@ -35,6 +35,11 @@ def scan_files(folder: Path, number: int) -> tuple[Path, Path]:
     return folder / POINTS / f"{number:06d}.bin", folder / PER_POINT / f"{number:06d}.npz"
 
 
+def label_file(folder: Path, number: int) -> Path:
+    """The classes of the points of scan `number` in the sequence folder, as SemanticKITTI has them."""
+    return folder / LABELS / f"{number:06d}.label"
+
+
 def write_scan(
     folder: Path,
     number: int,
@@ -42,10 +47,14 @@ def write_scan(
     intensity: NDArray[np.float32] | None,
     times: NDArray[np.float32] | None,
     rings: NDArray[np.uint16] | None,
+    labels: NDArray[np.uint16] | None = None,
 ) -> None:
-    """Write points, and beside them what is known of times, s from the scan's stamp, and rings. That file comes last, always."""
+    """Write points, their classes, and what is known of times, s from the stamp, and rings. That file comes last, always."""
     cloud, beside = scan_files(folder, number)
     write_bin(cloud, points, intensity)
+    if labels is not None:
+        label_file(folder, number).parent.mkdir(exist_ok=True)
+        write_labels(label_file(folder, number), labels)
     known: dict[str, Any] = {name: v for name, v in (("t", times), ("ring", rings)) if v is not None}
     with atomic_write(beside) as stream:
         np.savez_compressed(stream, **known)

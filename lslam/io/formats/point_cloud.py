@@ -38,6 +38,11 @@ TIME_NAMES = (
     "gpstime", "utc_time", "delta_time", "delta_t", "dt", "lidar_timestamp", "sensor_timestamp", "firing_time", "fire_time",
     "capture_time", "offset_ns", "offset_us", "curvature",
 )  # fmt: skip
+# The likeliest first; Livox's `tag` says how sure a return is.
+LABEL_NAMES = (
+    "label", "labels", "semantic", "semantics", "semantic_label", "semantic_id", "semantic_class", "sem_label", "sem_class",
+    "label_id", "class", "class_id", "class_label", "classification", "category", "tag",
+)  # fmt: skip
 # FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
 _DOUBTFUL_TIMES = {"curvature": "ms"}
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}  # ns
@@ -75,12 +80,14 @@ class PointCloud:
 
     points : (N, 3) float32 (of maps float64), m; intensity : (N,) float32 or None
     rings : (N,) uint16, `NO_RING` where a point has none, or None
+    labels : (N,) uint16, class of each point, or None
     clocks : what may be per-point times, the likeliest first; fields : those read as the above; unread : the others
     """
 
     points: NDArray[Any]
     intensity: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
+    labels: NDArray[np.uint16] | None = None
     clocks: tuple[TimeColumn, ...] = ()
     fields: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
@@ -100,6 +107,7 @@ class PointCloud:
             points=self.points[mask],
             intensity=None if self.intensity is None else self.intensity[mask],
             rings=None if self.rings is None else self.rings[mask],
+            labels=None if self.labels is None else self.labels[mask],
             clocks=tuple(replace(clock, values=clock.values[mask]) for clock in self.clocks),
         )
 
@@ -176,11 +184,13 @@ def cloud_from_fields(
         points[:, k] = first[axis or ""]
     intensity = _first(names, INTENSITY_NAMES)
     ring, rings = _find_rings(points, {names[plain]: first[names[plain]] for plain in RING_NAMES if plain in names})
-    fields = [name for name in (*axes, intensity, ring) if name is not None]
+    label, labels = _find_labels({names[plain]: first[names[plain]] for plain in LABEL_NAMES if plain in names})
+    fields = [name for name in (*axes, intensity, ring, label) if name is not None]
     return PointCloud(
         points,
         None if intensity is None else np.ascontiguousarray(first[intensity], np.float32),
         rings,
+        labels,
         tuple(_clocks(names, columns)),
         tuple(fields),
         tuple(name for name in columns if name not in (*fields, ORGANISED) and plain_name(name)),
@@ -217,6 +227,15 @@ def _find_rings(
             if not _FEWEST_RINGS <= count <= _MOST_RINGS:
                 continue
         return name, rings
+    return None, None
+
+
+def _find_labels(candidates: Mapping[str, NDArray[Any]]) -> tuple[str | None, NDArray[np.uint16] | None]:
+    """The first of the fields whose values are whole numbers, of which the lower 16 bits are the class, as SemanticKITTI's."""
+    for name, values in candidates.items():
+        whole = _integers(values)
+        if whole is not None:
+            return name, whole.astype(np.uint16)
     return None, None
 
 

@@ -24,6 +24,7 @@ from lslam.io.formats.point_records import KITTI, WAY_OUT, PointRecord, name_col
 from lslam.io.formats.state_files import HEADERS
 from lslam.io.remote import RemotePath
 
+LABELS = "labels"  # SemanticKITTI's folder
 SUFFIXES = (".bin", ".pcd", ".ply", ".npy")
 MAP_SUFFIXES = (".ply", ".pcd", ".las", ".laz")
 _MOST_COLUMNS = 64
@@ -107,6 +108,23 @@ def write_bin(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None =
         raise UsageError(f"{path}: points must be (N, 3) and intensity (N,), not {np.shape(points)}")
     with atomic_write(path) as stream:
         stream.write(float_table(points, np.zeros(len(points)) if intensity is None else intensity).data)
+
+
+def read_labels(path: Path, count: int) -> NDArray[np.uint16]:
+    """Classes (count,) of the points of a scan: the lower halves of SemanticKITTI's numbers, the upper ones tell instances.
+
+    Raises InputError when the file cannot be read, or holds another number of labels.
+    """
+    raw = read_bytes(path)
+    if len(raw) != 4 * count:
+        raise InputError(f"{path}: {len(raw)} bytes are no labels of {count} points, 4 bytes each")
+    return raw.view("<u4").astype(np.uint16)
+
+
+def write_labels(path: Path, labels: NDArray[np.uint16]) -> None:
+    """Write the classes of a scan's points, atomically, as SemanticKITTI has them. Raises OutputError."""
+    with atomic_write(path) as stream:
+        stream.write(labels.astype("<u4").data)
 
 
 def read_array(path: Path) -> NDArray[Any]:

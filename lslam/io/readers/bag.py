@@ -89,7 +89,7 @@ class BagSequence(SequenceOnDisk):
         cloud, shift = self.cloud(index)
         stamp += shift
         if self.clock is None:
-            return Scan(cloud.points, stamp, index, cloud.intensity, None, cloud.rings)
+            return Scan(cloud.points, stamp, index, cloud.intensity, None, cloud.rings, labels=cloud.labels)
         timed = self.clock.read(cloud, stamp)
         cloud, fault = timed.cloud, timed.fault
         stamp += timed.shift_ns
@@ -98,7 +98,7 @@ class BagSequence(SequenceOnDisk):
             what = f"the clock of its points is {off * 1e-9:+.3f} s off: the header counts"
             fault = f"{fault}; {what}" if fault else what
             stamp = int(self.stamps_ns[index])
-        return Scan(cloud.points, stamp, index, cloud.intensity, timed.times, cloud.rings, fault=fault)
+        return Scan(cloud.points, stamp, index, cloud.intensity, timed.times, cloud.rings, fault, cloud.labels)
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
         """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""

@@ -193,7 +193,7 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
         for clock in first.clocks
         if clock.name in of_last
     )
-    columns = {name: (getattr(first, name), getattr(last, name)) for name in ("points", "intensity", "rings")}
+    columns = {name: (getattr(first, name), getattr(last, name)) for name in ("points", "intensity", "rings", "labels")}
     joined: dict[str, Any] = {
         name: None if x is None or y is None else np.concatenate([x, y]) for name, (x, y) in columns.items()
     }

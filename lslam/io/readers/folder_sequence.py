@@ -78,7 +78,7 @@ class FolderSequence(SequenceOnDisk):
 
             angle = math.radians(self.correction_deg)
             rotate_up(cloud.points, math.sin(angle), math.cos(angle))
-        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings, fault=fault)
+        return Scan(cloud.points, stamp, index, cloud.intensity, times, cloud.rings, fault, cloud.labels)
 
 
 @dataclass

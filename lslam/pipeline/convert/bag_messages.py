@@ -19,9 +19,9 @@ _DIAGONAL_KNOWN, _NO_COVARIANCE = 2, 0  # sensor_msgs/NavSatFix
 
 
 def cloud(store: Any, scan: Scan, frame: str) -> Any:
-    """PointCloud2 of a scan: x, y, z, and as far as they are known intensity, ring and `time`, s since the header's stamp."""
+    """PointCloud2 of a scan: x, y, z, and as far as they are known intensity, ring, label and `time`, s from the stamp."""
     columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
-    optional = {"intensity": scan.intensity, "ring": scan.rings, "time": scan.times}
+    optional = {"intensity": scan.intensity, "ring": scan.rings, "time": scan.times, "label": scan.labels}
     columns |= {name: values for name, values in optional.items() if values is not None}
     is_dense = bool(np.isfinite(scan.points).all())
     return _cloud(store, header(store, scan.stamp_ns, frame, scan.index), columns, is_dense)

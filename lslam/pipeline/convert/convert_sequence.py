@@ -23,6 +23,7 @@ from lslam.io.formats.kitti_layout import PER_POINT, POINTS, in_camera, write_ca
 from lslam.io.formats.sequence_toml import FILE_NAME, FRAMES, SequenceInfo, sequence_toml_text, write_sequence_toml
 from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv
 from lslam.io.formats.trajectory_files import write_kitti, write_tum
+from lslam.io.readers.labels import labelled
 from lslam.odometry.frontend.register_scans import sweep_of
 from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
 from lslam.pipeline.convert.bag_writer import BagWriter
@@ -72,7 +73,7 @@ def convert_sequence(
     OutputExistsError, OutputError : as named. UsageError : `out` or `lidars` does not suit. InputError : no scan can be read.
     """
     check_output(kind, out, is_zstd, overwrite)
-    source = _Source(sequence, trajectory, on_scan)
+    source = _Source(labelled(sequence), trajectory, on_scan)
     if lidars != "merged":
         if kind == "kitti" or trajectory is not None or not isinstance(sequence, MergedLidars):
             raise UsageError(
@@ -248,7 +249,7 @@ def _write_kitti(source: _Source, out: Path) -> None:
         inside.mkdir(parents=True)
     stamps = []
     for number, scan in enumerate(source.scans()):
-        write_scan(folder, number, scan.points, scan.intensity, scan.times, scan.rings)
+        write_scan(folder, number, scan.points, scan.intensity, scan.times, scan.rings, scan.labels)
         stamps.append(scan.stamp_ns)
     _write_sides(source, folder, out / "poses", np.array(stamps, np.int64))
 

@@ -208,6 +208,6 @@ def _joined(scan: Scan, parts: list[Scan], is_timed: bool) -> Scan:
 
     return replace(
         scan, points=np.concatenate([part.points for part in full]), intensity=column("intensity"), rings=column("rings"),
-        times=column("times") if is_timed else None, lidars=column("lidars"),
+        labels=column("labels"), times=column("times") if is_timed else None, lidars=column("lidars"),
         fault="; ".join(filter(None, dict.fromkeys(part.fault for part in full))),
     )  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.core.errors import InputError
+from lslam.core.labels import table_of
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.core.types.sequence import Sequence, SequenceView, readable
 from lslam.registration.preprocessing.rings import RingRule, decide_rings
@@ -76,6 +77,24 @@ class Ringed(SequenceView):
         scan = replace(scan, rings=rings)
         has_ring = rings != NO_RING
         return scan if has_ring.all() else scan.select(has_ring)
+
+
+class WithoutClasses(SequenceView):
+    """A sequence whose scans lack the points of some classes; all else is the sequence's own."""
+
+    def __init__(self, whole: Sequence, classes: Iterable[str]) -> None:
+        names = tuple(classes)
+        super().__init__(whole, notes=[*whole.notes, f"points of {', '.join(names)} are left out"])
+        self._is_dropped = table_of(names)
+
+    def scan(self, index: int) -> Scan:
+        """Read scan `index` and leave points out; one without labels stays whole and says so. Raises InputError as before."""
+        scan = self.whole.scan(index)
+        if scan.labels is None:
+            why = "its points have no labels and none is left out"
+            return replace(scan, fault="; ".join(filter(None, (scan.fault, why)))) if len(scan) else scan
+        dropped = self._is_dropped[scan.labels]
+        return scan.select(~dropped) if dropped.any() else scan
 
 
 def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:
