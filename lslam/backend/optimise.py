@@ -26,7 +26,7 @@ from lslam.backend.final_checks import fixes_against_points, redundancy, thicken
 from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
 from lslam.backend.graph.consistency import Drift, drift_of
 from lslam.backend.graph.drift import tilt_factor
-from lslam.backend.graph.odometry_constraints import bent, fitness_covariance, fitness_score, odometry_constraints
+from lslam.backend.graph.odometry_constraints import IDENTITY, bent, fitness_covariance, fitness_score, odometry_constraints
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore
@@ -211,6 +211,8 @@ def _graph(given: Given, inertial: InertialChain | None) -> PoseGraph:
     store, config, results, candidates = given.store, given.config, given.results, given.candidates
     loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     fitness = None
+    if config.graph.information == "identity":
+        loops = [replace(loop, covariance=IDENTITY) for loop in loops]
     if config.graph.information == "fitness":
         loops = [
             replace(loop, covariance=fitness_covariance(_fitness(store, loop.a, loop.b, loop.T_a_b), config.graph))

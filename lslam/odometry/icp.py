@@ -62,7 +62,7 @@ class Icp(MapMethod):
 
     def __init__(self, registration: Registration) -> None:
         c = registration.config
-        super().__init__(registration, is_scan_to_scan=c.target == "scan")
+        super().__init__(registration, is_scan_to_scan=c.target in ("scan", "sample"))
         # Point to plane, on a map of many scans.
         self.follows_course = registration.preprocess.deskew and c.target == "map" and c.residual in (None, "plane")
 

@@ -295,6 +295,7 @@ def match_buildings(
     if not len(match.walls):
         return found
     sigma = np.array([config.building_sigma, config.building_sigma, np.radians(config.building_sigma_deg)])
+    own = config.of_one_building
     for number in osm.near(pose[:2] - shift, config.use_radius).tolist():
         middle = osm.buildings[number].middle
         walls = osm.walls[osm.owners == number] - middle
@@ -302,7 +303,7 @@ def match_buildings(
             continue
         prior = se2.relative(pose, np.append(middle + shift, 0.0))
         # By coverage, since most buildings are seen in part.
-        one = match_walls(walls, match.walls, prior, sigma, config, by_coverage=True)
+        one = match_walls(walls, match.walls, prior, sigma, own, by_coverage=True)
         if one is None:
             continue
         reason = "another place fits nearly as well" if one.is_ambiguous else ""

@@ -93,10 +93,10 @@ def _check_imu(config: Config) -> None:
             "graph.gravity = false leaves gravity out of the pose graph, lio_sam.graph_imu brings it in: set both to false, or "
             "drop the first"
         )
-    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and config.imu.velocity == "integrated":
+    if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and config.imu.velocity != "registration":
         raise UsageError(
-            "imu.estimate_offset and imu.estimate_extrinsics learn from registered turns, of which imu.velocity = 'integrated' "
-            "takes none: drop them, or imu.velocity"
+            f"imu.estimate_offset and imu.estimate_extrinsics learn from registered turns, of which imu.velocity = "
+            f"{config.imu.velocity!r} takes none: drop them, or imu.velocity"
         )
     if (config.imu.estimate_offset or config.imu.estimate_extrinsics) and method in FIXED_DEVICE:
         raise UsageError(

@@ -13,7 +13,7 @@ import numpy as np
 from lslam.backend.georeferencing import require_gnss
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.manual import read_manual
-from lslam.core.config import Config
+from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry import se3
 from lslam.core.stopping import asking
@@ -168,12 +168,20 @@ def announce(job: PreparedRun) -> None:
     deskew, is_distorted = describe_deskew(sequence, config, sweep is not None, job.odometry.deskew)
     job.manifest.deskew = deskew
     job.manifest.pose_time = (sweep or Span()).instant
-    if not config.imu.use and (unused := [f"imu.{key}" for key in config.imu.changed()]):
+    if not config.imu.use and (unused := _set_by_hand(config)):
         log.warning("%s: without effect, this run has no IMU; --imu gives it one", ", ".join(unused))
     if is_distorted:
         log.warning("%s", deskew)
     else:
         log.info("deskew: %s", deskew)
+
+
+def _set_by_hand(config: Config) -> list[str]:
+    """Keys of the IMU that are neither the defaults' nor the preset's."""
+    keys, preset = config.imu.changed(), config.odometry.preset
+    if keys and preset:
+        keys = config.imu.changed(load_config(None, [f"odometry.preset={preset}"], {}).imu)
+    return [f"imu.{key}" for key in keys]
 
 
 @contextmanager

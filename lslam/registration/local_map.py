@@ -113,6 +113,16 @@ class LastScan(MapScans):
         target.insert(points.map_points, points.source, T_world_lidar)
 
 
+class LastSample(MapScans):
+    """The source points of the last scan alone; of the first scan all points (Girolimetto, listings 4.3 and 4.5)."""
+
+    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
+        """Replace the map."""
+        sample = points.source.astype(np.float32) if len(target) else points.map_points
+        target.clear()
+        target.insert(sample, points.source, T_world_lidar)
+
+
 class LastKeyframes(MapScans):
     """The last `count` keyframes, a new one where the sensor has moved `move`, m, or turned `turn`, rad, since the newest."""
 
@@ -148,4 +158,5 @@ def make_map_scans(config: RegistrationConfig) -> MapScans:
         raise UsageError("registration.target = submap is for methods: lslam run --method dlo")
     if config.target == "keyframe":
         return LastKeyframes(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
-    return LastScan() if config.target == "scan" else AllScans()
+    kinds: dict[str, type[MapScans]] = {"scan": LastScan, "sample": LastSample}
+    return kinds.get(config.target, AllScans)()

@@ -80,7 +80,8 @@ class VoxelTarget(MapAlignment, Target):
         if not self.kind.needs_covariance or points.covariance is not None:
             return points
         c = self.config
-        covariance = source_covariance(points.source, points.map_points, c.sigma**2, c.neighbourhood)
+        around = points.source.astype(np.float32) if c.target == "sample" else points.map_points
+        covariance = source_covariance(points.source, around, c.sigma**2, c.neighbourhood)
         return replace(points, covariance=covariance)
 
     def align(

@@ -324,6 +324,13 @@ def test_one_building_is_matched_with_the_walls_seen_of_it(shift: tuple[float, f
     assert match.distance == pytest.approx((42 - 21) / 42 * 2.0, abs=0.02), "two walls have no partner"
 
 
+def test_one_building_has_weights_of_its_own() -> None:
+    config = OsmConfig(distance_weight=0.7, building_weights=(1.5, 1.5, 0.1), building_max_distance=1.0)
+    own = config.of_one_building
+    assert (own.distance_weight, own.coverage_weight, own.translation_weight, own.max_distance) == (1.5, 1.5, 0.1, 1.0)
+    assert OsmConfig(distance_weight=0.7).of_one_building == OsmConfig(distance_weight=0.7)
+
+
 def reference(source: Floats, target: Floats, farthest: float, by_coverage: bool) -> tuple[float, float]:
     """Mean distance and coverage by the words of Del Tufo, wall by wall."""
     distance = covered = total = 0.0

@@ -16,6 +16,7 @@ from stub_sequences import sample
 
 import lslam
 from lslam.core.config import Config, load_config
+from lslam.core.config.config import known_presets
 from lslam.core.errors import InterruptedRunError
 from lslam.core.types.sequence import StatedTimes
 from lslam.core.types.warned import MOST_ALIKE, hearing, warnings_so_far
@@ -104,6 +105,15 @@ def test_keys_of_the_imu_in_a_run_without_one_are_warned_of() -> None:
     given = config_of("imu.estimate_offset=true", "imu.gyro_noise=0.001", "imu.start_s=5.0")
     (sentence,) = lslam.run(sample(4), given).record.manifest["problems"]
     assert sentence.startswith("imu.gyro_noise, imu.estimate_offset: without effect")
+
+
+@pytest.mark.parametrize("preset", sorted(known_presets()))
+def test_keys_that_a_preset_set_are_not_warned_of(preset: str) -> None:
+    """Those set beside it are; of values as the preset has them nobody can tell who set them."""
+    plain, own = (config_of(f"odometry.preset={preset}", *more) for more in ([], ["imu.gyro_noise=0.001"]))
+    said = [lslam.run(sample(4), config).record.manifest["problems"] for config in (plain, own)]
+    assert not [sentence for sentence in said[0] if "without effect" in sentence]
+    assert [sentence for sentence in said[1] if sentence.startswith("imu.gyro_noise: without effect")]
 
 
 def test_warnings_before_a_run_are_problems_of_the_run(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import BREADTH, LocalMap
+from lslam.registration.local_map import BREADTH, LocalMap, make_map_scans
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.simulation.scenarios import simulate
@@ -44,6 +44,21 @@ def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> Non
         expected.insert(points.source.astype(np.float32), T)
         assert_same(level, expected)
     assert len(target) == len(fine) > len(target.coarser[0]) > len(target.coarser[2]) > 0
+
+
+def test_the_target_is_the_sample_of_the_scan_before_and_at_first_the_whole_scan() -> None:
+    """Girolimetto, listings 4.3 and 4.5."""
+    scans, target = make_map_scans(RegistrationConfig(target="sample")), new_map()
+    config = PreprocessConfig(downsample="random", random_share=0.3)
+    cloud = room(np.random.default_rng(0)).astype(np.float32)
+    first, second = (prepare_points(cloud, config, k) for k in range(2))
+    for points, expected in ((first, first.map_points), (second, second.source)):
+        scans.enter(target, points, np.eye(4))
+        alone = new_map()
+        alone.insert(expected.astype(np.float32), points.source, np.eye(4))
+        kept, own = target.fine, alone.fine
+        np.testing.assert_array_equal(kept.keys, own.keys)
+        np.testing.assert_array_equal(kept.planes[kept.keys >= 0, :3], own.planes[own.keys >= 0, :3])
 
 
 def test_all_levels_are_cleared_and_restored() -> None:

@@ -21,6 +21,8 @@ from lslam.core.types.trajectory import Keyframe
 # m and rad; least sigmas of a step when a method states no covariance, and those of one into another frame.
 LEAST_M, LEAST_RAD = 1e-3, 1e-4
 FREE_M, FREE_RAD = 1e3, np.pi
+# m2 and rad2, of every constraint by `graph.information = "identity"`.
+IDENTITY = np.eye(6)
 
 
 def odometry_constraints(
@@ -39,7 +41,9 @@ def odometry_constraints(
     for k, (before, after) in enumerate(pairwise(keyframes)):
         a, b = results[before.scan], results[after.scan]
         T = se3.relative(a.T_world_lidar, b.T_world_lidar)
-        if fitness is not None:
+        if config.information == "identity" and a.frame == b.frame:
+            covariance = IDENTITY
+        elif fitness is not None:
             covariance = fitness_covariance(fitness[k], config)
         else:
             grown = growth(a, b, after.distance - before.distance, config)

@@ -44,7 +44,8 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     reasons = ["" if loop.is_held else reason for loop, reason in zip(graph.loops, reasons, strict=True)]
     stages = [LoopStage.CONSISTENCY if reason else LoopStage.GRAPH for reason in reasons]
     accepted = [i for i, reason in enumerate(reasons) if not reason]
-    drift = 0.0 if graph.is_rigid else max(drift_factor(graph, [graph.loops[i] for i in accepted], config), graph.walk)
+    is_as_given = graph.is_rigid or config.information == "identity"
+    drift = 0.0 if is_as_given else max(drift_factor(graph, [graph.loops[i] for i in accepted], config), graph.walk)
     accepted = [i for i in accepted if not graph.loops[i].is_held]
     loops, fixes = [graph.loops[i] for i in accepted], [fix for fix in graph.fixes if not fix.is_held]
     graph = replace(graph, odometry=with_drift(graph, drift, config))

@@ -132,10 +132,10 @@ class GraphConfig(Section):
     planar: bool = Field(
         False, description="a graph of two dimensions: odometry's height, roll and pitch stay as they are"
     )
-    information: Literal["registration", "fitness"] = Field(
+    information: Literal["registration", "fitness", "identity"] = Field(
         "registration",
-        description="covariances of constraints: of the registrations, or from how far the points of one keyframe lie from the "
-        "nearest ones of the other (hdl_graph_slam)",
+        description="covariances of constraints: of the registrations, from how far the points of one keyframe lie from the "
+        "nearest ones of the other (hdl_graph_slam), or 1 m2 and 1 rad2 whatever was found (Girolimetto)",
     )
     fitness_sigma_m: tuple[float, float] = Field((0.1, 5.0), description="m; sigma of a perfect fit and of a bad one")
     fitness_sigma_rad: tuple[float, float] = Field((0.05, 0.2), description="rad; likewise of rotation")
@@ -238,6 +238,12 @@ class OsmConfig(Section):
     distance_weight: float = Field(1.0, ge=0, description="A of equation 3.1")
     coverage_weight: float = Field(1.0, ge=0, description="B of equation 3.2")
     translation_weight: float = Field(0.1, ge=0, description="C of equation 3.3, of the way to the edge of the window")
+    building_weights: tuple[float, float, float] | None = Field(
+        None, description="A, B and C where one building is matched; absent: as where all are"
+    )
+    building_max_distance: float | None = Field(
+        None, gt=0, description="m; likewise in place of max_distance; absent: the same"
+    )
     line_weight: float = Field(
         0.25, gt=0, le=1, description="information of a match of parallel walls only, against one with corners"
     )
@@ -247,6 +253,15 @@ class OsmConfig(Section):
     rival_margin: float = Field(
         15.0, ge=0, description="another pose with so little less fitness makes a match a guess"
     )
+
+    @property
+    def of_one_building(self) -> OsmConfig:
+        """The section as the match of a single building takes it: `building_weights`, `building_max_distance`."""
+        keys = ("distance_weight", "coverage_weight", "translation_weight")
+        own: dict[str, float] = dict(zip(keys, self.building_weights or (), strict=False))
+        if self.building_max_distance is not None:
+            own["max_distance"] = self.building_max_distance
+        return self.model_copy(update=own)
 
     @model_validator(mode="after")
     def _check(self) -> OsmConfig:

@@ -46,10 +46,10 @@ class RegistrationConfig(Section):
         description="`gicp` and `vgicp`: a point's surface is that of its scan in the voxel around, where several rings make "
         "one, or of its twenty nearest neighbours, as in the paper",
     )
-    target: Literal["map", "submap", "keyframe", "scan"] = Field(
+    target: Literal["map", "submap", "keyframe", "scan", "sample"] = Field(
         "map",
-        description="registered against a map of all scans near by, of the keyframes around, of the last keyframes, or "
-        "the last scan alone",
+        description="registered against a map of all scans near by, of the keyframes around, of the last keyframes, of the "
+        "last scan alone, or of that scan's source points alone",
     )
     keyframes: int = Field(10, ge=1, description="`target = keyframe`: how many")
     keyframe_m: float = Field(2.0, gt=0, description="m; so far from the newest of them a new one is made")
@@ -255,10 +255,11 @@ class ImuConfig(Section):
     """Whether and how the IMU predicts the motion between scans and within them."""
 
     use: bool = Field(False, description="predict and deskew with the IMU; `--imu`")
-    velocity: Literal["registration", "integrated"] = Field(
+    velocity: Literal["registration", "along-x", "integrated"] = Field(
         "registration",
-        description="where a prediction's velocity comes from: what registration found, or integration alone since the "
-        "start (Girolimetto, methods 2 and 1)",
+        description="where a prediction's velocity comes from: a filter that registration corrects; the way that registration "
+        "found, taken to lead along the x axis of a LiDAR that is level (Girolimetto, method 2); integration alone since the "
+        "start (method 1)",
     )
     weigh: bool = Field(
         True,
@@ -296,7 +297,7 @@ class ImuConfig(Section):
         description="estimate the rotation of T_lidar_imu, from the given one: by turns as they come, about what was turned",
     )
     inlier_distance: float | None = Field(
-        None, gt=0, description="m; takes the place of registration.inlier_distance when the IMU is used"
+        None, gt=0, description="m; takes the place of registration.inlier_distance and inlier_ratio when the IMU is used"
     )
     start_s: float = Field(
         5.0, ge=0.5, le=60, description="s; the start, which is registered once without the IMU, to check and align it"

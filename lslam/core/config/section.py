@@ -10,9 +10,11 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
-    def changed(self) -> list[str]:
-        """Keys whose values differ from the defaults, in the order of the section."""
-        return [key for key, field in type(self).model_fields.items() if getattr(self, key) != field.get_default()]
+    def changed(self, since: Section | None = None) -> list[str]:
+        """Keys whose values differ from those of `since`, None: from the defaults, in the order of the section."""
+        fields = type(self).model_fields
+        before = {key: field.get_default() if since is None else getattr(since, key) for key, field in fields.items()}
+        return [key for key in fields if getattr(self, key) != before[key]]
 
     def require_order(self, low: str, high: str) -> None:
         """Raise ValueError unless the value of key `low` lies below that of `high`."""

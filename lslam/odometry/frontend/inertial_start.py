@@ -140,10 +140,12 @@ def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, config: Conf
 
 
 def with_imu_settings(config: Config) -> Config:
-    """The configuration of a run that the IMU predicts: better priors want a narrower search."""
+    """The configuration of a run that the IMU predicts: better priors want a narrower search, which trims by itself."""
     if not config.imu.use or config.imu.inlier_distance is None:
         return config
-    narrow = config.registration.model_copy(update={"inlier_distance": config.imu.inlier_distance})
+    narrow = config.registration.model_copy(
+        update={"inlier_distance": config.imu.inlier_distance, "inlier_ratio": 1.0}
+    )
     return config.model_copy(update={"registration": narrow})
 
 
@@ -277,7 +279,7 @@ def mounting_problem(motion: InertialMotion) -> str:
     if gyroscope.is_mounted or angle < LEAST_TURN_RAD or angle < SIGMAS * sigma:
         return ""
     first = "" if motion.HAS_DEVICE else "--method fast-lio2 "
-    if motion.config.velocity == "integrated":
+    if motion.config.velocity != "registration":
         first = "--set imu.velocity=registration "
     cause = "correct T_lidar_imu, or have it estimated"
     if not _is_turned(gyroscope):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -68,6 +69,11 @@ class InertialMotion(Stateful):
         self._errors: list[tuple[float, float]] = []
 
     @property
+    def _is_filter(self) -> bool:
+        """Whether it estimates at all: the rules of Girolimetto take what they are given."""
+        return self.config.velocity == "registration"
+
+    @property
     def is_known(self) -> bool:
         """Whether there is a velocity: from the start on, unless the IMU is silent there."""
         return self.coasting.is_known or self.is_inertial
@@ -108,7 +114,7 @@ class InertialMotion(Stateful):
         weighed: the scan before was deskewed without the IMU, and is wrong by more than its covariance says. prior : of
         the registration, says how the sweep moved
         """
-        C, is_off = result.covariance, not self.config.weigh or self.config.velocity == "integrated"
+        C, is_off = result.covariance, not (self.config.weigh and self._is_filter)
         if C is None or not result.is_accepted or is_off or self._has_gap:
             return result
         middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
@@ -195,7 +201,7 @@ class InertialMotion(Stateful):
 
         The filter knows gravity in a world that registration lets drift; a LiDAR that turned with it sees the true one.
         """
-        if self.refusal or self._has_gap or self._instant_ns is None or self.config.velocity == "integrated":
+        if self.refusal or self._has_gap or self._instant_ns is None or not self._is_filter:
             return None
         direction, sigma = self.estimate.down
         return GravityDirection(pose[:3, :3].T @ direction, sigma)
@@ -254,6 +260,8 @@ class InertialMotion(Stateful):
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
         if self.config.velocity == "integrated":
             return self._carried(instant_ns)
+        if self.config.velocity == "along-x":
+            return self._level_along_x(instant_ns, middle)
         a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
         step = self._since_last(instant_ns)
         if self._taught is not None and self._taught[0] == instant_ns:
@@ -261,6 +269,13 @@ class InertialMotion(Stateful):
         else:
             gyroscope, noise = self.estimate.taught(step, a[:3, :3], b[:3, :3]), None
         return self.estimate.corrected(self.imu, step, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise)
+
+    def _level_along_x(self, instant_ns: int, middle: Floats) -> ImuEstimate:
+        """The estimate of a LiDAR that neither slips sideways nor tilts: the speed is the way since the last scan over time."""
+        assert self._instant_ns is not None
+        way = float(np.linalg.norm(middle[:3, 3] - self._pose[:3, 3]))
+        speed = way / (1e-9 * (instant_ns - self._instant_ns))
+        return replace(self.estimate, velocity=speed * middle[:3, 0], gravity=-GRAVITY * middle[:3, 2])
 
     def _carried(self, instant_ns: int) -> ImuEstimate:
         return self.estimate.carried(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
@@ -300,7 +315,7 @@ class InertialMotion(Stateful):
         else:
             mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, np.zeros(1)).pose
         self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
-        if len(self._errors) < self.JUDGED or self.config.velocity == "integrated":
+        if len(self._errors) < self.JUDGED or not self._is_filter:
             return
         newest = np.sort(np.array(self._errors[-self.JUDGED :]), axis=0)
         own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from graph_builders import STEP_SIGMAS, measured, truth
@@ -49,6 +51,17 @@ def test_growth_is_what_the_steps_between_added() -> None:
     np.testing.assert_allclose(
         growth(results[20], results[29], 9.0, GraphConfig()), direct.covariance - OWN, atol=1e-12
     )
+
+
+def test_the_identity_is_the_covariance_of_each_step_but_one_into_another_frame() -> None:
+    """Girolimetto, listing 4.5, whatever the steps and what registration says of itself."""
+    results = results_of(POSES)
+    results[40:] = [replace(result, frame=1) for result in results[40:]]
+    found = odometry_constraints(keyframes_of(results), results, GraphConfig(information="identity"))
+    sigmas = [float(np.sqrt(c.covariance[0, 0])) for c in found]
+    assert [k for k, sigma in enumerate(sigmas) if sigma > 100] == [7]
+    for constraint in found[:7] + found[8:]:
+        np.testing.assert_array_equal(constraint.covariance, np.eye(6))
 
 
 def test_constraints_are_in_the_axes_of_their_first_keyframe() -> None:

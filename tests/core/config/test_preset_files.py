@@ -114,23 +114,6 @@ def test_every_shipped_preset_loads_and_says_what_it_is(name: str) -> None:
             assert getattr(getattr(config, section), key) == (tuple(value) if isinstance(value, list) else value)
 
 
-def test_the_first_thesis_presets_are_what_it_prints() -> None:
-    icp, loam, loam_map = (load(f"odometry.preset={name}") for name in ("thesis-icp", "thesis-loam", "thesis-loam-map"))
-    for config, method, far in ((icp, "gicp", 70.0), (loam, "loam-odom", 50.0), (loam_map, "loam", 50.0)):
-        p = config.preprocess
-        assert (p.range_shape, p.range_min, p.range_max) == ("cylinder", 2.0, far)
-        assert (config.input.skip_frames, config.odometry.method) == (4, method)
-    assert (icp.registration.target, icp.registration.inlier_ratio) == ("scan", 0.2)
-    assert (icp.preprocess.downsample, icp.preprocess.random_share) == ("random", 0.3)
-    for config in (loam, loam_map):
-        feature = config.loam
-        assert (feature.regions, feature.max_planar_points, feature.grid_step) == (6, 8, 1.5)
-        assert feature.matching == "one-to-many"
-    assert loam_map.loam.feature_map_voxel == 1.5
-    printed = [(c.loops.radius, c.loops.max_rmse, c.loops.max_iterations) for c in (icp, loam, loam_map)]
-    assert printed == [(8.0, 0.8, 50), (5.0, 0.9, 50), (3.0, 0.6, 50)]
-
-
 def test_methods_of_the_presets_exist() -> None:
     from lslam.odometry import create_odometry
 

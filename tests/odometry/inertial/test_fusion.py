@@ -16,6 +16,7 @@ from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.odometry.inertial.imu_estimate import GRAVITY
 from lslam.odometry.inertial.initialise import FirstPoses, start
 from lslam.simulation.scenarios import SimulatedDrive
 
@@ -188,9 +189,9 @@ def test_wrong_extrinsics_are_refused_during_the_run() -> None:
     assert not right.refusal
 
 
-@pytest.mark.parametrize("velocity", ["registration", "integrated"])
+@pytest.mark.parametrize("velocity", ["registration", "along-x", "integrated"])
 def test_an_imu_is_refused_after_thirty_scans_by_prior_errors(velocity: str) -> None:
-    """Not by fewer; constant velocity has something to say from the third on. An integrated speed is the user's wish."""
+    """Not by fewer; constant velocity has something to say from the third on. Another rule is the user's wish."""
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
     motion, refused = motion_of(drive, T=wrong, velocity=velocity), []
@@ -256,6 +257,16 @@ def test_velocity_from_registration_is_more_accurate_than_integrated_velocity() 
     by_registration, _ = errors(motion_of(drive), drive)
     integrated, _ = errors(motion_of(drive, velocity="integrated"), drive)
     assert integrated[-20:, 0].mean() > 5 * by_registration[-20:, 0].mean()
+
+
+def test_the_speed_along_x_is_the_way_since_the_last_scan_over_time() -> None:
+    """Girolimetto, listing 5.1: whatever the direction of the way, and in a LiDAR that is level whatever it is."""
+    motion = motion_of(drone(), velocity="along-x")
+    tilted = se3.make(so3.from_euler_rpy(np.array([0.2, -0.1, 1.0])), np.array([0.3, 0.4, 0.0]))
+    for stamp_ns, pose in ((0, np.eye(4)), (100_000_000, tilted)):
+        motion.correct(stamp_ns, pose, motion.sweep(stamp_ns, Span()))
+    np.testing.assert_allclose(motion.estimate.velocity, 5.0 * tilted[:3, 0], atol=1e-9)
+    np.testing.assert_allclose(motion.estimate.gravity, -GRAVITY * tilted[:3, 2], atol=1e-9)
 
 
 def test_the_lever_arm_of_the_imu_is_part_of_the_prediction() -> None:
