@@ -81,7 +81,9 @@ class IcpSvd(Traits, Stateful):
         result = judged(scan, alignment, prior.pose, c, {})
         self._failed = 0 if result.status == "ok" else self._failed + 1
         if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
-            self._last = Partners(prepared.map_points.astype(np.float64), result.T_world_lidar)
+            is_sampled = c.target == "sample" and self._last is not None
+            points = prepared.source if is_sampled else prepared.map_points.astype(np.float64)
+            self._last = Partners(points, result.T_world_lidar)
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)
         return result
 

@@ -114,7 +114,7 @@ def _check_heeded(config: Config) -> None:
         part, _, key = name.partition(".")
         section = getattr(config, part)
         value, default = getattr(section, key), type(section).model_fields[key].default
-        is_so_anyway = key == "target" and value == "scan" and method == "icp-svd"
+        is_so_anyway = key == "target" and value in ("scan", "sample") and method == "icp-svd"
         if value != default and method not in methods and not is_so_anyway:
             preset = config.odometry.preset
             if preset and read_preset(preset).get(part, {}).get(key) == value:

@@ -154,3 +154,18 @@ def test_the_options_reach_the_method() -> None:
     assert result(max_iterations=2).iterations == 2
     assert result(inlier_ratio=0.5).inliers <= 0.5 * result().source_points + 1
     assert result(inlier_distance=0.05).rmse <= 0.05 < result(inlier_distance=3.0).rmse
+
+
+@pytest.mark.parametrize("target", ["scan", "sample"])
+def test_the_target_is_the_whole_scan_or_its_sample_but_at_first(target: str) -> None:
+    cloud = room(np.random.default_rng(4), 1500)
+    preprocess = {"downsample": "random", "random_share": 0.3}
+    method = create(Config.model_validate({"registration": {"target": target}, "preprocess": preprocess}))
+    sizes = []
+    for index in range(2):
+        scan = Scan(cloud, index, index)
+        prepared = method.prepare(scan)
+        method.register(scan, prepared, MotionPrior.at_once(np.eye(4)))
+        assert method._last is not None
+        sizes.append(len(method._last.points))
+    assert sizes == [len(prepared.map_points), len(prepared.source if target == "sample" else prepared.map_points)]
