@@ -26,7 +26,13 @@ from lslam.backend.final_checks import fixes_against_points, redundancy, thicken
 from lslam.backend.georeferencing import Placement, final_fixes, on_earth, place
 from lslam.backend.graph.consistency import Drift, drift_of
 from lslam.backend.graph.drift import tilt_factor
-from lslam.backend.graph.odometry_constraints import IDENTITY, bent, fitness_covariance, fitness_score, odometry_constraints
+from lslam.backend.graph.odometry_constraints import (
+    IDENTITY,
+    bent,
+    fitness_covariance,
+    fitness_score,
+    odometry_constraints,
+)
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore

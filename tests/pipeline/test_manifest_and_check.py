@@ -159,7 +159,9 @@ def test_what_a_method_overrides_is_refused_and_what_it_does_anyway_is_not(
 
 def test_what_a_preset_says_and_its_method_only_heeds_is_said_to_be_the_presets() -> None:
     preset = "odometry.preset=thesis-icp"
-    with pytest.raises(UsageError, match=r"preset thesis-icp sets registration\.target = 'sample', which .* method loam"):
+    with pytest.raises(
+        UsageError, match=r"preset thesis-icp sets registration\.target = 'sample', which .* method loam"
+    ):
         check_config(load_config(None, [preset, "odometry.method=loam"], {}))
     own = [preset, "odometry.method=loam", "registration.target=keyframe"]
     with pytest.raises(UsageError, match=r"^registration\.target = 'keyframe' does nothing with method loam"):

@@ -297,7 +297,9 @@ class ImuConfig(Section):
         description="estimate the rotation of T_lidar_imu, from the given one: by turns as they come, about what was turned",
     )
     inlier_distance: float | None = Field(
-        None, gt=0, description="m; takes the place of registration.inlier_distance and inlier_ratio when the IMU is used"
+        None,
+        gt=0,
+        description="m; takes the place of registration.inlier_distance and inlier_ratio when the IMU is used",
     )
     start_s: float = Field(
         5.0, ge=0.5, le=60, description="s; the start, which is registered once without the IMU, to check and align it"

@@ -143,9 +143,7 @@ def with_imu_settings(config: Config) -> Config:
     """The configuration of a run that the IMU predicts: better priors want a narrower search, which trims by itself."""
     if not config.imu.use or config.imu.inlier_distance is None:
         return config
-    narrow = config.registration.model_copy(
-        update={"inlier_distance": config.imu.inlier_distance, "inlier_ratio": 1.0}
-    )
+    narrow = config.registration.model_copy(update={"inlier_distance": config.imu.inlier_distance, "inlier_ratio": 1.0})
     return config.model_copy(update={"registration": narrow})
 
 

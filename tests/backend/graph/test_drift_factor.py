@@ -50,6 +50,12 @@ def test_drift_is_estimated_from_accurate_and_from_noisy_fixes() -> None:
         assert drift_factor(fixed(seed, 5.0, 0.1), [], CONFIG) > 1.0
 
 
+def test_by_the_identity_covariances_stay_as_they_are_given() -> None:
+    graph = graph_of(REAL, 40, 0, np.random.default_rng(0), 2, believed=1e-4)
+    assert optimise(graph, CONFIG).drift > 0
+    assert optimise(graph, GraphConfig(information="identity")).drift == 0
+
+
 @pytest.mark.parametrize("factor", [0.0, 0.25, 1.0, 4.0])
 def test_drift_is_a_walk_beside_what_odometry_says(factor: float) -> None:
     """A hundred steps of a metre: 2 % per root metre are 20 cm, half a degree per hundred metres 0.05 deg, at factor 1."""

@@ -41,8 +41,13 @@ def turned_motion(config: Config) -> InertialMotion:
     return motion_of(InertialStart(imu, np.eye(4), estimate, 0.0, True, True, [], []), config)
 
 
-@pytest.mark.parametrize("settings", [*((f"odometry.method={name}",) for name in ("icp", *TIGHTLY_COUPLED)),
-                                      *(("odometry.method=icp", f"imu.velocity={rule}") for rule in ("along-x", "integrated"))])  # fmt: skip
+@pytest.mark.parametrize(
+    "settings",
+    [
+        *((f"odometry.method={name}",) for name in ("icp", *TIGHTLY_COUPLED)),
+        *(("odometry.method=icp", f"imu.velocity={rule}") for rule in ("along-x", "integrated")),
+    ],
+)
 def test_what_is_advised_against_a_turned_imu_is_taken(settings: tuple[str, ...]) -> None:
     said = mounting_problem(turned_motion(config_of(*settings)))
     assert "3.0 deg (sigma 0.1) beside that of the scans: correct T_lidar_imu, or" in said
