@@ -8,24 +8,8 @@ from lslam.core.config.odometry import RecoveryConfig
 from lslam.odometry.feature_solver import remap_solution
 from lslam.odometry.feature_target import MIN_FEATURES
 from lslam.registration.attempt import Attempt, Policy
-from lslam.registration.policies import AtRest
-from lslam.registration.robust import is_more
+from lslam.registration.policies import policies_of
 from lslam.registration.solver import RegistrationResult
-
-
-class CoarseStart:
-    """The less planar points on coarse planes catch a scan from metres off, and the features go on from there."""
-
-    def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
-        """Acts on results that fail or correct their prior by much, and at the start, where its own stands unless it is worse."""
-        is_starting = attempt.history.starting > 0
-        if not is_starting and result.ok and attempt.is_small(result):
-            return result
-        coarse: RegistrationResult = attempt.target.captured(attempt)
-        if not (result.ok and coarse.ok):
-            return coarse if coarse.ok else result
-        is_worse = is_more(result.inliers, coarse.inliers) if is_starting else result.inliers >= coarse.inliers
-        return result if is_worse else coarse
 
 
 class LessPlanar:
@@ -89,10 +73,6 @@ class AllPointsInstead:
 
 def feature_policies(config: RecoveryConfig) -> tuple[Policy, ...]:
     """Those that a configuration switches on, in the order in which they are tried."""
-    return (
-        *([CoarseStart()] if config.coarse_to_fine else []),
-        *([LessPlanar()] if config.less_planar else []),
-        SolutionRemapping(),
-        *([AllPointsInstead()] if config.fallback == "all-points" else []),
-        *([AtRest()] if config.at_rest else []),
-    )
+    own = [LessPlanar()] if config.less_planar else []
+    last = [AllPointsInstead()] if config.fallback == "all-points" else []
+    return policies_of(config, of_features=(*own, SolutionRemapping(), *last))

@@ -1,40 +1,51 @@
-"""The recovery policies of points that a configuration switches on, in the order in which they are tried."""
+"""The recovery policies that a configuration switches on, in the order in which they are tried."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.registration.attempt import Attempt, Policy
+from lslam.registration.robust import is_more
 from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import StartSearch
 
 
+@dataclass(frozen=True)
 class CoarseToFine:
     """Aligns with the coarse planes, annealed slowly, then with the fine ones; of two results the larger consensus is taken.
 
     Fine registration alone loses a start above 0.7 m per scan: its kernel opens no wider than its voxels.
+
+    of_features : features are few: their share says nothing, and at the start they need a consensus that is larger by two sigma
     """
 
+    of_features: bool = False
     name = "coarse-to-fine"
 
     def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
         """Acts while the speed is unknown, and on results that fail, correct their prior by much or agree less than usual."""
         usual, is_started = attempt.history.agreement, attempt.history.starting == 0
-        is_certain = result.ok and attempt.is_small(result)
-        if is_certain and is_started and not usual.is_less(result.agreement):
+        is_certain = result.ok and attempt.is_small(result) and is_started
+        if is_certain and (self.of_features or not usual.is_less(result.agreement)):
             return result
         coarse: RegistrationResult = attempt.target.captured(attempt)
         iterations = result.iterations + coarse.iterations
         # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it.
-        is_consensus = result.ok and (result.converged or is_started)
-        is_better = coarse.ok and (not is_consensus or coarse.inliers > result.inliers)
-        if is_certain and is_started:
+        is_consensus = result.ok and (self.of_features or result.converged or is_started)
+        is_larger = coarse.inliers > result.inliers
+        if self.of_features and not is_started:
+            is_larger = not is_more(result.inliers, coarse.inliers)
+        is_better = coarse.ok and (not is_consensus or is_larger)
+        if is_certain:
             # What hides part of the map, as a crowd does, hides it from both.
             is_better = is_better and not usual.is_less(coarse.agreement)
-        if is_better:
-            return replace(coarse, iterations=iterations, pose_source=self.name)
-        return replace(result, iterations=iterations)
+        if not is_better:
+            return replace(result, iterations=iterations)
+        # The features go on from there: the method itself found the pose.
+        pose_source = coarse.pose_source if self.of_features else self.name
+        return replace(coarse, iterations=iterations, pose_source=pose_source)
 
 
 class AtRest:
@@ -57,13 +68,15 @@ class AtRest:
         return attempt.credit(result.moved(rest.T_world_lidar.copy(), result.covariance), self.name)
 
 
-def policies_of(config: RecoveryConfig) -> tuple[Policy, ...]:
-    """Nearest first: a policy sees what those before it found."""
-    policies: list[Policy] = []
-    if config.coarse_to_fine:
-        policies.append(CoarseToFine())
-    if config.start_search:
-        policies.append(StartSearch())
-    if config.at_rest:
-        policies.append(AtRest())
-    return tuple(policies)
+def policies_of(config: RecoveryConfig, of_features: Sequence[Policy] | None = None) -> tuple[Policy, ...]:
+    """Nearest first: a policy sees what those before it found.
+
+    of_features : what features have in place of the search for the start; None: for points
+    """
+    is_of_points = of_features is None
+    return (
+        *([CoarseToFine(not is_of_points)] if config.coarse_to_fine else []),
+        *([StartSearch()] if is_of_points and config.start_search else []),
+        *(of_features or ()),
+        *([AtRest()] if config.at_rest else []),
+    )

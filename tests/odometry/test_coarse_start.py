@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.odometry.feature_policies import CoarseStart
 from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
+from lslam.registration.policies import CoarseToFine
 from lslam.registration.solver import RegistrationResult
 
 FINE, COARSE = (RegistrationResult(np.eye(4), matched=2000, pose_source=name) for name in ("fine", "coarse"))
@@ -27,7 +27,7 @@ def chosen(fine: int, coarse: int, *, starting: int = 5, prior_m: float = 0.0, f
     target: Any = SimpleNamespace(captured=lambda attempt: other)
     attempt = Attempt(target, None, np.eye(4), config, history)
     result = replace(FINE, inliers=fine, ok=failed != "fine", prior_error=(prior_m, 0.0))
-    return CoarseStart().recover(attempt, result).pose_source
+    return CoarseToFine(of_features=True).recover(attempt, result).pose_source
 
 
 @pytest.mark.parametrize(
