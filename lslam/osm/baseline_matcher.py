@@ -19,6 +19,7 @@ from lslam.backend.outcome import Given
 from lslam.core.config import Config
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se2, se3
+from lslam.core.labels import table_of
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
@@ -94,7 +95,10 @@ def _match(
     at = se2.of_se3(pose)
     tilt = se2.to_se3(np.array([0.0, 0.0, -at[2]]))[:3, :3] @ pose[:3, :3]
     with clock.stage("walls"):
-        seen = flatten_scan(store.points(number) @ tilt.T.astype(np.float32), config.osm.wall_range)
+        points, labels = store.points(number), store.labels(number)
+        if config.osm.labels:
+            points = points[table_of(config.osm.labels)[np.zeros(len(points), np.uint16) if labels is None else labels]]
+        seen = flatten_scan(points @ tilt.T.astype(np.float32), config.osm.wall_range)
     with clock.stage("map match"):
         whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose

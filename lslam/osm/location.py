@@ -15,12 +15,13 @@ import numpy as np
 
 from lslam.backend.graph.problem import PlanarPrior, Solution
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import neighbours, submap
+from lslam.backend.keyframes.submaps import neighbours, submap, submap_labels
 from lslam.backend.levelling import floor_planes
 from lslam.core.config import Config
 from lslam.core.config.backend import GraphConfig, OsmConfig
 from lslam.core.geometry import se2, se3, so3
 from lslam.core.geometry.noise import quantile
+from lslam.core.labels import table_of
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
@@ -287,7 +288,8 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
     cloud = submap(store, poses, number, size, T_world_frame=T_world_level)
     near = neighbours(len(store), number, size)
     views = se2.apply(se2.inverse(at), poses[near.start : near.stop, :2, 3])
-    return WallView(find_walls(cloud, config, views).segments, views)
+    is_wall = table_of(config.labels)[submap_labels(store, number, size)] if config.labels else None
+    return WallView(find_walls(cloud, config, views, is_wall).segments, views)
 
 
 def known_start(config: OsmConfig) -> FirstPose:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.backend import OsmConfig
 from lslam.core.kernels import ground
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
 from lslam.osm.kernels import segments
 
@@ -54,21 +54,29 @@ class Walls:
         return np.asarray(np.linalg.norm(self.segments[:, 1] - self.segments[:, 0], axis=1))
 
 
-def find_walls(points: NDArray[Any], config: OsmConfig | None = None, views: NDArray[Any] | None = None) -> Walls:
+def find_walls(
+    points: NDArray[Any],
+    config: OsmConfig | None = None,
+    views: NDArray[Any] | None = None,
+    is_wall: Bools | None = None,
+) -> Walls:
     """Walls in the points (N, 3), m, of a scan or of a submap, in a frame whose z points up.
 
+    is_wall : (N,) which points may be of walls; the others tell where the ground is
     views : (V, 2) or (V, 3) positions of the sensor, m, which direct the walls; the origin by default
     The same input gives the same result, which is empty without walls.
     """
     config = config or OsmConfig()
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
     x, y, z = np.abs(cloud.T)
-    cloud = cloud[(x < config.wall_range) & (y < config.wall_range) & (z < HIGHEST)]
+    near = (x < config.wall_range) & (y < config.wall_range) & (z < HIGHEST)
+    cloud = cloud[near]
     if len(cloud) < config.min_cluster:
         return Walls(np.zeros((0, 2, 2)), np.zeros(0, np.int64), np.zeros(0))
+    high = _high(cloud, config.wall_height)
     flat, every = segments.flat_walls(
         cloud,
-        _high(cloud, config.wall_height),
+        high if is_wall is None else high[is_wall[near][high]],
         NEIGHBOURHOOD,
         np.sin(np.radians(config.wall_tilt_deg)),
         THICKNESS,

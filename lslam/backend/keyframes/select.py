@@ -9,7 +9,7 @@ from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import voxel
-from lslam.core.types.arrays import Floats
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -70,9 +70,24 @@ def keyframe_cloud(
     Range gate and ego box are odometry's. The ground stays in and nothing is denoised, whatever odometry prefers: what
     looks at keyframes wants to see the place.
     """
+    centroids = voxel.means(_within_gate(scan, motion, preprocess)[0], NO_TIMES, config.voxel)[0]
+    return np.asarray(np.round(centroids / np.float32(GRAIN)) * np.float32(GRAIN), np.float32)
+
+
+def keyframe_labels(
+    scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig, config: KeyframesConfig
+) -> NDArray[np.uint16] | None:
+    """Classes (M,) of the points of `keyframe_cloud`, each that of the first point in its voxel; None where none are known."""
+    if scan.labels is None:
+        return None
+    points, index = _within_gate(scan, motion, preprocess)
+    return np.asarray(scan.labels[index[voxel.first_points(points, config.voxel)]])
+
+
+def _within_gate(scan: Scan, motion: MotionPrior, preprocess: PreprocessConfig) -> tuple[NDArray[np.float32], Longs]:
+    """Points (N, 3), m, of the scan, deskewed, and their indices in it."""
     plain = preprocess.model_copy(update={"remove_ground": False, "denoise": False})
     raw = as_cloud(scan.points)
     index = gate_points(raw, plain)
     times = scan.times[index] if scan.times is not None and preprocess.deskew else None
-    centroids = voxel.means(deskew_points(voxel.take(raw, index), times, motion), NO_TIMES, config.voxel)[0]
-    return np.asarray(np.round(centroids / np.float32(GRAIN)) * np.float32(GRAIN), np.float32)
+    return deskew_points(voxel.take(raw, index), times, motion), index

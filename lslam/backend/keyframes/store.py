@@ -19,6 +19,7 @@ from lslam.core.types.state import Stateful
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import pack_npz, read_npz, write_npz
 
+Labels = NDArray[np.uint16]
 INDEX = "index.npz"
 CACHED = 32
 
@@ -47,7 +48,7 @@ class KeyframeStore(Stateful):
         self._files: list[int] = []
         self._memory: dict[int, bytes] = {}
         self._cached, self._deflate = cached, deflate
-        self._recent: OrderedDict[int, Points] = OrderedDict()
+        self._recent: OrderedDict[int, tuple[Points, Labels | None]] = OrderedDict()
         self._lock = threading.Lock()
         if folder is not None and (folder / INDEX).exists():
             self.restore(read_npz(folder / INDEX))
@@ -56,37 +57,54 @@ class KeyframeStore(Stateful):
         """How many keyframes there are."""
         return len(self.keyframes)
 
-    def add(self, keyframe: Keyframe, points: Points) -> None:
-        """Take the next keyframe with its cloud (N, 3), m, in the LiDAR frame at its scan's stamp; written at once."""
+    def add(self, keyframe: Keyframe, points: Points, labels: Labels | None = None) -> None:
+        """Take the next keyframe with its cloud (N, 3), m, in the LiDAR frame at its scan's stamp; written at once.
+
+        labels : (N,) classes of its points, where they are known
+        """
         if keyframe.number != len(self):
             raise ValueError(f"keyframe {keyframe.number} cannot follow {len(self) - 1}")
         cloud = np.ascontiguousarray(points, np.float32).reshape(-1, 3)
         # Byte by byte and axis by axis: what is alike lies side by side, and deflate takes it down to half.
         planes = np.ascontiguousarray(cloud.T).view(np.uint8).reshape(3, len(cloud), 4).transpose(2, 0, 1)
+        arrays: dict[str, NDArray[Any]] = {"planes": planes} if labels is None else {"planes": planes, "labels": labels}
         if self.folder is None:
             stream = io.BytesIO()
-            pack_npz(stream, {"planes": planes}, self._deflate)
+            pack_npz(stream, arrays, self._deflate)
             self._memory[keyframe.number] = stream.getvalue()
         else:
             _make(self.folder)
-            write_npz(self._path(keyframe.number), {"planes": planes}, self._deflate)
+            write_npz(self._path(keyframe.number), arrays, self._deflate)
         self.keyframes.append(keyframe)
         self._files.append(keyframe.number)
-        self._keep(keyframe.number, cloud)
+        self._keep(keyframe.number, cloud, labels)
 
     def points(self, number: int) -> Points:
         """Cloud (N, 3), m, of keyframe `number`, as it was added; not to be written to."""
+        return self._held(number)[0]
+
+    def labels(self, number: int) -> Labels | None:
+        """Classes (N,) of the points of keyframe `number`, as they were added; not to be written to."""
+        return self._held(number)[1]
+
+    def _held(self, number: int) -> tuple[Points, Labels | None]:
         file = self._files[number]
         with self._lock:
             if file in self._recent:
                 self._recent.move_to_end(file)
                 return self._recent[file]
         source = io.BytesIO(self._memory[file]) if self.folder is None else self._path(file)
-        planes = read_npz(source).get("planes", np.zeros(0, np.uint8))
-        if planes.ndim != 3 or planes.shape[:2] != (4, 3) or planes.dtype != np.uint8:
+        arrays = read_npz(source)
+        planes, labels = arrays.get("planes", np.zeros(0, np.uint8)), arrays.get("labels")
+        if (
+            planes.ndim != 3
+            or planes.shape[:2] != (4, 3)
+            or planes.dtype != np.uint8
+            or (labels is not None and labels.shape != planes.shape[2:])
+        ):
             raise InputError(f"{source if isinstance(source, Path) else 'a keyframe'} holds no cloud of a keyframe")
         values = np.ascontiguousarray(planes.transpose(1, 2, 0)).view(np.float32)[..., 0]
-        return self._keep(file, np.ascontiguousarray(values.T))
+        return self._keep(file, np.ascontiguousarray(values.T), labels)
 
     def keep(self, keyframes: Sequence[Keyframe]) -> None:
         """Hold these of the keyframes only, by their numbers, which begin at 0 again; their clouds stay where they are."""
@@ -134,14 +152,14 @@ class KeyframeStore(Stateful):
         assert self.folder is not None
         return self.folder / f"{file:06d}.npz"
 
-    def _keep(self, file: int, cloud: Points) -> Points:
+    def _keep(self, file: int, cloud: Points, labels: Labels | None) -> tuple[Points, Labels | None]:
         cloud.flags.writeable = False
         with self._lock:
-            self._recent[file] = cloud
+            self._recent[file] = cloud, labels
             self._recent.move_to_end(file)
             while len(self._recent) > self._cached:
                 self._recent.popitem(last=False)
-        return cloud
+        return cloud, labels
 
 
 class PartOfStore(KeyframeStore):
@@ -158,6 +176,10 @@ class PartOfStore(KeyframeStore):
     def points(self, number: int) -> Points:
         """Cloud of a keyframe."""
         return self._store.points(self.whole[number].number)
+
+    def labels(self, number: int) -> Labels | None:
+        """Classes of its points, where they are known."""
+        return self._store.labels(self.whole[number].number)
 
 
 def keyframe_arrays(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[Any]]:

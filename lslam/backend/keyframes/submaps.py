@@ -44,6 +44,15 @@ def submap(
     return points if voxel is None else voxels.means(points, NO_TIMES, voxel)[0]
 
 
+def submap_labels(store: KeyframeStore, number: int, size: int) -> NDArray[np.uint16]:
+    """Classes (M,) of the points of `submap` where all are left; 0, unlabeled, of keyframes whose classes are unknown."""
+    parts = []
+    for k in neighbours(len(store), number, size):
+        labels = store.labels(k)
+        parts.append(np.zeros(len(store.points(k)), np.uint16) if labels is None else labels)
+    return np.concatenate(parts)
+
+
 # Keyframes in whose clouds the ground is looked for: rings of a sensor on its side cross it in a line, those of 20 m cover it.
 KEYFRAMES = 10
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from lslam.core.config.section import Section
+from lslam.core.labels import parse_classes
 
 
 class KeyframesConfig(Section):
@@ -190,6 +191,11 @@ class OsmConfig(Section):
         False,
         description="hold the first pose where the origin has it, as well as start_radius says, against a map that is off as a "
         "whole; else it only says where to look. rigid always does",
+    )
+    labels: Annotated[tuple[str, ...], BeforeValidator(parse_classes)] = Field(
+        (),
+        description="classes of points of which walls are made, by name or number as preprocess.drop_labels; needs labels of "
+        "points; empty: all that lies on vertical planes",
     )
     mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
         "two-level",

@@ -7,7 +7,7 @@ from contextlib import suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 
-from lslam.backend.keyframes.select import KeyframeSelector, keyframe_cloud
+from lslam.backend.keyframes.select import KeyframeSelector, keyframe_cloud, keyframe_labels
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.core.config import Config
 from lslam.core.types.motion_prior import MotionPrior
@@ -102,7 +102,8 @@ class Keyframing(Stateful):
         self._pending.append(self._pool.submit(copy_context().run, self._write, keyframe, scan, motion))
 
     def _write(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:
-        self.store.add(keyframe, keyframe_cloud(scan, motion, self._config.preprocess, self._config.keyframes))
+        given = scan, motion, self._config.preprocess, self._config.keyframes
+        self.store.add(keyframe, keyframe_cloud(*given), keyframe_labels(*given))
 
     def _wait(self, most: int) -> None:
         while len(self._pending) > most:
