@@ -192,7 +192,9 @@ def arguments(command: str, scratch: str, recordings: Path | None) -> list[str] 
 
 def run(words: list[str], root: Path, seconds: float | None) -> str:
     """How a command ended that is not '': stopped, with all its children, after so many seconds, or failed."""
-    process = subprocess.Popen([sys.executable, *words], cwd=root, start_new_session=True)
+    # The package below root, whichever is installed.
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    process = subprocess.Popen([sys.executable, *words], cwd=root, env=environment, start_new_session=True)
     try:
         code = process.wait(seconds)
     except subprocess.TimeoutExpired:
