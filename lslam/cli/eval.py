@@ -23,7 +23,7 @@ EPILOG = """\b
 Examples:
   lslam eval runs/seq07-icp poses/07.txt
   lslam eval ours.tum theirs.tum gt.csv --align se3 --delta 1scan --delta 100m/all
-  lslam eval runs/seq07-icp poses/07.txt --metrics thesis
+  lslam eval runs/seq07-icp poses/07.txt --metrics thesis --frame base_link
   lslam eval runs/seq07-icp poses/07.txt --fail-ate 1.0 --fail-drift 0.6
 """
 
@@ -48,8 +48,9 @@ Examples:
     "--T-est-gt", "transform", metavar="T", help="Truth's body in the estimate's: 12, 16 or 7 numbers, or a file."
 )
 @click.option(
-    "--calib", type=click.Path(path_type=Path), metavar="FILE", help="KITTI calibration, for camera 0 against LiDAR."
+    "--calib", type=click.Path(path_type=Path), metavar="FILE", help="KITTI calibration or sequence.toml: extrinsics."
 )
+@click.option("--frame", metavar="NAME", help="Score the poses of another frame of the robot, as base_link  [lidar].")
 @click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Stamps of KITTI files, one per line.")
 @click.option(
     "--format", "file_format", type=click.Choice(list(FORMATS)), help="Format of the estimates; detected by default."
@@ -118,6 +119,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         parse_delta(delta)
     check_words(words)
     flags = {"metrics": words, "align": align, "delta": deltas, "max_diff": given["max_diff"], "time_offset": offset}
+    flags["frame"] = given["frame"]
     return {key: value for key, value in flags.items() if value not in (None, [])}
 
 
@@ -146,12 +148,16 @@ def _evaluate_all(
     from lslam.evaluation.evaluate import evaluate
     from lslam.io.formats.calibration_files import read_transform
     from lslam.io.formats.trajectory_files import read_trajectory
+    from lslam.pipeline.rebuild import read_run
+    from lslam.pipeline.resume import open_again
 
     ground_truth = read_trajectory(truth, given["gt_format"], given["times"])
     T_est_gt = None if given["transform"] is None else read_transform(given["transform"])
     calibration = _calibration(truth, given["calib"])
     evaluations = []
     for path in estimates:
+        if config.frame not in calibration.known() and given["calib"] is None and path.is_dir():
+            calibration = open_again(read_run(path)).calibration
         estimate: Trajectory = read_trajectory(path, given["file_format"], given["times"])
         result = evaluate(estimate, ground_truth, config, T_est_gt=T_est_gt, calibration=calibration)
         for name, error in result.ate.items():
@@ -161,18 +167,25 @@ def _evaluate_all(
     return evaluations
 
 
-def _calibration(truth: Path, calib: Path | None) -> Calibration | None:
-    """The calibration of --calib, or the file at KITTI's place for this ground truth; None without one."""
+def _calibration(truth: Path, calib: Path | None) -> Calibration:
+    """The calibration of --calib, or what lies at KITTI's place for this ground truth."""
     from lslam.core.types.sequence import Calibration
     from lslam.io.formats import calibration_files
+    from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo, read_sequence_toml
+    from lslam.io.readers.sidecars import calibration_over
 
     if calib is not None:
+        if calib.suffix == ".toml":
+            return calibration_over(read_sequence_toml(calib), Calibration())
         return Calibration(T_cam0_lidar=calibration_files.read_cam0_lidar(calib))
     above = truth.resolve().parent
-    for found in (above / "calib.txt", above.parent / "sequences" / truth.stem / "calib.txt"):
-        if found.is_file():
-            return Calibration(T_cam0_lidar=calibration_files.read_odometry_calib(found))
-    return None
+    for folder in (above, above.parent / "sequences" / truth.stem):
+        tr, said = folder / "calib.txt", folder / FILE_NAME
+        if tr.is_file() or said.is_file():
+            T_cam0_lidar = calibration_files.read_odometry_calib(tr) if tr.is_file() else None
+            info = read_sequence_toml(said) if said.is_file() else SequenceInfo()
+            return calibration_over(info, Calibration(T_cam0_lidar))
+    return Calibration()
 
 
 def _timing(estimate: Path, given: Path | None) -> Timing | None:

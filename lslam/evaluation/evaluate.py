@@ -13,11 +13,11 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.printable import metres
 from lslam.core.types.arrays import Floats
-from lslam.core.types.sequence import Calibration
+from lslam.core.types.sequence import LIDAR_FRAME, Calibration
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.absolute import AbsoluteTrajectoryError, absolute_error
 from lslam.evaluation.associate import Matches, associate, estimate_offset
-from lslam.evaluation.frames import body_turn, reconcile
+from lslam.evaluation.frames import body_turn, carry, reconcile
 from lslam.evaluation.kitti_drift import KittiOdometry
 from lslam.evaluation.metric import Evaluation, MatchedPoses, TrajectoryMetric
 from lslam.evaluation.relative import RelativePoseError
@@ -64,17 +64,22 @@ def evaluate(
     ----------
     config : alignments, RPE distances, association; defaults when None
     T_est_gt : (4, 4) pose of the truth's body in the estimate's body, m; carries the truth to the estimate's body
-    calibration : its `T_cam0_lidar` converts when one trajectory is the camera's and the other the LiDAR's
+    calibration : its `T_cam0_lidar` converts when one trajectory is the camera's and the other the LiDAR's; it says where
+        `config.frame` sits
 
     Raises
     ------
-    InputError when fewer than 3 poses match, poses are not finite, or stamps do not increase.
+    InputError when fewer than 3 poses match, poses are not finite, stamps do not increase, or nobody knows where `config.frame`
+    sits.
 
     Notes
     -----
     Definitions: docs/conventions.md, "Metrics". Every part of the result carries its recipe.
     """
     config = config or EvalConfig()
+    calibration = calibration or Calibration()
+    T_lidar_body = calibration.T_lidar(config.frame)
+    is_carried = config.frame != LIDAR_FRAME
     for which, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
         _check(which, trajectory)
     offset_ns, notes = _offset(estimate, ground_truth, config)
@@ -86,6 +91,8 @@ def evaluate(
         f"{which}: {note}" for which, t in (("estimate", estimate), ("ground truth", ground_truth)) for note in t.notes
     ]
     if not (estimate.has_rotations and ground_truth.has_rotations):
+        if is_carried:
+            raise InputError(f"poses of {config.frame} need rotations of both trajectories: one has positions alone")
         return _evaluate_positions(estimate, ground_truth, matches, config, T_est_gt, offset_ns / 1e9, notes)
     truth = matches.truth
     if T_est_gt is not None:
@@ -98,12 +105,20 @@ def evaluate(
         matches.estimate,
         truth,
         (estimate.frame, ground_truth.frame),
-        calibration.T_cam0_lidar if calibration else None,
+        calibration.T_cam0_lidar,
         is_given=T_est_gt is not None,
+        wants_lidar=is_carried,
     )
     units = _other_unit(same.estimate, same.truth)
     # Whose body it is shows in motions, which are wrong then.
     frames = [] if units else same.faults or _turned(same.estimate, same.truth)
+    if is_carried:
+        if estimate.frame == ground_truth.frame == "imu":
+            T_lidar_body = se3.inverse(calibration.T_lidar("imu")) @ T_lidar_body
+        is_world_of_body = ground_truth.frame == "cam0" or np.allclose(ground_truth.poses[0], np.eye(4), atol=1e-6)
+        same.estimate = carry(same.estimate, T_lidar_body)
+        same.truth = carry(same.truth, T_lidar_body, is_world_of_body)
+        same.notes.append(f"poses of {config.frame}, {np.linalg.norm(T_lidar_body[:3, 3]):.3f} m from the sensor")
     notes = [*units, *notes, *same.notes, *frames, *_nearly_straight(same.truth, config)]
     faults = (*units, *frames)
     for note in notes:

@@ -40,8 +40,22 @@ class Reconciled:
     faults: list[str] = field(default_factory=list)
 
 
+def carry(poses: Floats, T_lidar_body: Floats, is_world_of_body: bool = False) -> Floats:
+    """Poses (N, 4, 4) of a body that sits at `T_lidar_body`, from the LiDAR's: T_world_body = T_world_lidar T_lidar_body.
+
+    is_world_of_body : the world is the body at the start, as in KITTI's files; it changes with the body (Del Tufo, 4.1)
+    """
+    moved = poses @ T_lidar_body
+    return se3.inverse(T_lidar_body) @ moved if is_world_of_body else moved
+
+
 def reconcile(
-    estimate: Floats, truth: Floats, frames: tuple[str, str], T_cam0_lidar: Floats | None, is_given: bool = False
+    estimate: Floats,
+    truth: Floats,
+    frames: tuple[str, str],
+    T_cam0_lidar: Floats | None,
+    is_given: bool = False,
+    wants_lidar: bool = False,
 ) -> Reconciled:
     """Bring matched poses (N, 4, 4) into one body frame.
 
@@ -50,6 +64,7 @@ def reconcile(
     frames : the frames the files state (estimate, ground truth); the motion outranks them where it is clear
     T_cam0_lidar : (4, 4) or None when unknown
     is_given : the user stated the transform between the bodies: nothing is converted, a remaining difference is said
+    wants_lidar : poses of the camera in both are converted to the LiDAR, where `T_cam0_lidar` is known
     """
     camera = [_is_camera(poses, frame) for poses, frame in zip((estimate, truth), frames, strict=True)]
     out = Reconciled(estimate, truth)
@@ -62,6 +77,10 @@ def reconcile(
             out.notes.append(
                 f"{who} is a KITTI file (camera 0 by convention) but advances along +x: taken as LiDAR poses"
             )
+    if wants_lidar and all(camera) and T_cam0_lidar is not None:
+        out.estimate, out.truth = (se3.inverse(T_cam0_lidar) @ poses @ T_cam0_lidar for poses in (estimate, truth))
+        _say_difference(out)
+        return out
     if camera[0] is None or camera[1] is None or camera[0] == camera[1]:
         _say_difference(out)
         if camera[0] and camera[1] and "cam0" in frames and not (out.notes or out.faults):

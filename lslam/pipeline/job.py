@@ -86,6 +86,9 @@ def prepare(
     sequence = with_streams(sequence, config.imu.use, config.gnss.mode != "off")
     require_gnss(sequence, config.gnss)
     truth = sequence.ground_truth if truth is None else truth
+    if truth is not None:
+        # Before the odometry and not after it.
+        sequence.calibration.T_lidar(config.eval.frame)
     odometry = create_odometry(with_imu_settings(config))
     given: Trajectory | None = None
     if isinstance(odometry, GivenPoses):

@@ -125,7 +125,7 @@ def run_identity(
     Raises InputError when the recording cannot be listed.
     """
     reading = hashlib.sha256(np.ascontiguousarray(sequence.stamps_ns).tobytes())
-    for name, T in sorted(vars(sequence.calibration).items()):
+    for name, T in sorted(sequence.calibration.extrinsics.items()):
         reading.update(f"{name} {None if T is None else np.asarray(T).tolist()}".encode())
     reading.update(repr((sequence.kind, sequence.motion_compensated, sequence.notes)).encode(errors="surrogateescape"))
     gnss = sequence.gnss if config.gnss.mode != "off" else None

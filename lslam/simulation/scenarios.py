@@ -141,9 +141,9 @@ class SimulatedDrive(Scans):
             other.stamps_ns, se3.relative(poses[0], poses), "lidar", source=f"simulation of {other.name}"
         )
         known = self.calibration
-        inner = [None if S is None else se3.relative(T, S) for S in (known.T_lidar_imu, known.T_lidar_gnss)]
+        imu, gnss = (None if S is None else se3.relative(T, S) for S in (known.T_lidar_imu, known.T_lidar_gnss))
         assert known.T_cam0_lidar is not None
-        other.calibration = Calibration(portable.product(known.T_cam0_lidar, T), *inner)
+        other.calibration = Calibration(portable.product(known.T_cam0_lidar, T), imu, gnss)
         return other
 
     def scan(self, index: int) -> Scan:

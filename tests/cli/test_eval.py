@@ -169,6 +169,7 @@ def test_a_straight_line(folder: Path) -> None:
         (("good.tum", "gt.tum", "--time-offset", "soon"), 2, "seconds, or auto"),
         (("good.tum", "gt.tum", "--max-diff", "-1"), 2, "max_diff"),
         (("good.tum", "gt.tum", "--calib", "none.txt"), 3, "none.txt does not exist"),
+        (("good.tum", "gt.tum", "--frame", "base_link"), 3, "nothing says where frame base_link sits (known: lidar)"),
         (("good.tum", "gt.tum", "--format", "kitti"), 3, "8 columns where KITTI poses has 12"),
         (("good.tum", "gt.tum", "--timing", "none.csv"), 3, "none.csv"),
         (("good.tum", "gt.tum", "--set", "eval.aling=se3"), 2, "did you mean 'align'"),
@@ -206,6 +207,21 @@ def test_kitti_layout_finds_times_and_calibration(folder: Path, tmp_path: Path) 
     loud = evaluated(tmp_path / "own.tum", tmp_path / "poses/07.txt", "--json", "-q")
     assert "WRONG FRAMES" in loud.stderr
     assert any("WRONG FRAMES" in note for note in json.loads(loud.stdout)["notes"])
+
+
+def test_poses_of_another_frame_of_the_robot(folder: Path, tmp_path: Path) -> None:
+    """Its place is stated in a file that is named, or lies beside the truth."""
+    write_tum(tmp_path / "gt.tum", wander(0))
+    toml = tmp_path / "sequence.toml"
+    toml.write_text("[frames]\nbase_link = [1, 0, 0, -30, 0, 1, 0, 5, 0, 0, 1, -1.7]\n")
+    words = ("--frame", "base_link", "--json")
+    named = evaluated(folder / "good.tum", folder / "gt.tum", *words, "--calib", toml)
+    beside = evaluated(folder / "good.tum", tmp_path / "gt.tum", *words)
+    base, same, lidar = (
+        json.loads(done.stdout) for done in (named, beside, evaluated(folder / "good.tum", folder / "gt.tum", "--json"))
+    )
+    assert "poses of base_link, 30.461 m from the sensor" in base["notes"]
+    assert base["ate"] == same["ate"] != lidar["ate"]
 
 
 def test_plot(folder: Path, tmp_path: Path) -> None:

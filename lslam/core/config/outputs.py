@@ -77,6 +77,10 @@ class EvalConfig(Section):
     )
     max_diff: float = Field(0.01, gt=0, description="s; largest stamp difference of a matched pair")
     time_offset: float | Literal["auto"] = Field(0.0, description="s; added to the estimate's stamps, or auto")
+    frame: str = Field(
+        "lidar",
+        description="body whose poses are scored: lidar, imu, cam0, or a frame of /tf_static or sequence.toml, as base_link",
+    )
     metrics: tuple[str, ...] = Field(
         (), description="shown beside ATE, RPE and KITTI drift: thesis for those of the theses"
     )

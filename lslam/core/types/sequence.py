@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sized
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
@@ -18,6 +19,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.trajectory import Trajectory
 
 T = TypeVar("T", bound=Sized)
+LIDAR_FRAME = "lidar"
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,40 @@ class Calibration:
     """Extrinsics as (4, 4) transforms; None where the recording does not say.
 
     T_cam0_lidar : KITTI's `Tr`; T_lidar_imu and T_lidar_gnss : IMU and antenna in the LiDAR frame
+    frames : T_lidar_frame of further frames of the robot by name, for example `base_link`
     """
 
     T_cam0_lidar: Floats | None = None
     T_lidar_imu: Floats | None = None
     T_lidar_gnss: Floats | None = None
+    frames: Mapping[str, Floats] = field(default_factory=dict)
+
+    @property
+    def extrinsics(self) -> dict[str, Floats | None]:
+        """All transforms by their names."""
+        own = {"T_cam0_lidar": self.T_cam0_lidar, "T_lidar_imu": self.T_lidar_imu, "T_lidar_gnss": self.T_lidar_gnss}
+        return {**own, **{f"T_lidar_{frame}": T for frame, T in self.frames.items()}}
+
+    def known(self) -> dict[str, Floats]:
+        """(4, 4) poses in the LiDAR of all that the recording places, by frame."""
+        T_cam0_lidar = self.T_cam0_lidar
+        own = {
+            LIDAR_FRAME: np.eye(4),
+            "imu": self.T_lidar_imu,
+            "gnss": self.T_lidar_gnss,
+            "cam0": None if T_cam0_lidar is None else se3.inverse(T_cam0_lidar),
+        }
+        return {name: T for name, T in {**self.frames, **own}.items() if T is not None}
+
+    def T_lidar(self, frame: str) -> Floats:
+        """(4, 4) pose of `frame` in the LiDAR. Raises InputError naming the frames that are known."""
+        known = self.known()
+        if frame not in known:
+            raise InputError(
+                f"nothing says where frame {frame} sits (known: {', '.join(sorted(known))}): state it below [frames] in "
+                f"sequence.toml, {frame} = [T_lidar_{frame}, 12 numbers]"
+            )
+        return known[frame]
 
 
 @dataclass(frozen=True)

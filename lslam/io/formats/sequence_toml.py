@@ -88,6 +88,7 @@ class SequenceInfo:
         the frame of their messages, or `all`; several have commas between them and are merged, the first one leads
     T_cam0_lidar, T_lidar_imu, T_lidar_gnss : (4, 4) extrinsics, written in the table `[extrinsics]`
     lidars : further LiDARs and where they sit, T_lidar_other (4, 4) by folder, or by frame or topic of a bag
+    frames : further frames of the robot, T_lidar_frame (4, 4) by name
     """
 
     name: str | None = _text("text")
@@ -122,6 +123,7 @@ class SequenceInfo:
     T_lidar_imu: Matrix | None = None
     T_lidar_gnss: Matrix | None = None
     lidars: Mapping[str, Matrix] | None = None
+    frames: Mapping[str, Matrix] | None = None
 
     def over(self, other: SequenceInfo) -> SequenceInfo:
         """What this says, and what `other` says where this is silent."""
@@ -140,25 +142,24 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
     """The same from text that was found at `path`."""
     with input_errors(path, tomllib.TOMLDecodeError, as_what="TOML"):
         tree = parse_toml(text)
-    extrinsics, lidars = tree.pop("extrinsics", {}), tree.pop("lidars", {})
-    for key, table, row in (
-        ("extrinsics", extrinsics, "T_lidar_imu = [...]"), ("lidars", lidars, '"FOLDER" = [T_lidar_other, 12 numbers]'),
-    ):  # fmt: skip
+    tables = {key: tree.pop(key, {}) for key in _TABLES}
+    for key, table in tables.items():
         if not isinstance(table, dict):
-            raise InputError(f"{path}: {key} is a table, write [{key}] and below it {row}")
+            raise InputError(f"{path}: {key} is a table, write [{key}] and below it {_TABLES[key]}")
     values: dict[str, Any] = {}
     for key, value in tree.items():
         if key not in _KEYS:
-            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_KEYS, 'extrinsics', 'lidars'])}")
+            raise InputError(f"{path}: unknown key {key!r}; {nearest(key, [*_KEYS, *_TABLES])}")
         if not _KEYS[key]["is_valid"](value):
             raise InputError(f"{path}: {key} = {value!r}, expected {_KEYS[key]['expected']}")
         values[key] = float(value) if key in ("rate_hz", "vertical_correction_deg") else value
-    for key, value in extrinsics.items():
+    for key, value in tables["extrinsics"].items():
         if key not in EXTRINSICS:
             raise InputError(f"{path}: unknown key extrinsics.{key}; {nearest(key, EXTRINSICS)}")
         values[key] = _transform(path, f"extrinsics.{key}", value)
-    if lidars:
-        values["lidars"] = {name: _transform(path, f"lidars.{name}", T) for name, T in lidars.items()}
+    for key in ("lidars", "frames"):
+        if tables[key]:
+            values[key] = {name: _transform(path, f"{key}.{name}", T) for name, T in tables[key].items()}
     if (values.get("rows") is None) != (values.get("cols") is None):
         raise InputError(f"{path}: rows and cols of organised clouds go together, one of them is missing")
     return SequenceInfo(**values)
@@ -171,8 +172,11 @@ def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
 
 def sequence_toml_text(info: SequenceInfo) -> str:
     """`info` as TOML, without what is None."""
-    tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, "lidars")}
-    tables = {"extrinsics": {key: getattr(info, key) for key in EXTRINSICS}, "lidars": info.lidars or {}}
+    tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, *_TABLES)}
+    extrinsics = {key: getattr(info, key) for key in EXTRINSICS}
+    tables: dict[str, Mapping[str, Matrix | None]] = {
+        "extrinsics": extrinsics, "lidars": info.lidars or {}, "frames": info.frames or {}
+    }  # fmt: skip
     for key, matrices in tables.items():
         rows = {name: np.asarray(T, np.float64).tolist() for name, T in matrices.items() if T is not None}
         tree[key] = rows or None
@@ -180,6 +184,12 @@ def sequence_toml_text(info: SequenceInfo) -> str:
 
 
 _KEYS = {f.name: f.metadata for f in fields(SequenceInfo) if f.metadata}
+# Tables, and what a row of each looks like.
+_TABLES = {
+    "extrinsics": "T_lidar_imu = [...]",
+    "lidars": '"FOLDER" = [T_lidar_other, 12 numbers]',
+    "frames": "base_link = [T_lidar_base_link, 12 numbers]",
+}
 
 
 def _transform(path: Path | str, key: str, value: Any) -> Matrix:

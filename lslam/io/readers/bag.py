@@ -298,7 +298,9 @@ def find_extrinsics(
 
     lidar : the frame of the scans
     """
-    found = calibration_over(info, Calibration(T_cam0_lidar=chain(links.static, CAMERA, lidar)))
+    names = {name for pair in links.static for name in pair} - {lidar}
+    frames = {name: T for name in sorted(names) if (T := chain(links.static, lidar, name)) is not None}
+    found = calibration_over(info, Calibration(T_cam0_lidar=chain(links.static, CAMERA, lidar), frames=frames))
     T_lidar_imu, T_lidar_gnss = found.T_lidar_imu, found.T_lidar_gnss
     is_assumed = False
     if imu is not None and T_lidar_imu is None:
@@ -313,7 +315,8 @@ def find_extrinsics(
         T_lidar_gnss = _find(links, lidar, gnss.frame, "GNSS", voice)
         if T_lidar_gnss is None:
             voice.notes.append(f"extrinsics: {links.why_not(lidar, gnss.frame)}: the place of the antenna is unknown")
-    return replace(found, T_lidar_imu=T_lidar_imu, T_lidar_gnss=T_lidar_gnss), is_assumed
+    own = replace(found, T_lidar_imu=T_lidar_imu, T_lidar_gnss=T_lidar_gnss, frames={})
+    return replace(own, frames={name: T for name, T in found.frames.items() if name not in own.known()}), is_assumed
 
 
 def truth_topics(bag: Bag) -> list[BagTopic]:

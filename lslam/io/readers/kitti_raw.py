@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lslam.core.errors import InputError, input_errors
+from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
@@ -50,6 +51,8 @@ DRIVES = {
     "08": ("2011_09_30", 28, 1100), "09": ("2011_09_30", 33, 0), "10": ("2011_09_30", 34, 0),
 }  # fmt: skip
 CALIBRATION = "calib_imu_to_velo.txt"
+# The IMU in `base_link` as kitti2bag has it, m: on the ground in the middle of the car, axes alike.
+T_BASE_IMU = se3.make(np.eye(3), np.array([-2.71 / 2 - 0.05, 0.32, 0.93]))
 # The sequence lies so many folders below the data root at most: kitti/dataset/sequences/NN.
 _UPWARDS = 4
 
@@ -205,7 +208,12 @@ def _calibration(folder: Folder) -> Calibration:
         matrices.append(folder.calibration(path, read) if path.is_file() else None)
     T_lidar_imu, T_cam0_lidar = matrices
     # The OXTS position is that of the IMU's origin (devkit readme), so both extrinsics are one.
-    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu)
+    return Calibration(T_cam0_lidar, T_lidar_imu, T_lidar_imu, _frames(T_lidar_imu))
+
+
+def _frames(T_lidar_imu: Floats | None) -> dict[str, Floats]:
+    """The middle of the car on the ground."""
+    return {} if T_lidar_imu is None else {"base_link": T_lidar_imu @ se3.inverse(T_BASE_IMU)}
 
 
 def oxts_streams(oxts: Oxts, stamps_ns: Longs) -> tuple[ImuStream, GnssStream]:
@@ -301,10 +309,11 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
     source = f"{drive} at {rate_hz:.0f} Hz, its frame {first} by {clock} taken as the first scan"
     imu, gnss = oxts_streams(oxts, stamps_ns)
     T_lidar_imu = read_rigid(calibration)
+    known = replace(sequence.calibration, frames={**_frames(T_lidar_imu), **sequence.calibration.frames})
     # The position that OXTS gives is that of the IMU's origin (devkit readme).
     parts: dict[str, Any] = (
-        {"imu": imu, "calibration": replace(sequence.calibration, T_lidar_imu=T_lidar_imu)} if kind is IMU else
-        {"gnss": gnss, "calibration": replace(sequence.calibration, T_lidar_gnss=T_lidar_imu)}
+        {"imu": imu, "calibration": replace(known, T_lidar_imu=T_lidar_imu)} if kind is IMU else
+        {"gnss": gnss, "calibration": replace(known, T_lidar_gnss=T_lidar_imu)}
     )  # fmt: skip
     problems = list(dict.fromkeys([*sequence.problems, *oxts.problems]))
     return replace(sequence, notes=[*sequence.notes, f"{kind.name} of {source}"], problems=problems, **parts)

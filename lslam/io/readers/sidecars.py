@@ -97,7 +97,8 @@ def load_streams(folder: Path, info: SequenceInfo, voice: Voice) -> tuple[ImuStr
 
 def calibration_over(info: SequenceInfo, found: Calibration) -> Calibration:
     """Extrinsics that `sequence.toml` states, else those found."""
-    return replace(found, **{name: T for name in EXTRINSICS if (T := getattr(info, name)) is not None})
+    stated = {name: T for name in EXTRINSICS if (T := getattr(info, name)) is not None}
+    return replace(found, frames={**found.frames, **(info.frames or {})}, **stated)
 
 
 def per_point_folder(folder: Path, info: SequenceInfo) -> Path | None:

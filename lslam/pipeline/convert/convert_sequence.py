@@ -183,6 +183,7 @@ class _Source:
             T_cam0_lidar=self.calibration.T_cam0_lidar,
             T_lidar_imu=self.calibration.T_lidar_imu,
             T_lidar_gnss=self.calibration.T_lidar_gnss,
+            frames=self.calibration.frames or None,
         )
 
 
@@ -236,11 +237,12 @@ def _transforms(calibration: Calibration) -> dict[tuple[str, str], Any]:
     """The tree of frames below the LiDAR."""
     T_cam0_lidar = calibration.T_cam0_lidar
     below = {
+        **calibration.frames,
         "imu": calibration.T_lidar_imu,
         "gnss": calibration.T_lidar_gnss,
         "cam0": None if T_cam0_lidar is None else se3.inverse(T_cam0_lidar),
     }
-    return {("lidar", frame): T for frame, T in below.items() if T is not None}
+    return {("lidar", frame): T for frame, T in below.items() if T is not None and frame != "lidar"}
 
 
 def _write_kitti(source: _Source, out: Path) -> None:

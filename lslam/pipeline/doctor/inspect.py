@@ -153,7 +153,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
         "motion_compensated": clocked.motion_compensated,
         "vertical_correction_deg": float(getattr(sequence, "correction_deg", 0.0)),
         "extrinsics": {
-            key: None if T is None else np.asarray(T).tolist() for key, T in vars(sequence.calibration).items()
+            key: None if T is None else np.asarray(T).tolist() for key, T in sequence.calibration.extrinsics.items()
         },
         "imu": None if imu is None else {**imu, "turns": turns},
         "gnss": gnss,

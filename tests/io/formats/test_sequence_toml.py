@@ -19,6 +19,7 @@ FULL = SequenceInfo(
     lidar_topic="/points", lidar_frame="all", imu_topic="/imu", gnss_topic="/fix",
     T_cam0_lidar=se3.exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])), T_lidar_imu=se3.exp(np.array([0, 0, 0.1, 0, 0, 3.0])),
     T_lidar_gnss=np.eye(4), lidars={"../rear": se3.exp(np.array([1, 2, 3, 0.1, 0.2, 0.3])), "top": np.eye(4)},
+    frames={"base_link": se3.exp(np.array([-1, 0, -2, 0, 0, 0.3]))},
 )  # fmt: skip
 
 
@@ -31,7 +32,7 @@ def test_round_trip(info: SequenceInfo, tmp_path: Path) -> None:
         mine, theirs = getattr(info, field.name), getattr(back, field.name)
         if field.name in EXTRINSICS and mine is not None:
             np.testing.assert_array_equal(mine, theirs)
-        elif field.name == "lidars" and mine is not None:
+        elif field.name in ("lidars", "frames") and mine is not None:
             assert list(mine) == list(theirs)
             for name, T in mine.items():
                 np.testing.assert_array_equal(T, theirs[name])
@@ -42,6 +43,8 @@ def test_round_trip(info: SequenceInfo, tmp_path: Path) -> None:
 BAD = {
     "lidars = 'rear'": "lidars is a table",
     "[lidars]\n'../rear' = [1, 2, 3]": "lidars.../rear needs 3x4 or 4x4 numbers",
+    "frames = 'base_link'": "frames is a table",
+    "[frames]\nbase_link = [1]": "frames.base_link needs 3x4 or 4x4 numbers",
     "sensr = 'VLP-16'": "did you mean 'sensor'?",
     "rate_hz = 0": "rate_hz = 0, expected a number above 0",
     "rate_hz = nan": "rate_hz",

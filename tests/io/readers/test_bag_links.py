@@ -10,6 +10,7 @@ import pytest
 from bag_builders import KINDS, START_NS, STEP_NS, SUFFIX, Fill, bag, clouds, imu, together, transforms
 from numpy.typing import NDArray
 
+from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.io.readers import open_sequence
 from lslam.io.readers.bag import BagSequence
@@ -56,6 +57,15 @@ def test_what_tf_always_says_alike_is_where_the_imu_sits(tmp_path: Path, kind: s
     assert not sequence.has_assumed_extrinsics
     assert "extrinsics of the IMU: T_lidar_imu, from /tf, which always says the same of it" in sequence.notes
     assert sequence.uses["/tf"] == "extrinsics"
+
+
+def test_frames_of_tf_static_have_their_places_in_the_lidar(tmp_path: Path) -> None:
+    pairs = {("base", "lidar"): T_BASE_LIDAR, ("base", "mast"): T_BASE_IMU, ("elsewhere", "thing"): np.eye(4)}
+    calibration = open_sequence(bag(tmp_path / "a.bag", together(clouds(3), transforms(pairs)))).calibration
+    np.testing.assert_allclose(calibration.T_lidar("base"), se3.inverse(T_BASE_LIDAR), atol=1e-12)
+    np.testing.assert_allclose(calibration.T_lidar("mast"), T_LIDAR_IMU, atol=1e-12)
+    with pytest.raises(InputError, match=r"nothing says where frame thing sits \(known: base, lidar, mast\)"):
+        calibration.T_lidar("thing")
 
 
 def test_tf_fills_in_what_tf_static_leaves_open_and_does_not_overrule_it(tmp_path: Path) -> None:

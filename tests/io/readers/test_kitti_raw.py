@@ -31,6 +31,9 @@ def test_an_excerpt_without_velodyne_stamps(tmp_path: Path) -> None:
     assert s.problems == []
     assert s.calibration.T_lidar_imu is not None
     assert s.calibration.T_cam0_lidar is not None
+    # kitti2bag's: the IMU sits .93 m above it.
+    T_base_imu = se3.inverse(s.calibration.T_lidar("base_link")) @ s.calibration.T_lidar_imu
+    np.testing.assert_allclose(T_base_imu[:3, 3], [-1.405, 0.32, 0.93])
     assert s.imu is not None
     assert s.gnss is not None
     np.testing.assert_allclose(s.imu.accel[0], [0, 0, 9.81])
