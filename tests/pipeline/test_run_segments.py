@@ -21,7 +21,7 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline.watch import RunOutcome, Watch
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 # 13 m/s in a bend: 1.5 s of scans are missing there.
 COUNT, GAP, MISSING = 95, 30, 15
@@ -194,6 +194,25 @@ def test_a_walk_of_another_town_is_not_tied(monkeypatch: pytest.MonkeyPatch, tmp
     lslam.run(joined, config(), out=tmp_path / "out")
     assert columns(tmp_path / "out")["segment"] == ["0"] * 12 + ["1"] * 12
     assert len(set(columns(tmp_path / "out")["frame"])) == 2
+
+
+@pytest.mark.parametrize("method", ["icp", "fast-lio2", "lio-sam"])
+def test_a_run_with_an_imu_begins_a_segment_where_its_map_is_lost(
+    method: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drive = simulate("street", seed=7, lidar="vlp16", count=45, motion_compensated=False, imu="icm20948")
+    traced = SimulatedDrive.scan
+
+    def scan(self: SimulatedDrive, index: int) -> Scan:
+        scan = traced(self, index)
+        return scan if index < 30 else replace(scan, points=scan.points * np.float32([1, -1, 1]))
+
+    monkeypatch.setattr(SimulatedDrive, "scan", scan)
+    lslam.run(drive, config("imu.use=true", f"odometry.method={method}"), out=tmp_path / "out")
+    segments = columns(tmp_path / "out")["segment"]
+    assert segments[:30] == ["0"] * 30
+    assert segments[-1] == "1"
+    assert manifest(tmp_path / "out")["status"] == "degraded"
 
 
 def test_a_segment_of_another_world_has_a_frame_of_its_own(tmp_path: Path) -> None:

@@ -103,7 +103,8 @@ class InertialMotion(Stateful):
         is_swept = len(prior.times) > 1
         if self.refusal or not is_swept or self._instant_ns is None or not self._covers(self._instant_ns, end_ns):
             return self.coasting.refine(prior, stamp_ns, pose)
-        if self.config.velocity == "integrated":
+        # A scan that begins a new map was taken by the one before already: it teaches nothing a second time.
+        if self.config.velocity == "integrated" or instant_ns <= self._instant_ns:
             return prior
         return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
 

@@ -234,6 +234,19 @@ def test_a_sweep_is_refined_by_the_imu_when_samples_cover_it(seconds: float) -> 
     assert (refined[1].poses != refined[0].poses).any() == (seconds < 0.1)
 
 
+def test_a_scan_taken_already_refines_nothing() -> None:
+    """A new map begins with the scan that the last one lost, which the motion went on with."""
+    drive = walk()
+    stamps, poses = truth_of(drive)
+    motion = motion_of(drive)
+    for stamp, pose in zip(stamps[:10], poses[:10], strict=True):
+        motion.correct(int(stamp), pose, motion.sweep(int(stamp), SPAN))
+    prior = motion.sweep(int(stamps[9]), SPAN)
+    assert len(prior.times) > 1
+    refined = motion.refine(prior, int(stamps[9]), poses[9])
+    np.testing.assert_array_equal(refined.poses, prior.poses)
+
+
 @pytest.mark.parametrize("scans", [1, 40])
 def test_inertial_motion_resumes_to_the_last_bit(scans: int) -> None:
     drive = walk()
