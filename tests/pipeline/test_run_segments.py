@@ -196,7 +196,7 @@ def test_a_walk_of_another_town_is_not_tied(monkeypatch: pytest.MonkeyPatch, tmp
     assert len(set(columns(tmp_path / "out")["frame"])) == 2
 
 
-@pytest.mark.parametrize("method", ["icp", "fast-lio2", "lio-sam"])
+@pytest.mark.parametrize("method", ["icp", "fast-lio2"])
 def test_a_run_with_an_imu_begins_a_segment_where_its_map_is_lost(
     method: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
