@@ -24,7 +24,7 @@ from sought_starts import SoughtStarts
 
 from lslam.core.errors import InputError
 from lslam.core.extras import importing_open3d
-from lslam.registration.start_search import held_by_non_ground
+from lslam.registration.start_search import best_by_non_ground
 from lslam.simulation.scenarios import SimulatedDrive
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def shared_starts(request: pytest.FixtureRequest, made_once: MadeOnce) -> Iterat
     STARTS.folder.mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name != "registration":
-            patch.setattr("lslam.registration.start_search.held_by_non_ground", STARTS.held_by_non_ground)
+            patch.setattr("lslam.registration.start_search.best_by_non_ground", STARTS.best_by_non_ground)
         yield
 
 
@@ -136,7 +136,7 @@ def shared_starts(request: pytest.FixtureRequest, made_once: MadeOnce) -> Iterat
 def starts_sought_anew(shared_starts: None) -> Iterator[None]:
     """Nothing of an earlier run is taken: for the repetition that must give the same bytes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lslam.registration.start_search.held_by_non_ground", held_by_non_ground)
+        patch.setattr("lslam.registration.start_search.best_by_non_ground", best_by_non_ground)
         yield
 
 

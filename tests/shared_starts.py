@@ -10,7 +10,7 @@ from stub_sequences import Stub
 from lslam.core.config import Config
 from lslam.core.types.sequence import Selection, Sequence
 from lslam.odometry.frontend import inertial_start
-from lslam.odometry.frontend.inertial_start import first_heard_ns, first_poses
+from lslam.odometry.frontend.inertial_start import first_imu_ns, first_poses
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.initialise import FirstPoses
 
@@ -26,7 +26,7 @@ def shared_first_poses() -> Iterator[None]:
         )
         if motion is not None or not isinstance(whole, Stub):
             return first_poses(sequence, config, motion)
-        since = first_heard_ns(whole.imu, whole.stamps_ns, config)
+        since = first_imu_ns(whole.imu, whole.stamps_ns, config)
         key = (
             tuple(map(id, whole.scans)), whole.stamps_ns.tobytes(), whole.motion_compensated, indices, since,
             config.imu.model_dump_json(), config.preprocess.model_dump_json(), config.input.workers,

@@ -11,8 +11,8 @@ from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
-from lslam.registration.start_search import held_by_non_ground
+from lslam.registration.result import RegistrationResult
+from lslam.registration.start_search import best_by_non_ground
 
 # In `pose_source`.
 ALL_POINTS = "all-points"
@@ -46,7 +46,7 @@ class AllPoints(Stateful):
         """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
         icp = self._of_recent(attempt.history)
         points = prepare_points(attempt.points.cloud, icp.preprocess)
-        better = held_by_non_ground(icp.attempt(points, T_start), result)
+        better = best_by_non_ground(icp.attempt(points, T_start), result)
         return result if better is result else attempt.credit(better, ALL_POINTS)
 
     def instead(

@@ -11,7 +11,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanEquations, ScanResult
 from lslam.core.types.state import State
 from lslam.registration.preprocessing.features import Features
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 class Traits:

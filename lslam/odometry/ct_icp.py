@@ -10,7 +10,7 @@ from lslam.odometry.elastic_constraints import LastSweep
 from lslam.odometry.icp import Icp, registration_of
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> CtIcp:

@@ -13,7 +13,7 @@ from lslam.odometry.icp import Icp, registration_of
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> Dlo:

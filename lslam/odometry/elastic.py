@@ -18,17 +18,11 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.elastic_constraints import ElasticConstraints, ElasticSweep
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import (
-    LEAST_MATCHED,
-    STEP_M,
-    STEP_RAD,
-    Correspondences,
-    OptimiserResult,
-    Term,
-)
+from lslam.registration.optimiser import STEP_M, STEP_RAD, Correspondences, Term
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset
 from lslam.registration.residuals import residual_named
+from lslam.registration.result import LEAST_MATCHED, RegistrationResult
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import voxel_terms
 
@@ -47,7 +41,7 @@ class ElasticResult:
     sweep: ElasticSweep
     skew: Floats
     covariance: Floats
-    found: OptimiserResult
+    result: RegistrationResult
 
 
 class SweepPoints:
@@ -124,8 +118,11 @@ def register_elastic(
     covariance = np.asarray(np.linalg.pinv(A, hermitian=True), np.float64)
     information = np.asarray(np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True), np.float64)
     pose = sweep.prior.pose
-    optimum = OptimiserResult.of(pose, information, facts, at_stamp @ d.ravel(), iterations, converged, weak)
-    return ElasticResult(sweep, skew[0], covariance, optimum)
+    result = RegistrationResult.of(
+        pose, information, facts, start.prior.pose, step=at_stamp @ d.ravel(), weak=weak, source_points=len(points.times),
+        iterations=iterations, converged=converged,
+    )  # fmt: skip
+    return ElasticResult(sweep, skew[0], covariance, result)
 
 
 def _about_own_place(

@@ -9,11 +9,15 @@ from lslam.core.config.odometry import rest_alone
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.icp import Icp, registration_of
+from lslam.odometry.inertial.filter import FilterMotion
 
 
 def create(config: Config) -> FastLio2:
     """The method as the configuration wants it: point to plane, with no recovery beside the filter."""
     return FastLio2(registration_of(config, recovery=rest_alone(config.recovery)))
+
+
+create_motion = FilterMotion.of
 
 
 class FastLio2(Icp):

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.odometry.feature_solver import remap_solution
 from lslam.odometry.feature_target import MIN_FEATURES
 from lslam.registration.attempt import Attempt, Policy
 from lslam.registration.policies import policies_of
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
+
+# Planar points of one normal that constrain a direction well enough, as many as LOAM asks for a plane.
+ENOUGH = 5
 
 
 class LessPlanar:
@@ -49,7 +54,7 @@ class SolutionRemapping:
         # The first step's prior is a guess, which the search has replaced.
         start = attempt.start if attempt.history.inserted <= 1 else None
         expected = attempt.T_prior if start is None else start.T_world_lidar
-        return attempt.judged(remap_solution(result, expected))
+        return attempt.judge(remap_solution(result, expected))
 
 
 class AllPointsInstead:
@@ -65,10 +70,17 @@ class AllPointsInstead:
         if c.start_reach > 0 and (attempt.is_young or is_far):
             with attempt.clock.stage("start" if attempt.history.starting else "recover"):
                 result = points.confirm(attempt, attempt.T_prior if start is None else start.T_world_lidar, result)
-        if attempt.target.map is not None and not result.is_well_constrained(c.sigma):
+        if attempt.target.map is not None and not is_well_constrained(result, c.sigma):
             with attempt.clock.stage("all-points"):
                 result = points.instead(attempt, result, start)
         return result
+
+
+def is_well_constrained(result: RegistrationResult, sigma: float) -> bool:
+    """Whether the position's largest variance is below that of `ENOUGH` points of one normal, of `sigma`, m."""
+    if not result.ok or result.covariance is None:
+        return False
+    return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < sigma**2 / ENOUGH
 
 
 def feature_policies(config: RecoveryConfig) -> tuple[Policy, ...]:

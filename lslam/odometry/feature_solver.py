@@ -21,8 +21,9 @@ from lslam.registration.gaussian_map import FLOOR, GaussianMap
 from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise, slots_of
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.residuals import PLANE
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
+from lslam.registration.solver import voxel_terms
 
 NONE: Floats = np.zeros((0, 3))
 # Scan-to-scan errors persist as velocity, without a map to correct them: the threshold of degeneracy is twice as high there.
@@ -65,10 +66,7 @@ def solve_on_scan(
         noise.weak_share, TIMES_ON_SCAN * noise.least / noise.plane**2, by_surfaces=True,
         allowed=EVERYWHERE if allowed is None else np.ascontiguousarray(allowed),
     )  # fmt: skip
-    optimum = optimise(terms, T_prior, annealing, limits, Correspondences(0))
-    if allowed is not None:
-        optimum = replace(optimum, weak=optimum.weak[np.linalg.norm(optimum.weak @ allowed, axis=1) > 0.5])
-    return result_of(optimum, T_prior, len(edges) + len(planes))
+    return optimise(terms, T_prior, annealing, limits, Correspondences(len(edges) + len(planes)))
 
 
 def solve_on_map(
@@ -84,7 +82,7 @@ def solve_on_map(
     problem = map_problem(
         target, edges, planes, T_prior, annealing, noise, scatter=scatter, levels=levels, inlier_ratio=inlier_ratio
     )
-    return result_of(optimise(*problem), T_prior, len(edges) + len(planes))
+    return optimise(*problem)
 
 
 def map_problem(

@@ -18,8 +18,8 @@ from lslam.registration.history import History
 from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.preprocessing.ground import Z
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing, is_more
-from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.start_search import MUCH, START_STEP, start_offsets
 
 # Fewer inliers, ten per degree of freedom, are insignificant.
@@ -119,7 +119,7 @@ class FeatureTarget(Target):
         if self.variant.scan_step is not None:
             one_to_many = self.loam.matching == "one-to-many"
             result = self.variant.scan_step(self.scan, features, T_start, annealing, noise, one_to_many, attempt.clock)
-            result = attempt.judged(result)
+            result = attempt.judge(result)
             iterations = result.iterations
         if self.map is not None:
             start = result.T_world_lidar if result.ok else T_start
@@ -129,16 +129,16 @@ class FeatureTarget(Target):
                     self.map, features.edges.points, points, start, annealing, noise, scatter=scatter,
                     inlier_ratio=self.variant.inlier_ratio,
                 )  # fmt: skip
-                result = result_of(optimise(*problem), start, len(features.edges) + len(points))
+                result = optimise(*problem)
             result = replace(result, iterations=iterations + result.iterations)
-        is_kept = attempt.is_near and len(result.degenerate) > 0
-        return remap_solution(result, attempt.T_prior) if is_kept else result
+        is_remapped = attempt.is_near and len(result.degenerate) > 0
+        return remap_solution(result, attempt.T_prior) if is_remapped else result
 
-    def captured(self, attempt: Attempt) -> RegistrationResult:
+    def capture(self, attempt: Attempt) -> RegistrationResult:
         """Less planar points on coarse planes first, then as usual from there, and judged."""
         with attempt.clock.stage("start" if attempt.history.starting else "recover"):
             attempt.start = self._start(attempt)
-        return attempt.judged(self.align(attempt, attempt.start.T_world_lidar, attempt.annealing))
+        return attempt.judge(self.align(attempt, attempt.start.T_world_lidar, attempt.annealing))
 
     def on_planes(self, attempt: Attempt, T_start: Floats) -> RegistrationResult:
         """Edges, and centroids of the less planar points, on fine and coarse planes, judged."""
@@ -146,7 +146,7 @@ class FeatureTarget(Target):
         points, scatter = thinned(attempt.points)
         annealing = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
         edges = attempt.points.edges.points
-        return attempt.judged(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
+        return attempt.judge(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
 
     def enter(self, result: RegistrationResult) -> None:
         """Into the feature map, and as what the next scan is registered on."""
@@ -174,9 +174,7 @@ class FeatureTarget(Target):
         def on_coarse(start: Floats, width: float) -> RegistrationResult:
             slow = Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
             levels = target.planes.coarser[:1]
-            return attempt.judged(
-                solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels)
-            )
+            return attempt.judge(solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels))
 
         def edges_at(result: RegistrationResult) -> int:
             """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""

@@ -21,8 +21,8 @@ from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS, VoxelTarget
 
 
@@ -32,15 +32,15 @@ def create(config: Config) -> Icp:
     `icp` takes any residual; the others are named after theirs, with or without `icp-` before it. Raises UsageError when
     one is asked for another.
     """
-    method, chosen = config.odometry.method, config.registration.residual
+    method, configured = config.odometry.method, config.registration.residual
     name = method.removeprefix("icp-")
     own = name if name in RESIDUALS else None
-    if own is not None and chosen not in (None, own):
+    if own is not None and configured not in (None, own):
         raise UsageError(
-            f"method {method!r} measures by the residual {own!r}, registration.residual asks for {chosen!r}: "
-            f"choose one of them, or --method icp --residual {chosen}"
+            f"method {method!r} measures by the residual {own!r}, registration.residual asks for {configured!r}: "
+            f"choose one of them, or --method icp --residual {configured}"
         )
-    return Icp(registration_of(config, own or chosen))
+    return Icp(registration_of(config, own or configured))
 
 
 def registration_of(
@@ -101,7 +101,7 @@ class Icp(MapMethod):
         width = max(attempt.annealing.start, c.kernel_min)
         annealing = Annealing(width, c.kernel_min, c.kernel_decay, c.max_iterations)
         elastic = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)
-        result = attempt.judged(result_of(elastic.found, prior.pose, len(prepared.source)))
+        result = attempt.judge(elastic.result)
         sweep = replace(elastic.sweep.prior, change=prior.change) if result.ok else None
         return replace(
             result, points=deskew(prepared, sweep or prior), detail=(prior, elastic), sweep=sweep, map_age=self.map_age,

@@ -19,10 +19,10 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
-from lslam.odometry.scan_outcome import judged
+from lslam.odometry.scan_outcome import judge
 from lslam.registration.optimiser import STEP_M, STEP_RAD
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # Distances beyond the median plus this many median deviations are outliers (the X84 rule, Hampel et al. 1986).
@@ -78,7 +78,7 @@ class IcpSvd(Traits, Stateful):
                 inlier_distance=c.inlier_distance, max_iterations=c.max_iterations,
             )  # fmt: skip
         aligned = time.perf_counter()
-        result = judged(scan, alignment, prior.pose, c, {})
+        result = judge(scan, alignment, prior.pose, c, {})
         self._failed = 0 if result.status == "ok" else self._failed + 1
         if len(prepared.source) >= MIN_SOURCE_POINTS and self._failed in (0, 2):
             is_sampled = c.target == "sample" and self._last is not None

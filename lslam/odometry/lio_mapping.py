@@ -6,20 +6,28 @@ from collections.abc import Mapping
 
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
-from lslam.core.geometry import normal_equations
+from lslam.core.geometry import normal_equations as window_equations
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio2 import FastLio2
 from lslam.odometry.icp import registration_of
+from lslam.odometry.inertial.initialise import InertialStart
+from lslam.odometry.inertial.window_motion import WindowMotion
+from lslam.registration.optimiser import normal_equations
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> LioMapping:
     """The method as the configuration wants it: point to plane, with no recovery beside the window."""
     return LioMapping(registration_of(config, recovery=rest_alone(config.recovery)), config.lio_mapping.window - 1)
+
+
+def create_motion(opening: InertialStart, config: Config) -> WindowMotion:
+    """The window, which estimates its scans together."""
+    return WindowMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, config.lio_mapping.window)
 
 
 class LioMapping(FastLio2):
@@ -59,13 +67,16 @@ class LioMapping(FastLio2):
         return tuple(self._at(stamp_ns, by_stamp[stamp_ns], T) for stamp_ns, T in poses.items() if stamp_ns in by_stamp)
 
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
-        return ScanEquations(stamp_ns, T, *self.registration.target.equations(points, T))
+        """As registration weighs the points where it ends."""
+        target, width = self.registration.target, self.registration.config.kernel_min
+        terms, _, _, _, matches, *_ = target.problem(points, T, width, 1)
+        return ScanEquations(stamp_ns, T, *normal_equations(terms, T, width, matches))
 
     def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
         """Keep the scan for the map; while that is young, or the window silent, it enters at once."""
         if not result.ok or prior.covariance is None or self.registration.history.is_young:
             return self.registration.update(result)
-        result = self.registration.rest_detector.judged(result)
+        result = self.registration.rest_detector.judge(result)
         self.registration.history.observe(result)
         self.pending = (*self.pending, (stamp_ns, result.points, result.T_world_lidar, result.is_stationary))
         return result
@@ -82,7 +93,7 @@ class LioMapping(FastLio2):
     def warm_up(self) -> None:
         """As of `icp`, and a small window, which the motion model solves."""
         super().warm_up()
-        normal_equations.warm_up()
+        window_equations.warm_up()
 
     def restart(self) -> None:
         """An empty map, and no scan that waits for it."""

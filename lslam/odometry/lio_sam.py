@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from lslam.backend.graph.inertial_smoother import InertialSmoother
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
 from lslam.core.types.motion_prior import MotionPrior
@@ -17,10 +18,12 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
+from lslam.odometry.inertial.initialise import InertialStart
+from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
 from lslam.odometry.loam import Loam
 from lslam.odometry.map_method import MapMethod
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 def create(config: Config) -> LioSam | LioSamOfPoints:
@@ -32,6 +35,12 @@ def create(config: Config) -> LioSam | LioSamOfPoints:
         return LioSam(quiet, LoamVariant(None, with_map=True, keyframes=keyframes))
     keys: dict[str, Any] = {"keyframes": own.keyframes, "keyframe_m": own.keyframe_m, "keyframe_deg": own.keyframe_deg}
     return LioSamOfPoints(registration_of(config, recovery=rest_alone(config.recovery), target="keyframe", **keys))
+
+
+def create_motion(opening: InertialStart, config: Config) -> SmootherMotion:
+    """The smoother, whose states predict the next one."""
+    smoother = InertialSmoother(smoother_noise(opening.estimate.gyroscope.noise), config.lio_sam.reset_scans)
+    return SmootherMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, smoother)
 
 
 class SmoothedUncertainty(PoseUncertainty):

@@ -19,6 +19,7 @@ from lslam.core.types.scan import LEVER_M, Scan
 from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
+from lslam.odometry.inertial.linked_motion import LinkedMotion
 from lslam.odometry.plane_factors import SHARED, sighting_residuals
 from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
 from lslam.odometry.plane_window import PlaneWindow, associate
@@ -26,7 +27,7 @@ from lslam.odometry.scan_outcome import recorded
 from lslam.registration.acceptance import correction
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # Share of the points on planes that known planes must take; where it is less, the scan is elsewhere.
 LEAST_SHARE = 0.1
@@ -35,6 +36,9 @@ LEAST_SHARE = 0.1
 def create(config: Config) -> Lips:
     """The method as the configuration wants it."""
     return Lips(config)
+
+
+create_motion = LinkedMotion.of
 
 
 class Lips(Traits, Stateful):
@@ -133,8 +137,10 @@ class Lips(Traits, Stateful):
         """(D, 6) twists of the LiDAR along which the known planes of the scan say next to nothing."""
         if window.values.states == 1:
             return np.zeros((0, 6))  # the first scan begins the world
-        is_known = (window.seen.states == window.values.states - 1) & np.isin(window.seen.planes, matches[matches >= 0])
-        sightings = window.seen.only(is_known)
+        is_of_known_planes = (window.seen.states == window.values.states - 1) & np.isin(
+            window.seen.planes, matches[matches >= 0]
+        )
+        sightings = window.seen.only(is_of_known_planes)
         _, J, _ = sighting_residuals(window.values, sightings, window.landmarks.anchors, window.T_imu_lidar)
         J[:, :, 3:] /= LEVER_M
         values, vectors = np.linalg.eigh(np.einsum("kia,kij,kjb->ab", J, sightings.information, J))

@@ -18,7 +18,7 @@ from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.features import Features, extract_features
 from lslam.registration.preprocessing.ground import up_of
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 VARIANTS = {
     "loam-odom": LoamVariant(joint_step, with_map=False),

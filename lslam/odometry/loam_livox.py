@@ -17,7 +17,7 @@ from lslam.odometry.loam import Loam, deskewed
 from lslam.registration.acceptance import correction, failed
 from lslam.registration.preprocessing.features import FeaturePoints, Features
 from lslam.registration.preprocessing.petals import petal_features
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # Of the correspondences, the nearest, that have a say: a fifth is dropped as outliers (section IV-C).
 INLIERS = 0.8

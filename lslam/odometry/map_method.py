@@ -14,7 +14,7 @@ from lslam.odometry.base import Traits
 from lslam.odometry.scan_outcome import recorded
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 class MapMethod(Traits, Stateful):

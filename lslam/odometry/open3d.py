@@ -18,9 +18,9 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
-from lslam.odometry.scan_outcome import judged
+from lslam.odometry.scan_outcome import judge
 from lslam.registration.preprocessing.prepare import clean_points
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # Centroids of this grid, covariances of this many neighbours, correspondences within this distance, m.
@@ -65,7 +65,7 @@ class Open3dGicp(Traits):
         """Align with the last scan that was registered."""
         began = time.perf_counter()
         alignment = self._align(prepared, prior.pose)
-        result = judged(scan, alignment, prior.pose, self._limits, {})
+        result = judge(scan, alignment, prior.pose, self._limits, {})
         if result.status == "ok":
             self._last = Reference(prepared, result.T_world_lidar)
         result.stages["register"] = time.perf_counter() - began

@@ -16,7 +16,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.registration.acceptance import Acceptance, failed
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
@@ -35,7 +35,7 @@ def recorded(scan: Scan, result: RegistrationResult, covariance: Floats | None, 
     )  # fmt: skip
 
 
-def judged(
+def judge(
     scan: Scan, alignment: RegistrationResult, T_prior: Floats, c: RegistrationConfig, stages: dict[str, float]
 ) -> ScanResult:
     """The result of a scan that a package aligned: `ok`, or `bridged` by the motion prior when it is rejected.
@@ -50,7 +50,7 @@ def judged(
         result = failed(T_prior, count, "the solution is not finite")
     else:
         pose = se3.normalise(alignment.T_world_lidar)
-        result = limits.accepted(replace(alignment, T_world_lidar=pose, matched=alignment.inliers), T_prior)
+        result = limits.judge(replace(alignment, T_world_lidar=pose, matched=alignment.inliers), T_prior)
     return recorded(scan, replace(result, stages=stages), None, None)
 
 

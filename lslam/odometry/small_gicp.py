@@ -17,9 +17,9 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
-from lslam.odometry.scan_outcome import judged
+from lslam.odometry.scan_outcome import judge
 from lslam.registration.preprocessing.prepare import clean_points
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # The recipe: the package's own centroids and covariances, correspondences within a metre, and a map of the last ten
@@ -57,7 +57,7 @@ class SmallGicp(Traits):
         began = time.perf_counter()
         alignment = self._align(prepared, prior.pose)
         aligned = time.perf_counter()
-        result = judged(scan, alignment, prior.pose, self._limits, {})
+        result = judge(scan, alignment, prior.pose, self._limits, {})
         if result.status == "ok" and self._has_moved_on(result.T_world_lidar):
             self._insert(np.asarray(prepared.points())[:, :3], result.T_world_lidar)
         result.stages.update(register=aligned - began, update=time.perf_counter() - aligned)

@@ -14,8 +14,9 @@ from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.solver import solve
 
 # Steps beyond these, m and deg, need no test of the next scan: it is not stationary.
 SLOW_M, SLOW_DEG = 0.1, 1.0

@@ -19,7 +19,7 @@ from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # Scans over which the change of the motion is averaged: a second.
 MEMORY = 10

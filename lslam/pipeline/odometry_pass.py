@@ -30,13 +30,13 @@ from lslam.odometry.frontend.inertial_start import (
     with_imu_settings,
 )
 from lslam.odometry.frontend.keyframing import Keyframing
-from lslam.odometry.frontend.motion_models import copy_of, smoother_noise
+from lslam.odometry.frontend.motion_models import copy_of
 from lslam.odometry.frontend.register_scans import estimate, is_diverged, to_trajectory
 from lslam.odometry.frontend.segments import Begin
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
-from lslam.odometry.inertial.smoothing import SmootherMotion
+from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector

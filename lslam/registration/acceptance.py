@@ -9,17 +9,13 @@ from typing import Literal
 import numpy as np
 
 from lslam.core.types.arrays import Floats
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import UsualAgreement
-from lslam.registration.solver import RegistrationResult
 
 Test = Literal["solution", "directions", "rmse", "overlap", "inliers", "agreement", "jump"]
 
 # Of a pose from the motion prior alone: sigmas of half a metre and two degrees.
 PRIOR_COVARIANCE = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
-
-# On a map of another day no earlier scan tells how many points can agree: the shares of a scan that the map has, and that agree.
-MAP_MIN_OVERLAP = 0.2
-MAP_MIN_INLIERS = 0.3
 
 
 @dataclass(frozen=True)
@@ -77,7 +73,7 @@ class Acceptance:
             return Rejection("jump", f"impossible jump of {move:.1f} m and {turn_deg:.0f} deg")
         return None
 
-    def accepted(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
+    def judge(self, result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
         """The result with its correction of the prior (4, 4), or a failed one at the prior with the reason."""
         jump = correction(T_prior, result.T_world_lidar)
         rejection = self.rejection(result, jump)

@@ -11,12 +11,13 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LocalMap
-from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, normal_equations, optimise
+from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise
 from lslam.registration.preprocessing.ground import Z
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE, ResidualKind
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, prior_term, result_of, solve, voxel_terms
+from lslam.registration.solver import prior_term, solve, voxel_terms
 
 
 class MapAlignment:
@@ -37,8 +38,7 @@ class MapAlignment:
         allowed : (6, 6) projector on the directions that are aligned, world axes; no rows: all
         information : (6, 6) of the start as a prior, world axes, 1/m2 and 1/rad2; None: it is only a start
         """
-        problem = self.problem(points, start, width, steps, coarser, allowed, information)
-        return result_of(optimise(*problem), start, len(points.source))
+        return optimise(*self.problem(points, start, width, steps, coarser, allowed, information))
 
     def problem(
         self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
@@ -51,21 +51,13 @@ class MapAlignment:
         end = coarser[0].size / self.map.coarser[0].size * c.kernel_min
         width, end = (max(width, end), end) if c.inlier_distance is None else (c.inlier_distance,) * 2
         matches = self._remembered(len(points.source))
-        terms = self._terms(points, (self.map.fine, *coarser), matches)
+        arrays, levels = self.kind.points(points, c.sigma), (self.map.fine, *coarser)
+        terms = voxel_terms(self.kind, arrays, levels, matches, c.sigma, c.blob_weight)
         if information is not None:
             terms.append(prior_term(start, information))
         limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, allowed=allowed)
         farthest = np.inf if c.inlier_distance is None else c.inlier_distance
         return terms, start, Annealing(width, end, c.kernel_decay, steps), limits, matches, farthest, c.inlier_ratio
-
-    def equations(self, points: PreparedPoints, T: Floats) -> tuple[Floats, Floats]:
-        """H (6, 6) and g (6,) of the points at the pose T (4, 4), as `refine` weighs them where it ends."""
-        matches = self._remembered(len(points.source))
-        return normal_equations(self._terms(points, self.map.levels, matches), T, self.config.kernel_min, matches)
-
-    def _terms(self, points: PreparedPoints, levels: Sequence[GaussianMap], matches: Correspondences) -> list[Term]:
-        c = self.config
-        return voxel_terms(self.kind, self.kind.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
 
     def _remembered(self, count: int) -> Correspondences:
         """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
@@ -84,7 +76,7 @@ class MapAlignment:
         """
         c = self.config
         coarser = self.coarse_maps(points, T_prior)
-        coarse = self.on_planes(coarser[0], points, T_prior, self.slowly(min(width, c.coarse_kernel)))
+        coarse = solve(coarser[:1], points, T_prior, self.slowly(min(width, c.coarse_kernel)), c)
         start = coarse.T_world_lidar if coarse.ok else T_prior
         fine = self.refine(points, start, c.kernel_max, c.start_iterations, coarser)
         return replace(fine, iterations=coarse.iterations + fine.iterations)
@@ -97,7 +89,7 @@ class MapAlignment:
         c, coarser = self.config, self.map.coarser
         once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
         for k, level in enumerate(coarser):
-            if self.on_planes(level, points, T_prior, once).overlap >= c.min_overlap:
+            if solve((level,), points, T_prior, once, c).overlap >= c.min_overlap:
                 return coarser[k:]
         return coarser[-1:]
 
@@ -105,12 +97,6 @@ class MapAlignment:
         """A kernel that closes from `width`, m, so slowly that coarse planes are followed."""
         c = self.config
         return Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
-
-    def on_planes(
-        self, coarse_map: GaussianMap, points: PreparedPoints, start: Floats, annealing: Annealing
-    ) -> RegistrationResult:
-        """Align with the planes of a coarse map alone, from `start` (4, 4)."""
-        return solve((coarse_map,), points, start, annealing, self.config)
 
 
 def upright_directions(T_prior: Floats, up: Floats = Z) -> Floats:

@@ -15,8 +15,8 @@ from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.history import History
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult
 
 # The kernel opens so many times its end width around a pose that is nearly right.
 NEAR_KERNEL = 2.0
@@ -58,7 +58,7 @@ class Target(Stateful, ABC):
         """Align the scan from `T_start` (4, 4); `information` (6, 6) of it as a prior, world axes, None: only a start."""
 
     @abstractmethod
-    def captured(self, attempt: Attempt) -> RegistrationResult:
+    def capture(self, attempt: Attempt) -> RegistrationResult:
         """Aligned with the coarse planes first, which catch a scan from metres off, and judged."""
 
     @abstractmethod
@@ -96,14 +96,14 @@ class Attempt:
             steps = c.start_iterations
         return Annealing(width, c.kernel_min, c.kernel_decay, steps)
 
-    def judged(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
+    def judge(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
         c, history = self.config, self.history
         limits = Acceptance(
             c.min_overlap, history.matches.least, max_jump_m=c.max_jump_m, max_jump_deg=c.max_jump_deg,
             usual=history.agreement, source=self.target.source,
         )  # fmt: skip
-        return limits.accepted(result, self.T_prior if T_prior is None else T_prior)
+        return limits.judge(result, self.T_prior if T_prior is None else T_prior)
 
     def credit(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:
         """The result of the policy `pose_source`, with its correction of the prior."""

@@ -11,8 +11,8 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.rest import Rest
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
-from lslam.registration.solver import RegistrationResult
 
 
 class History(Stateful):

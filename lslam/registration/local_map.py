@@ -105,22 +105,19 @@ class AllScans(MapScans):
 
 
 class LastScan(MapScans):
-    """The last scan alone: scan-to-scan registration."""
+    """The last scan alone: scan-to-scan registration.
+
+    is_sampled : its source points; of the first scan all points (Girolimetto, listings 4.3 and 4.5)
+    """
+
+    def __init__(self, *, is_sampled: bool = False) -> None:
+        self.is_sampled = is_sampled
 
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Replace the map."""
+        is_few = self.is_sampled and len(target) > 0
         target.clear()
-        target.insert(points.map_points, points.source, T_world_lidar)
-
-
-class LastSample(MapScans):
-    """The source points of the last scan alone; of the first scan all points (Girolimetto, listings 4.3 and 4.5)."""
-
-    def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
-        """Replace the map."""
-        sample = points.source.astype(np.float32) if len(target) else points.map_points
-        target.clear()
-        target.insert(sample, points.source, T_world_lidar)
+        target.insert(points.source.astype(np.float32) if is_few else points.map_points, points.source, T_world_lidar)
 
 
 class LastKeyframes(MapScans):
@@ -158,5 +155,6 @@ def make_map_scans(config: RegistrationConfig) -> MapScans:
         raise UsageError("registration.target = submap is for methods: lslam run --method dlo")
     if config.target == "keyframe":
         return LastKeyframes(config.keyframes, config.keyframe_m, float(np.deg2rad(config.keyframe_deg)))
-    kinds: dict[str, type[MapScans]] = {"scan": LastScan, "sample": LastSample}
-    return kinds.get(config.target, AllScans)()
+    if config.target in ("scan", "sample"):
+        return LastScan(is_sampled=config.target == "sample")
+    return AllScans()

@@ -5,7 +5,6 @@ The kernels hold no GIL; between two of them there is a handful of Python, micro
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,18 +17,17 @@ from lslam.core.kernels import facts as at
 from lslam.core.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
+from lslam.registration.result import LEAST_MATCHED, RegistrationResult
 from lslam.registration.robust import Annealing
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is of a turn.
 STEP_M = 1e-3
 STEP_RAD = STEP_M / LEVER_M
-# A pose has six degrees of freedom.
-LEAST_MATCHED = 6
 EVERYWHERE: Floats = np.zeros((0, 6))
 
 
 class Correspondences:
-    """Correspondences of `count` points in an iteration: which have one, and squared distances; shared by the maps of a scan.
+    """Correspondences of the `count` source points in an iteration: which have one, and squared distances; shared by the maps.
 
     What was looked up in a map is remembered, for as long as that map stays as it is.
     """
@@ -88,55 +86,10 @@ class Limits:
     allowed: Floats = field(default_factory=lambda: EVERYWHERE)
 
 
-@dataclass(frozen=True)
-class OptimiserResult:
-    """Where the iterations ended: pose (4, 4), H (6, 6) and sums of the last linearisation, and the last step (6,).
-
-    weak : (K, 6) unobserved directions, unit rows, rotations scaled by the lever arm
-    information : sum, 1/m2; lever_information : times the squared lever arm of each point
-    squared : weighted squared residuals, m2; robust : the sum of their weights
-    matched : points that found a counterpart; inliers : those within the kernel's width
-    """
-
-    pose: Floats
-    H: Floats
-    step: Floats
-    iterations: int
-    converged: bool
-    weak: Floats
-    information: float
-    squared: float
-    inliers: int
-    matched: int
-    lever_information: float
-    robust: float
-
-    @classmethod
-    def of(
-        cls, pose: Floats, H: Floats, facts: Floats, step: Floats, iterations: int, converged: bool, weak: Floats
-    ) -> OptimiserResult:
-        """With the sums of a linearisation by name."""
-        f = facts.tolist()
-        return cls(
-            pose, H, step, iterations, converged, weak, information=f[at.INFORMATION], squared=f[at.SQUARED],
-            inliers=int(f[at.INLIERS]), matched=int(f[at.MATCHED]), lever_information=f[at.LEVER], robust=f[at.ROBUST],
-        )  # fmt: skip
-
-    @property
-    def lever_arm(self) -> float:
-        """Root mean square, m, by information."""
-        return math.sqrt(max(self.lever_information / max(self.information, 1e-300), 1e-6))
-
-    @property
-    def rmse(self) -> float:
-        """Weighted residual, m."""
-        return math.sqrt(self.squared / max(self.robust, 1e-12))
-
-
 def optimise(
     terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Correspondences,
     inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
-) -> OptimiserResult:  # fmt: skip
+) -> RegistrationResult:  # fmt: skip
     """Step from `T_start` (4, 4) until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
 
     Every step linearises all terms anew, in their order: on several maps the finest first. Correspondences beyond
@@ -169,7 +122,13 @@ def optimise(
         scale = max(scale * annealing.decay, end)
         if inlier_ratio < 1.0:
             gate2 = trimmed(matches.away2, float(inlier_ratio), farthest2)
-    return OptimiserResult.of(se3.make(*pose), H, facts, d, iterations, converged, weak[:count])
+    weak = weak[:count]
+    if len(limits.allowed):
+        weak = weak[np.linalg.norm(weak @ limits.allowed, axis=1) > 0.5]
+    return RegistrationResult.of(
+        se3.make(*pose), H, facts, T_start, step=d, weak=weak, source_points=len(matches), iterations=iterations,
+        converged=converged,
+    )  # fmt: skip
 
 
 def warm_up() -> None:

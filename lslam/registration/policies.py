@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.registration.attempt import Attempt, Policy
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import is_more
-from lslam.registration.solver import RegistrationResult
 from lslam.registration.start_search import StartSearch
 
 
@@ -30,7 +30,7 @@ class CoarseToFine:
         is_certain = result.ok and attempt.is_small(result) and is_started
         if is_certain and (self.of_features or not usual.is_less(result.agreement)):
             return result
-        coarse: RegistrationResult = attempt.target.captured(attempt)
+        coarse: RegistrationResult = attempt.target.capture(attempt)
         iterations = result.iterations + coarse.iterations
         # Forty steps that lead nowhere are no consensus; the ten of a usual scan may end a millimetre short of it.
         is_consensus = result.ok and (self.of_features or result.converged or is_started)

@@ -23,8 +23,8 @@ from lslam.registration.local_map import LocalMap
 from lslam.registration.policies import policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.rest import RestDetector
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import VoxelTarget
 
 
@@ -96,7 +96,7 @@ class Registration(Stateful):
         if len(self.target) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count, points=points)
         attempt = self.attempt(points, T_prior, is_near, clock)
-        result = attempt.judged(self.target.align(attempt, T_prior, attempt.annealing, information))
+        result = attempt.judge(self.target.align(attempt, T_prior, attempt.annealing, information))
         for policy in () if is_near else self.policies:
             result = policy.recover(attempt, result)
         return replace(result, points=points)
@@ -112,7 +112,7 @@ class Registration(Stateful):
         Returns the result, which says whether the sensor is at rest.
         """
         is_first = len(self.target) == 0
-        result = self.rest_detector.judged(result)
+        result = self.rest_detector.judge(result)
         self.enter(result)
         if not (result.ok and is_first):
             self.history.observe(result)

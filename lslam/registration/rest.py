@@ -18,7 +18,7 @@ from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR
 from lslam.registration.local_map import BREADTH
 from lslam.registration.preprocessing.ground import ground_of, up_of
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # Squared Mahalanobis distance of six dimensions that two poses of one place exceed once in a thousand scans.
 CHI2_LIMIT = 22.5
@@ -44,7 +44,7 @@ class RestDetector(Stateful):
         # Scans near the reference; scans that it took to leave the one before.
         self._stayed = self._last_stay = 0
 
-    def judged(self, result: RegistrationResult) -> RegistrationResult:
+    def judge(self, result: RegistrationResult) -> RegistrationResult:
         """The result, which says whether the sensor is at rest; a failed one says nothing."""
         if not result.ok:
             return result

@@ -14,12 +14,13 @@ from lslam.core.types.arrays import Bools, Floats, Points
 from lslam.registration.alignment import upright_directions
 from lslam.registration.attempt import NEAR_KERNEL, Attempt
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Correspondences, Limits, optimise
+from lslam.registration.optimiser import Correspondences, normal_equations
 from lslam.registration.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thin
 from lslam.registration.residuals import MEANS
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing, is_more
-from lslam.registration.solver import RegistrationResult, solve, voxel_terms
+from lslam.registration.solver import solve, voxel_terms
 
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
@@ -58,7 +59,7 @@ class NonGroundPoints:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
         matches = Correspondences(len(high.source))
         terms = voxel_terms(MEANS, MEANS.points(high, NEAR), (self._cells,), matches, NEAR, 1.0)
-        optimise(terms, T_world_lidar, Annealing(NEAR, NEAR, 0.5, 1), Limits(0.0), matches)
+        normal_equations(terms, T_world_lidar, NEAR, matches)
         return (matches.away2 >= 0) & (matches.away2 < NEAR**2)
 
     def share(self, high: PreparedPoints, T_world_lidar: Floats) -> float:
@@ -106,11 +107,11 @@ class StartSearch:
         is_settled = result.ok and not attempt.history.is_young
         if attempt.config.start_reach == 0 or is_settled:
             return result
-        better = held_by_non_ground(attempt, result, is_lost=attempt.history.inserted == 1)
+        better = best_by_non_ground(attempt, result, is_lost=attempt.history.inserted == 1)
         return attempt.credit(better, self.name) if better is not result and better.ok else better
 
 
-def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False) -> RegistrationResult:
+def best_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False) -> RegistrationResult:
     """The result, unless significantly more non-ground points of the last scans are inliers elsewhere.
 
     is_lost : whether the sensor may be anywhere within `start_reach`, as after a failed registration
@@ -149,7 +150,7 @@ def held_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
     if is_drawn or not is_much_more(most, agreeing(result), margin):
         return result
     near = target.refine(points, place, width, c.start_iterations, target.coarse_maps(points, place))
-    judged = attempt.judged(near, place)
+    judged = attempt.judge(near, place)
     if not judged.ok and not result.ok:
         return result
     if not judged.ok or len(judged.degenerate) or is_much_more(most, agreeing(judged)):
@@ -165,7 +166,7 @@ def _best_start(
     coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_SHARE)
     slow = target.slowly(2 * START_STEP)
     trials = [
-        target.on_planes(coarse_map, few, attempt.T_prior @ se3.make(np.eye(3), offset), slow)
+        solve((coarse_map,), few, attempt.T_prior @ se3.make(np.eye(3), offset), slow, attempt.config)
         for offset in start_offsets(attempt.config.start_reach, START_STEP, up_of(target.preprocess))
     ]
     # Without non-ground points, as in hills, the ground decides.
@@ -173,7 +174,7 @@ def _best_start(
     for promising in distinct(trials, best.T_world_lidar):
         start = promising.T_world_lidar
         # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
-        result = attempt.judged(target.coarse_to_fine(attempt.points, start, 2 * START_STEP), start)
+        result = attempt.judge(target.coarse_to_fine(attempt.points, start, 2 * START_STEP), start)
         share, usual = (non_ground.share(high, at.T_world_lidar) for at in (result, best))
         if count == 0:
             share, usual = result.agreement, best.agreement
@@ -210,13 +211,13 @@ def is_much_more(ours: Bools, others: Bools, margin: float = MUCH) -> bool:
 
 def distinct(results: list[RegistrationResult], T_best: Floats) -> list[RegistrationResult]:
     """The first `LOOKED_AT` places that lie at least half a step from the known pose (4, 4) and from each other."""
-    places, chosen = [T_best[:3, 3]], []
+    places, apart = [T_best[:3, 3]], []
     for result in results:
         place = result.T_world_lidar[:3, 3]
         if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP / 2:
             places.append(place)
-            chosen.append(result)
-    return chosen[:LOOKED_AT]
+            apart.append(result)
+    return apart[:LOOKED_AT]
 
 
 def start_offsets(reach: float, step: float, up: Floats = Z) -> Floats:

@@ -19,8 +19,8 @@ from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.beams import ring_gap
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import residual_named
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, result_of
 from lslam.registration.source_covariance import source_covariance
 
 MIN_SOURCE_POINTS = 30
@@ -88,13 +88,13 @@ class VoxelTarget(MapAlignment, Target):
         self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None
     ) -> RegistrationResult:
         """Align with the map from `T_start` (4, 4); `information` (6, 6) of it as a prior, None: only a start."""
-        points = attempt.points
-        problem = self.problem(points, T_start, annealing.start, annealing.steps, information=information)
-        return result_of(optimise(*problem), T_start, len(points.source))
+        return optimise(
+            *self.problem(attempt.points, T_start, annealing.start, annealing.steps, information=information)
+        )
 
-    def captured(self, attempt: Attempt) -> RegistrationResult:
+    def capture(self, attempt: Attempt) -> RegistrationResult:
         """Aligned with the coarse planes, then with the fine ones, and judged."""
-        return attempt.judged(self.coarse_to_fine(attempt.points, attempt.T_prior))
+        return attempt.judge(self.coarse_to_fine(attempt.points, attempt.T_prior))
 
     def enter(self, result: RegistrationResult) -> None:
         """Insert a scan at its pose."""

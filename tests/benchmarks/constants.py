@@ -54,8 +54,7 @@ PATH: dict[str, tuple[str, ...]] = {
 # Of other methods, of `localize`, of the whole recording, of what is off unless asked for, and what is no quantity: dimensions,
 # indices, marks, bits, constants of nature.
 NOT_OF_IT = {
-    "registration/source_covariance.py", "registration/acceptance.py MAP_MIN_OVERLAP",
-    "registration/acceptance.py MAP_MIN_INLIERS", "registration/voxel_target.py SPARSE_SHARE",
+    "registration/source_covariance.py", "registration/voxel_target.py SPARSE_SHARE",
     "registration/start_search.py NO_PLANES", "core/kernels/voxel.py OFFSET", "core/kernels/voxel.py MASK",
     "core/kernels/gaussians.py FREE", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
     "core/kernels/ground.py EMPTY", "odometry/kernels/lines.py NO_LINE", "registration/kernels/curvature.py EDGE",
@@ -70,7 +69,7 @@ NOT_OF_IT = {
     "core/kernels/gaussians.py HAND", "core/kernels/gaussians.py LIVE", "odometry/frontend/scene_scale.py USUAL_RANGE_M",
     "odometry/integrity/directions.py _ROWS", "odometry/integrity/directions.py _COLUMNS",
     "odometry/inertial/gyroscope.py MOUNTING_SIGMA", "odometry/inertial/gyroscope.py OFFSET_SIGMA",
-    "odometry/inertial/gyroscope.py OFFSET_WALK", "registration/optimiser.py LEAST_MATCHED",
+    "odometry/inertial/gyroscope.py OFFSET_WALK", "registration/result.py LEAST_MATCHED",
     "odometry/inertial/imu_estimate.py PLACE_NOISE", "odometry/inertial/imu_estimate.py TURN_NOISE",
 }  # fmt: skip
 # Keys of sections that every scan passes, those that the scene's size decides aside.

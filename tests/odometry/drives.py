@@ -17,7 +17,7 @@ from lslam.evaluation.relative import by_path, error_transforms
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

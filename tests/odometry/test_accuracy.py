@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam import Registration
 from lslam.core.geometry import se3, so3
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 CENTIMETRE = 0.01

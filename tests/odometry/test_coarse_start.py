@@ -13,7 +13,7 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
 from lslam.registration.policies import CoarseToFine
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 FINE, COARSE = (RegistrationResult(np.eye(4), matched=2000, pose_source=name) for name in ("fine", "coarse"))
 
@@ -24,7 +24,7 @@ def chosen(fine: int, coarse: int, *, starting: int = 5, prior_m: float = 0.0, f
     history = History(config)
     history.starting = starting
     other = replace(COARSE, inliers=coarse, ok=failed != "coarse")
-    target: Any = SimpleNamespace(captured=lambda attempt: other)
+    target: Any = SimpleNamespace(capture=lambda attempt: other)
     attempt = Attempt(target, None, np.eye(4), config, history)
     result = replace(FINE, inliers=fine, ok=failed != "fine", prior_error=(prior_m, 0.0))
     return CoarseToFine(of_features=True).recover(attempt, result).pose_source

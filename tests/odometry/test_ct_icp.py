@@ -106,7 +106,7 @@ def test_both_poses_of_a_sweep_are_found_from_a_wrong_start() -> None:
     none = np.zeros((6, 6))
     free = ElasticConstraints(start, none, none, 0.0, np.zeros(6), 1e12 * np.eye(6))
     result = register_elastic(scanned(true), start, free, ANNEALING, 1e-3)
-    assert result.found.converged
+    assert result.result.converged
     for found, wanted in ((result.sweep.begin, true.begin), (result.sweep.end, true.end)):
         error = se3.relative(wanted, found)
         assert np.linalg.norm(error[:3, 3]) < 0.02
@@ -114,8 +114,8 @@ def test_both_poses_of_a_sweep_are_found_from_a_wrong_start() -> None:
     errors = np.concatenate([_off(result.sweep.begin, true.begin), _off(result.sweep.end, true.end)])
     nees = errors @ np.linalg.solve(result.covariance[:12, :12], errors) / 12
     assert 0.1 < nees < 6
-    assert len(result.found.weak) == 0
-    np.testing.assert_allclose(result.found.pose, result.sweep.begin, atol=1e-12)
+    assert len(result.result.degenerate) == 0
+    np.testing.assert_allclose(result.result.T_world_lidar, result.sweep.begin, atol=1e-12)
 
 
 def _off(found: Floats, true: Floats) -> Floats:

@@ -16,7 +16,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence, select
 from lslam.odometry import create_odometry
 from lslam.odometry.frontend.register_scans import estimate
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 from lslam.studies.worker import ScanStore, SequenceCache
 

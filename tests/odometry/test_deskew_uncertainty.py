@@ -13,7 +13,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.uncertainty import DeskewUncertainty, PoseUncertainty
 from lslam.pipeline.run import run
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 SPAN = 0.1

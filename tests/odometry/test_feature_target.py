@@ -30,8 +30,8 @@ from lslam.odometry.feature_solver import (
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.registration.preprocessing.features import Features, extract_features
 from lslam.registration.registration import Registration
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult
 
 Floats = NDArray[np.float64]
 
@@ -212,7 +212,9 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     assert registration.target.all_points is not None
     entered = []
     for is_starved in (False, True, *[False] * (FED + 2)):
-        monkeypatch.setattr(RegistrationResult, "is_well_constrained", lambda *_, starved=is_starved: not starved)
+        monkeypatch.setattr(
+            "lslam.odometry.feature_policies.is_well_constrained", lambda *_, starved=is_starved: not starved
+        )
         result = registration.locate(features, np.eye(4))
         assert (result.pose_source == ALL_POINTS) == is_starved
         registration.update(result)

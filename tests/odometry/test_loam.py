@@ -27,7 +27,7 @@ from lslam.odometry.loam import Loam
 from lslam.registration.policies import AtRest
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.features import FeaturePoints, Features
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

@@ -25,7 +25,7 @@ from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import estimate
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.loam_livox import TRUST, joined, line_weights
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

@@ -20,7 +20,7 @@ from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
 from lslam.odometry.frontend.register_scans import estimate
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 Floats = NDArray[np.float64]
 Recordings = Callable[[str], Path]

@@ -8,7 +8,7 @@ from drives import ate, coasting, drive, nees_per_dof, poses_of, standing
 
 from lslam.core.config.odometry import RegistrationConfig, Residual
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 FAMILY: tuple[Residual, ...] = ("gicp", "vgicp", "ndt")
 DENSE, SPARSE = ("street", 1, 25, "hdl64"), ("street", 0, 35, "vlp16")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
 from lslam.odometry.uncertainty import PoseUncertainty
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 C = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
 LEVER = 10.0

@@ -12,13 +12,13 @@ from lslam.core.geometry import se3, so3
 from lslam.registration.acceptance import PRIOR_COVARIANCE, Acceptance, correction
 from lslam.registration.attempt import Attempt
 from lslam.registration.history import History
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 CONFIG = RegistrationConfig(min_overlap=0.6, min_agreement=0.5, max_jump_m=5.0, max_jump_deg=30.0)
 PRIOR = se3.make(np.eye(3), np.array([1.0, 2.0, 3.0]))
 
 
-def judged(
+def judge(
     source: str = "points", metres: float = 0.1, degrees: float = 1.0, matched: int = 90, inliers: int = 80,
     reason: str = "",
 ) -> RegistrationResult:  # fmt: skip
@@ -30,7 +30,7 @@ def judged(
     history = History(CONFIG)
     history.agreement.observe(0.8)
     history.matches.observe(0.6)
-    return attempt(CONFIG, history, source).judged(result)
+    return attempt(CONFIG, history, source).judge(result)
 
 
 def attempt(config: RegistrationConfig, history: History, source: str = "points") -> Attempt:
@@ -43,11 +43,11 @@ def test_the_share_of_matches_that_agree_is_judged_by_the_share_of_earlier_scans
     for usual, is_accepted in ((0.2, True), (0.7, False)):
         history = History(RegistrationConfig())
         history.matches.observe(usual)
-        assert attempt(RegistrationConfig(), history).judged(result).ok == is_accepted
+        assert attempt(RegistrationConfig(), history).judge(result).ok == is_accepted
 
 
 def test_an_accepted_result_has_its_correction_of_the_prior() -> None:
-    result = judged()
+    result = judge()
     assert (result.ok, result.reason, result.inliers) == (True, "", 80)
     np.testing.assert_allclose(result.prior_error, (0.1, np.deg2rad(1.0)))
 
@@ -65,7 +65,7 @@ def test_an_accepted_result_has_its_correction_of_the_prior() -> None:
 )
 def test_a_rejected_result_keeps_the_prior_with_a_reason(facts: dict[str, float], reason: str) -> None:
     for source in ("points", "features"):
-        result = judged(source, **facts)  # type: ignore[arg-type]
+        result = judge(source, **facts)  # type: ignore[arg-type]
         why = (result.ok, result.reason, result.iterations, result.source_points)
         assert why == (False, reason.format(source), 7, 100)
         np.testing.assert_array_equal(result.T_world_lidar, PRIOR)

@@ -15,7 +15,7 @@ from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.geometry import se3
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

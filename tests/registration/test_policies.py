@@ -15,7 +15,7 @@ from lslam.core.geometry import se3
 from lslam.registration.policies import AtRest, CoarseToFine, policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.registration.start_search import StartSearch
 
 Floats = NDArray[np.float64]

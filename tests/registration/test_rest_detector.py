@@ -13,7 +13,7 @@ from lslam.core.geometry import se3, so3
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.rest import RestDetector
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -31,7 +31,7 @@ def noisy(twists: Floats, seed: int = 0) -> list[RegistrationResult]:
 
 def at_rest(results: Iterable[RegistrationResult]) -> NDArray[np.bool_]:
     detector = RestDetector(0.03)
-    return np.array([detector.judged(result).is_stationary for result in results])
+    return np.array([detector.judge(result).is_stationary for result in results])
 
 
 def along(axis: int, steps: Floats) -> Floats:
@@ -66,21 +66,21 @@ def test_a_slow_sensor_is_not_at_rest(axis: int, step: float, seed: int) -> None
 
 def test_a_pose_that_is_unsure_or_rejected_is_no_rest() -> None:
     detector, (result, *_) = RestDetector(0.03), noisy(np.zeros((1, 6)))
-    detector.judged(result)
-    assert not detector.judged(RegistrationResult(result.T_world_lidar, covariance=None)).is_stationary
-    detector.judged(result)
-    assert not detector.judged(result.rejected("the IMU", result.T_world_lidar, C)).is_stationary
+    detector.judge(result)
+    assert not detector.judge(RegistrationResult(result.T_world_lidar, covariance=None)).is_stationary
+    detector.judge(result)
+    assert not detector.judge(result.rejected("the IMU", result.T_world_lidar, C)).is_stationary
     # 10 cm are no rest, however little is known.
     far = RegistrationResult(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])), covariance=1e4 * C, lever_arm=LEVER_M)
-    detector.judged(result)
-    assert not detector.judged(far).is_stationary
+    detector.judge(result)
+    assert not detector.judge(far).is_stationary
 
 
 def test_a_scan_that_failed_says_nothing() -> None:
     detector, results = RestDetector(0.03), noisy(np.zeros((3, 6)))
-    detector.judged(results[0])
-    assert not detector.judged(RegistrationResult(np.eye(4), ok=False)).is_stationary
-    assert detector.judged(results[1]).is_stationary
+    detector.judge(results[0])
+    assert not detector.judge(RegistrationResult(np.eye(4), ok=False)).is_stationary
+    assert detector.judge(results[1]).is_stationary
 
 
 def test_the_map_does_not_follow_scans_from_one_place() -> None:

@@ -23,8 +23,9 @@ from lslam.core.geometry import se3, so3
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.solver import solve
 
 Floats = NDArray[np.float64]
 FINE = Annealing(1.0, 0.15, 0.5, 20)

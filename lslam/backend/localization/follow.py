@@ -9,7 +9,7 @@ import numpy as np
 
 from lslam.backend.graph.drift import drift_covariance
 from lslam.backend.graph.odometry_constraints import growth
-from lslam.backend.localization.prior_map import LocalView
+from lslam.backend.localization.prior_map import MAP_MIN_INLIERS, MAP_MIN_OVERLAP, LocalView
 from lslam.core.config.config import Config
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.geometry.noise import quantile
@@ -18,12 +18,12 @@ from lslam.core.types.constraint import FixStatus, MapFix
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
-from lslam.registration.acceptance import MAP_MIN_INLIERS, MAP_MIN_OVERLAP, Acceptance, correction
+from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import NEAR_KERNEL
 from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import UsualAgreement
-from lslam.registration.solver import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # Sigmas that the kernel spans, and the chance that the innovation of a scan that the map holds lies beyond its gate.

@@ -26,6 +26,9 @@ BLOCK = 32.0
 KEPT = 3
 # Points that the vertical is estimated from, at most, and that one insertion takes.
 LOOKED_AT, AT_ONCE = 400_000, 1 << 17
+# On a map of another day no earlier scan tells how many points can agree: the shares of a scan that the map has, and that agree.
+MAP_MIN_OVERLAP = 0.2
+MAP_MIN_INLIERS = 0.3
 
 
 @dataclass

@@ -11,17 +11,19 @@ from numpy.typing import NDArray
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.keyframes.submaps import mounted_up, submap
 from lslam.backend.localization.place_search import APART, PlaceSearch, Region
+from lslam.backend.localization.prior_map import MAP_MIN_INLIERS
 from lslam.backend.loops.level_submap import LevelSubmap, find_up, level_rotation, make_level_submap
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats
-from lslam.registration.acceptance import MAP_MIN_INLIERS, Acceptance
+from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.preprocessing.up import ahead_of
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.solver import solve
 
 # m between two keyframes that are tried.
 SPACING = 6.0

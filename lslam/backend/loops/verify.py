@@ -16,8 +16,9 @@ from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.constraint import LoopStage
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, solve
+from lslam.registration.solver import solve
 
 # Cells; the smaller image serves where the search is short.
 SMALL, LARGE = BevGrid(128), BevGrid(256)

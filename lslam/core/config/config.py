@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError, model_validator
+from pydantic import BaseModel, ValidationError
 
 from lslam.core.config.backend import (
     DebugConfig,
@@ -22,19 +22,8 @@ from lslam.core.config.backend import (
     LoopsConfig,
     OsmConfig,
 )
-from lslam.core.config.input import InputConfig, PreprocessConfig
-from lslam.core.config.odometry import (
-    TIGHTLY_COUPLED,
-    ImuConfig,
-    LioMappingConfig,
-    LioSamConfig,
-    LoamConfig,
-    OdometryConfig,
-    RecoveryConfig,
-    RegistrationConfig,
-)
+from lslam.core.config.odometry import FrontEndConfig
 from lslam.core.config.outputs import EvalConfig, MapConfig, ReportConfig
-from lslam.core.config.section import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.core.printable import toml_text
 from lslam.core.untrusted import is_file, parse_toml
@@ -52,18 +41,9 @@ REMOVED = {
 }
 
 
-class Config(Section):
+class Config(FrontEndConfig):
     """All sections; the defaults are one configuration for every sensor."""
 
-    input: InputConfig = InputConfig()
-    preprocess: PreprocessConfig = PreprocessConfig()
-    odometry: OdometryConfig = OdometryConfig()
-    registration: RegistrationConfig = RegistrationConfig()
-    recovery: RecoveryConfig = RecoveryConfig()
-    loam: LoamConfig = LoamConfig()
-    lio_sam: LioSamConfig = LioSamConfig()
-    lio_mapping: LioMappingConfig = LioMappingConfig()
-    imu: ImuConfig = ImuConfig()
     keyframes: KeyframesConfig = KeyframesConfig()
     loops: LoopsConfig = LoopsConfig()
     graph: GraphConfig = GraphConfig()
@@ -74,21 +54,6 @@ class Config(Section):
     eval: EvalConfig = EvalConfig()
     report: ReportConfig = ReportConfig()
     debug: DebugConfig = DebugConfig()
-
-    @model_validator(mode="before")
-    @classmethod
-    def _with_needed_imu(cls, given: Any) -> Any:
-        """A tightly coupled method cannot do without the IMU.
-
-        >>> Config.model_validate({"odometry": {"method": "fast-lio2"}}).imu.use
-        True
-        """
-        odometry = given.get("odometry") if isinstance(given, dict) else None
-        method = odometry.get("method") if isinstance(odometry, dict) else getattr(odometry, "method", None)
-        if method not in TIGHTLY_COUPLED:
-            return given
-        imu = given.get("imu", {})
-        return {**given, "imu": {**(imu if isinstance(imu, dict) else imu.model_dump()), "use": True}}
 
 
 _UNIT = re.compile(r"((?:%|deg|rad|m2?|s)(?:/(?:100 m|m|s2?))?(?: per sqrt\((?:s|Hz)\))?); ")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from lslam.core.config.input import InputConfig, PreprocessConfig
 from lslam.core.config.section import Section
 
 # Methods whose estimate is of points and IMU together.
@@ -307,3 +308,32 @@ class ImuConfig(Section):
     gap_s: float = Field(
         0.1, gt=0, description="s; time without samples beyond which a scan falls back to constant velocity"
     )
+
+
+class FrontEndConfig(Section):
+    """The sections of what registers scans."""
+
+    input: InputConfig = InputConfig()
+    preprocess: PreprocessConfig = PreprocessConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    recovery: RecoveryConfig = RecoveryConfig()
+    loam: LoamConfig = LoamConfig()
+    lio_sam: LioSamConfig = LioSamConfig()
+    lio_mapping: LioMappingConfig = LioMappingConfig()
+    imu: ImuConfig = ImuConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_needed_imu(cls, given: Any) -> Any:
+        """A tightly coupled method cannot do without the IMU.
+
+        >>> FrontEndConfig.model_validate({"odometry": {"method": "fast-lio2"}}).imu.use
+        True
+        """
+        odometry = given.get("odometry") if isinstance(given, dict) else None
+        method = odometry.get("method") if isinstance(odometry, dict) else getattr(odometry, "method", None)
+        if method not in TIGHTLY_COUPLED:
+            return given
+        imu = given.get("imu", {})
+        return {**given, "imu": {**(imu if isinstance(imu, dict) else imu.model_dump()), "use": True}}

@@ -153,7 +153,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     Where the IMU begins later, its first seconds, and all scans before.
     """
     whole, first = (sequence.whole, int(sequence.indices[0])) if isinstance(sequence, Selection) else (sequence, 0)
-    begin_ns = first_heard_ns(sequence.imu, whole.stamps_ns[first:], config)
+    begin_ns = first_imu_ns(sequence.imu, whole.stamps_ns[first:], config)
     if motion is None and begin_ns > whole.stamps_ns[first]:
         log.info("the IMU begins %.1f s after the first scan", 1e-9 * (begin_ns - whole.stamps_ns[first]))
     end_ns = begin_ns + round(1e9 * config.imu.start_s)
@@ -189,7 +189,7 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     )  # fmt: skip
 
 
-def first_heard_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int:
+def first_imu_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int:
     """Since when the IMU tells of the scans: from the first on, unless it begins among the later ones."""
     first_ns = int(stamps_ns[0])
     if imu is None:
@@ -223,7 +223,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "decisions": part.notes,
         "velocity": motion.config.velocity,
         "time_offset_s": round(opening.offset_s + last.gyroscope.offset_s, 5),
-        **calibration_found(last.gyroscope, opening),
+        **calibration_of(last.gyroscope, opening),
         "is_checked_by_turns": opening.is_checked,
         "is_static_start": opening.is_static,
         "gyro_bias_rad_s": _rounded(last.gyroscope.bias, 5),
@@ -298,7 +298,7 @@ def _is_turned(gyroscope: Gyroscope) -> bool:
     return angle**2 > SIGMAS * float(np.sqrt(rotation @ covariance @ rotation))
 
 
-def calibration_found(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, Any]:
+def calibration_of(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, Any]:
     """For the manifest: what was estimated, with its sigma; empty where nothing was to be.
 
     `mounting_deg` turns readings into the axes of the T_lidar_imu that was given, a rotation vector; `T_lidar_imu` is that with

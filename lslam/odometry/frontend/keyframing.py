@@ -49,12 +49,12 @@ class Keyframing(Stateful):
         Raises OutputError when the store cannot be written, by this scan or one before.
         """
         keyframe = self._selector.consider(position, result)
-        is_known = len(motion.times) > 1
-        if self._unknown and is_known:
+        has_motion = len(motion.times) > 1
+        if self._unknown and has_motion:
             self._make_unknown(motion)
         if keyframe is None or scan is None:
             return
-        if not is_known and scan.span.seconds > 0 and self._config.preprocess.deskew:
+        if not has_motion and scan.span.seconds > 0 and self._config.preprocess.deskew:
             self._unknown.append(_Due(keyframe, scan))
         else:
             self._make(keyframe, scan, motion)

@@ -91,17 +91,17 @@ class SegmentTracker(Stateful):
             return self._finish()
         first = self._tracked(self.present, loaded, result, self._segment)
         other = None if self._other is None else self._trial(self._other, loaded)
-        is_held = first.result.status == "ok"
-        if is_held:
+        is_registered = first.result.status == "ok"
+        if is_registered:
             self._usual.observe(_share(first.result))
         is_new = other is not None and other.result.status == "ok" and not self._usual.is_collapse(_share(other.result))
         if other is not None and is_new:
             self._open.append((first, other))
-            if is_held and not _is_less(first.result, other.result):
+            if is_registered and not _is_less(first.result, other.result):
                 return self._finish()
-            return self._new_segment() if is_held or len(self._open) > self.initial_scans else []
+            return self._new_segment() if is_registered or len(self._open) > self.initial_scans else []
         decided = self._finish()
-        if is_held or self.begin is None or loaded.scan is None:
+        if is_registered or self.begin is None or loaded.scan is None:
             return [*decided, first]
         self._other = self.begin(first.result.T_world_lidar)
         other = self._trial(self._other, loaded)

@@ -19,7 +19,7 @@ from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionMo
 from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.odometry.scan_outcome import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
 # between the prior and the first.
@@ -232,15 +232,15 @@ class Tracker(Stateful):
         if fused.is_accepted:
             return _both(located, fused)
         apart, off = (_apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
-        chosen = located if near.ok and apart < SAME * off else rejected
+        source = located if near.ok and apart < SAME * off else rejected
         # Where nothing is found near by, the first registration enters with the points as they are seen from there.
         base = near
         if not near.ok:
             own = replace(located, points=near.points, sweep=near.sweep)
             base = replace(own, iterations=near.iterations, stages=near.stages)
-        moved = base.moved(chosen.T_world_lidar, chosen.covariance)
-        is_rejected = base.ok and not chosen.is_accepted
-        moved = replace(moved, is_rejected=is_rejected, reason=chosen.reason, converged=chosen.converged)
+        moved = base.moved(source.T_world_lidar, source.covariance)
+        is_rejected = base.ok and not source.is_accepted
+        moved = replace(moved, is_rejected=is_rejected, reason=source.reason, converged=source.converged)
         return _both(located, moved)
 
     def _begin_again(

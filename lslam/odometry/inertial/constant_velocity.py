@@ -15,7 +15,7 @@ from lslam.core.types.scan import Span
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.course import Course, motion_covariance
 from lslam.registration.preprocessing.deskew import knots_over
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 class MotionModel(Protocol):

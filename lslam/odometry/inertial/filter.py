@@ -17,7 +17,7 @@ from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.imu_estimate import PLACE_SIGMA, TURN_SIGMA, ImuEstimate
 from lslam.odometry.inertial.navigation_state import POSE, NavigationState
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 
 class FilterMotion(InertialMotion):
@@ -66,8 +66,8 @@ class FilterMotion(InertialMotion):
             return prior
         middle, _ = middle_of(prior, stamp_ns, pose)
         T_world_imu = middle @ self.T_lidar_imu
-        noise_found = np.diag(np.repeat([PLACE_SIGMA**2, TURN_SIGMA**2], 3))
-        estimate = state.moved_to(T_world_imu, noise_found).estimate
+        registration_noise = np.diag(np.repeat([PLACE_SIGMA**2, TURN_SIGMA**2], 3))
+        estimate = state.moved_to(T_world_imu, registration_noise).estimate
         swept = self._prior(estimate, instant_ns, middle, stamp_ns, prior.times)
         return replace(swept, covariance=prior.covariance)
 

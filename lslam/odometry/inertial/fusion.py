@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
+from lslam.core.config import Config
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
@@ -19,11 +20,12 @@ from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_o
 from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
 from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import apart, vector_between
 from lslam.registration.preprocessing.deskew import knots_over
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 log = logging.getLogger("lslam")
 
@@ -67,6 +69,11 @@ class InertialMotion(Stateful):
         self._increments: Increments | None = None
         self._expected: tuple[int, Floats] | None = None
         self._errors: list[tuple[float, float]] = []
+
+    @classmethod
+    def of(cls, opening: InertialStart, config: Config) -> Self:
+        """A model that takes nothing but the IMU as a run opened it, and its section."""
+        return cls(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
 
     @property
     def _is_filter(self) -> bool:
@@ -125,9 +132,9 @@ class InertialMotion(Stateful):
         e = self.estimate
         step = self._since_last(instant_ns)
         begin, end = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
-        R_felt = begin[:3, :3] @ step.rotations[-1]
-        moved, P = self._felt_motion(step)
-        rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_felt @ vector_between(R_felt, end[:3, :3])])
+        R_imu = begin[:3, :3] @ step.rotations[-1]
+        moved, P = self._imu_motion(step)
+        rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_imu @ vector_between(R_imu, end[:3, :3])])
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
         if float(kalman.square(rest, P + 2 * C)) / (len(rest) * OUTLIER**2) > 1:
@@ -137,16 +144,16 @@ class InertialMotion(Stateful):
         pose, covariance = kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age)
         return result.moved(pose, covariance)
 
-    def _felt_motion(self, step: Increments) -> tuple[Floats, Floats]:
+    def _imu_motion(self, step: Increments) -> tuple[Floats, Floats]:
         """How far, m, the IMU came over `step` from the newest pose, (3,), and the covariance (6, 6) of that and of its turn.
 
         All in world axes.
         """
         R = (self._pose @ self.T_lidar_imu)[:3, :3]
-        R_felt = R @ step.rotations[-1]
+        R_imu = R @ step.rotations[-1]
         moved, spread = self.estimate.displacement(step, R)
         P = np.zeros((6, 6))
-        P[:3, :3], P[3:, 3:] = spread, R_felt @ self.estimate.gyroscope.turn_covariance(step) @ R_felt.T
+        P[:3, :3], P[3:, 3:] = spread, R_imu @ self.estimate.gyroscope.turn_covariance(step) @ R_imu.T
         return moved, P
 
     def _rejected(
@@ -188,7 +195,7 @@ class InertialMotion(Stateful):
                     self._judge(stamp_ns, pose)
                     self.estimate = self._corrected(instant_ns, middle)
                 else:
-                    self.estimate = self._carried(instant_ns)
+                    self.estimate = self._propagated(instant_ns)
             elif self._instant_ns is None:
                 self.estimate = self._advanced(stamp_ns, instant_ns)
         self.coasting.correct(instant_ns, middle)
@@ -260,7 +267,7 @@ class InertialMotion(Stateful):
     def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
         if self.config.velocity == "integrated":
-            return self._carried(instant_ns)
+            return self._propagated(instant_ns)
         if self.config.velocity == "along-x":
             return self._level_along_x(instant_ns, middle)
         a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
@@ -278,8 +285,8 @@ class InertialMotion(Stateful):
         speed = way / (1e-9 * (instant_ns - self._instant_ns))
         return replace(self.estimate, velocity=speed * middle[:3, 0], gravity=-GRAVITY * middle[:3, 2])
 
-    def _carried(self, instant_ns: int) -> ImuEstimate:
-        return self.estimate.carried(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
+    def _propagated(self, instant_ns: int) -> ImuEstimate:
+        return self.estimate.propagated(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
 
     def _since_last(self, instant_ns: int) -> Increments:
         """What the IMU felt since the last scan, integrated once for all who ask before the next `correct`."""
@@ -293,7 +300,7 @@ class InertialMotion(Stateful):
         if instant_ns <= stamp_ns or not self._covers(stamp_ns, instant_ns):
             return self.estimate
         step = self.estimate.over(self.imu, np.array([stamp_ns, instant_ns]))
-        return self.estimate.carried(step, self.T_lidar_imu[:3, :3])
+        return self.estimate.propagated(step, self.T_lidar_imu[:3, :3])
 
     def _restart(self, instant_ns: int, middle: Floats) -> None:
         """After a gap, and a scan later, the velocity is that of registration over it, with a large covariance."""

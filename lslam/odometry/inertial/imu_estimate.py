@@ -80,7 +80,7 @@ class ImuEstimate:
         x, P = _propagate(self, step, R)
         return x[:3], P[:3, :3]
 
-    def carried(self, step: Increments, R: Floats) -> ImuEstimate:
+    def propagated(self, step: Increments, R: Floats) -> ImuEstimate:
         """The estimate at the last instant of `step`, with nothing but the IMU to go by; R (3, 3) of the IMU at the first."""
         x, P = _propagate(self, step, R)
         return self._with(x[3:], P[3:, 3:], step)
@@ -91,10 +91,10 @@ class ImuEstimate:
         step : as this estimate finds it `over` the two instants
         noise : (3, 3) rad2, world axes, of either rotation; None for a registration without covariance
         """
-        R_felt = R @ step.rotations[-1]
+        R_imu = R @ step.rotations[-1]
         if noise is None:
             noise = TURN_NOISE
-        return self.gyroscope.learnt(step, vector_between(R_felt, R_end), 2 * R_felt.T @ noise @ R_felt)
+        return self.gyroscope.learnt(step, vector_between(R_imu, R_end), 2 * R_imu.T @ noise @ R_imu)
 
     def corrected(
         self, imu: ImuStream, step: Increments, R: Floats, R_end: Floats, moved: Floats,

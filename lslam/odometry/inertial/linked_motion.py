@@ -28,7 +28,7 @@ from lslam.odometry.inertial.navigation_state import (
     transition,
 )
 from lslam.registration.acceptance import PRIOR_COVARIANCE
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # m/s2, change of velocity over a gap of the IMU, one sigma: a car brakes.
 BRAKING = 3.0

@@ -19,15 +19,21 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.fusion import InertialMotion
-from lslam.odometry.inertial.imu_estimate import ImuEstimate
+from lslam.odometry.inertial.gyroscope import ImuNoise
+from lslam.odometry.inertial.imu_estimate import GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 log = logging.getLogger("lslam")
 
 # Velocity, gravity and accelerometer bias of an `ImuEstimate` among the 18 of an `InertialState`.
 ESTIMATE = np.r_[6:9, 15:18, 9:12]
+
+
+def smoother_noise(noise: ImuNoise) -> SmootherNoise:
+    """The noise of an IMU as factors take it."""
+    return SmootherNoise(noise.force, noise.accel_walk, noise.gyro_walk, GRAVITY_WALK)
 
 
 class SmootherMotion(InertialMotion):
@@ -62,7 +68,7 @@ class SmootherMotion(InertialMotion):
         self._withdraw()
         C = result.covariance
         middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
-        step = self._felt_until(instant_ns)
+        step = self._increments_until(instant_ns)
         if C is None or not result.is_accepted or step is None:
             return result
         T_world_imu = middle @ self.T_lidar_imu
@@ -75,7 +81,7 @@ class SmootherMotion(InertialMotion):
             self._is_begun = False
             # The IMU's pose is as sure as the IMU, whatever registration said of its own.
             lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
-            covariance = noise.transported(self._felt_motion(step)[1], lever)
+            covariance = noise.transported(self._imu_motion(step)[1], lever)
             return result.rejected(str(error), prior.pose, covariance)
         self._added = instant_ns, state
         within = se3.relative(result.T_world_lidar, middle)
@@ -94,7 +100,7 @@ class SmootherMotion(InertialMotion):
         step = (
             None
             if is_registered
-            else self._felt_until(stamp_ns if prior is None else middle_of(prior, stamp_ns, pose)[1])
+            else self._increments_until(stamp_ns if prior is None else middle_of(prior, stamp_ns, pose)[1])
         )
         super().correct(stamp_ns, pose, prior, is_registered)
         if self._instant_ns is None or self._has_gap or self.refusal:
@@ -104,17 +110,17 @@ class SmootherMotion(InertialMotion):
         if added is not None and added[0] == self._instant_ns:
             state = added[1]
         else:
-            carried = None if step is None else self._carried_by_smoother(step)
-            if carried is None:
+            propagated = None if step is None else self._propagated_by_smoother(step)
+            if propagated is None:
                 # The first scan, the first behind a gap or a graph without solution, or one that stood: at its pose, by what
                 # the loose estimate knows.
                 self.smoother.begin(self._beginning())
                 self._is_begun = True
                 return
-            state = carried
+            state = propagated
         self.estimate = self._as_estimate(state)
 
-    def _carried_by_smoother(self, step: Increments) -> InertialState | None:
+    def _propagated_by_smoother(self, step: Increments) -> InertialState | None:
         """The state at the end of `step` by the IMU alone; None where the graph has no solution."""
         try:
             return self.smoother.add(self._measured(step))
@@ -149,11 +155,13 @@ class SmootherMotion(InertialMotion):
         self._is_begun, self._added = False, None
         return super().rewind(stamp_ns, pose, span)
 
-    def _felt_until(self, instant_ns: int) -> Increments | None:
+    def _increments_until(self, instant_ns: int) -> Increments | None:
         """What the IMU felt since the newest state; None where there is no such state, or the IMU was silent since."""
         before = self._instant_ns
-        is_felt = self._is_begun and before is not None and instant_ns > before and self._covers(before, instant_ns)
-        return self._since_last(instant_ns) if is_felt and not self.refusal else None
+        has_increments = (
+            self._is_begun and before is not None and instant_ns > before and self._covers(before, instant_ns)
+        )
+        return self._since_last(instant_ns) if has_increments and not self.refusal else None
 
     def _withdraw(self) -> None:
         if self._added is not None:

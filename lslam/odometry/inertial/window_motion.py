@@ -20,7 +20,7 @@ from lslam.odometry.inertial.filter import FilterMotion
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.navigation_state import POSE
 from lslam.odometry.inertial.window import Window, moment_of, off_by
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 # m, of a point at `LEVER_M`: a scan whose pose moved farther from where its points were linearised is linearised again.
 STALE_M = 0.005

@@ -94,7 +94,7 @@ class IntegrityMonitor(Stateful):
         self._is_broken |= (position > 0 and step_s > PAUSE_S) or not is_ok
         if scan is None or not is_ok or not self._is_due(position, scan, result, step_s):
             return
-        now = self._seen(position, scan, prepared, result, sweep)
+        now = self._view(position, scan, prepared, result, sweep)
         if self._reference is not None:
             self._compare(self._reference, now, self._emptied(self._reference, now, scan))
         self._reference, self._is_broken = now, False
@@ -131,7 +131,7 @@ class IntegrityMonitor(Stateful):
         motion, before = self._motion
         return np.asarray(se3.exp(seconds / before * se3.log(motion)))
 
-    def _seen(self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior) -> Seen:
+    def _view(self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior) -> Seen:
         if not (self._is_prepared and isinstance(prepared, PreparedPoints)):
             prepared = prepare_points(scan.points, self._preprocess, scan.index, scan.times)
         points = thin(prepared, 1 + len(prepared.source) // PLANE_POINTS)

@@ -19,8 +19,9 @@ from lslam.registration.local_map import BREADTH, WIDE
 from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE
+from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import RegistrationResult, result_of, voxel_terms
+from lslam.registration.solver import voxel_terms
 
 SETTINGS = RegistrationConfig(blob_weight=0.0)
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
@@ -129,9 +130,8 @@ class PairRegistration:
         return self._lay(motion, Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, 1))
 
     def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
-        result = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
+        motion = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
         away2 = self._matches.away2
-        motion = result_of(result, start, len(away2))
         cells = directions(se3.apply(motion.T_world_lidar, self._source))
         on_planes = (away2 >= 0) & (away2 < SETTINGS.kernel_min**2)
         return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))

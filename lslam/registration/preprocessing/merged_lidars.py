@@ -44,14 +44,14 @@ class FurtherLidar:
 class _Reading:
     """A further LiDAR as it is read: `sweep` of its scans, None without times; begins, ends : (N,) ns of its scans.
 
-    held : the scans that were used last, by index
+    cache : the scans that were used last, by index
     """
 
     lidar: FurtherLidar
     sweep: Span | None
     begins: Longs
     ends: Longs
-    held: dict[int, Scan | None]
+    cache: dict[int, Scan | None]
 
 
 class MergedLidars(SequenceView):
@@ -101,8 +101,8 @@ class MergedLidars(SequenceView):
         begin, end = int(self._edges[index]), int(self._edges[index + 1])
         end = min(end, begin + round(_LONGEST_SWEEP * self._period_ns))
         first, last = int(np.searchsorted(source.ends, begin)), int(np.searchsorted(source.begins, end))
-        cache = source.held
-        source.held = cache = {k: cache[k] if k in cache else _read(source.lidar, k) for k in range(first, last)}
+        cache = source.cache
+        source.cache = cache = {k: cache[k] if k in cache else _read(source.lidar, k) for k in range(first, last)}
         for scan in cache.values():
             if scan is None or not len(scan):
                 continue

@@ -194,8 +194,8 @@ def _gated(
     """The points that `gate_points` keeps, and their times: in one pass where only the gate asks."""
     if not (config.remove_ground or config.denoise):
         return voxel.gated(cloud, times, *_gate_of(config))
-    chosen = gate_points(cloud, config)
-    return voxel.take(cloud, chosen), times[chosen] if len(times) else times
+    rows = gate_points(cloud, config)
+    return voxel.take(cloud, rows), times[rows] if len(times) else times
 
 
 Down = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
@@ -210,14 +210,14 @@ def _source_points(
     if config.downsample == "grid":
         return voxel.centroids(map_points, map_times, config.source_voxel)[:3]
     if config.downsample == "first":
-        chosen = voxel.first_points(cloud, config.source_voxel)
+        rows = voxel.first_points(cloud, config.source_voxel)
     elif config.downsample == "random":
         rng = np.random.default_rng((config.seed, index))
-        chosen = np.sort(rng.permutation(len(cloud))[: round(config.random_share * len(cloud))])
+        rows = np.sort(rng.permutation(len(cloud))[: round(config.random_share * len(cloud))])
     else:
-        chosen = np.arange(len(cloud))
-    times = cloud_times[chosen] if len(cloud_times) else cloud_times
-    return cloud[chosen], times, np.zeros((len(chosen), 6), np.float32)
+        rows = np.arange(len(cloud))
+    times = cloud_times[rows] if len(cloud_times) else cloud_times
+    return cloud[rows], times, np.zeros((len(rows), 6), np.float32)
 
 
 def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32], config: PreprocessConfig) -> Down:

@@ -20,7 +20,7 @@ from lslam.core.errors import ConfigError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.scan_result import StageClock
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 Floats = NDArray[np.float64]
 # Sigmas of odometry: 2 m along x, 0.5 m across, and three degrees.

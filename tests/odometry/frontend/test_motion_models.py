@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from lslam.core.geometry import so3
 from lslam.core.types.imu import ImuStream
 from lslam.odometry import METHODS
 from lslam.odometry.frontend.inertial_start import mounting_problem
-from lslam.odometry.frontend.motion_models import MOTION_MODELS, motion_of
+from lslam.odometry.frontend.motion_models import motion_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import AXES_SIGMA, Gyroscope
 from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
@@ -23,8 +24,11 @@ from lslam.pipeline.check import check_config
 
 
 def test_tightly_coupled_methods_are_those_with_a_motion_model_of_their_own() -> None:
-    assert set(MOTION_MODELS) == set(TIGHTLY_COUPLED)
-    assert set(TIGHTLY_COUPLED) <= set(METHODS)
+    own = {name for name, (module, _) in METHODS.items() if hasattr(import_module(module), "create_motion")}
+    assert own == set(TIGHTLY_COUPLED)
+    kinds = {name: type(turned_motion(config_of(f"odometry.method={name}"))) for name in (*TIGHTLY_COUPLED, "icp")}
+    assert kinds.pop("icp") is InertialMotion
+    assert InertialMotion not in kinds.values()
 
 
 def config_of(*settings: str) -> Config:
@@ -74,5 +78,5 @@ def test_turns_about_one_axis_do_not_blame_the_mounting() -> None:
 
 
 def test_methods_without_states_for_the_device_are_those_whose_motion_models_have_none() -> None:
-    fixed = [name for name in MOTION_MODELS if not turned_motion(config_of(f"odometry.method={name}")).HAS_DEVICE]
+    fixed = [name for name in TIGHTLY_COUPLED if not turned_motion(config_of(f"odometry.method={name}")).HAS_DEVICE]
     assert set(fixed) == set(FIXED_DEVICE)

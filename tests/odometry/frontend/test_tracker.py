@@ -20,7 +20,7 @@ from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.odometry.scan_outcome import recorded
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 SPAN_S, NO_SPAN = 0.1, Span()
 

@@ -14,7 +14,7 @@ from lslam.core.types.scan import Span
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.initialise import FirstPoses, start
 from lslam.odometry.inertial.integrate import Increments, integrate
-from lslam.registration.solver import RegistrationResult
+from lslam.registration.result import RegistrationResult
 
 Floats = NDArray[np.float64]
 

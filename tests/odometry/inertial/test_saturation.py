@@ -202,7 +202,7 @@ def test_saturation_adds_its_sigma_to_velocity_and_rotation() -> None:
     blind = replace(seen, hidden=np.tile([0.0, 3.0, 0.0, 0.0, 0.0, 0.5], (11, 1)))
     estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
     steps = [estimate.over(stream, stamps[[0, -1]]) for stream in (seen, blind)]
-    speeds = [estimate.carried(step, np.eye(3)).covariance[:3, :3] for step in steps]
+    speeds = [estimate.propagated(step, np.eye(3)).covariance[:3, :3] for step in steps]
     turns = [estimate.gyroscope.turn_covariance(step) for step in steps]
     np.testing.assert_allclose(speeds[1] - speeds[0], (0.1 * 3.0) ** 2 * np.eye(3), atol=1e-9)
     np.testing.assert_allclose(turns[1] - turns[0], (0.1 * 0.5) ** 2 * np.eye(3), atol=1e-9)

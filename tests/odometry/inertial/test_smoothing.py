@@ -11,12 +11,11 @@ from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Span
-from lslam.odometry.frontend.motion_models import smoother_noise
 from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
 from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
 from lslam.odometry.inertial.initialise import FirstPoses, start
-from lslam.odometry.inertial.smoothing import SmootherMotion
-from lslam.registration.solver import RegistrationResult
+from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
+from lslam.registration.result import RegistrationResult
 
 IMU_NOISE = smoother_noise(USUAL_NOISE)
 LEVER = np.array([0.4, -0.3, 0.2])
