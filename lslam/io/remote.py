@@ -1,7 +1,7 @@
-"""Object storage in place of a disk: what lies at `s3://`, `gs://` or another URL of fsspec is a path as any other.
+"""Object storage as paths: `s3://`, `gs://` and other URLs of fsspec behave like files on a disk.
 
-Readers ask a path what is there, list it and open it; a `RemotePath` answers from storage, and nothing is copied. What only
-a disk has (a file that grows, a lock, a rename) it does not have: `os.fspath` of it raises UsageError.
+Readers list, test and open paths; a `RemotePath` answers from storage, and nothing is copied. Features of a disk alone
+(appending, locks, renaming) are missing: `os.fspath` of it raises UsageError.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _NO_CONNECTION = re.compile(r"Connect|Timeout|gaierror|Endpoint|ServerDisconnect
 
 
 def as_path(place: str | Path) -> Path:
-    """The path of a word: one in storage for a URL, else one of the disk; a path stays what it is.
+    """Path of a word: a RemotePath for a URL, else a Path. A path is returned unchanged.
 
     >>> as_path("s3://bucket/drive7.bag").parent
     RemotePath('s3://bucket')
@@ -47,9 +47,11 @@ def as_path(place: str | Path) -> Path:
 
 
 class RemotePath(PosixPath):
-    """A place in storage. Everything asks the storage anew, but for paths that a folder's listing has just told of.
+    """Path in object storage.
 
-    Raises FileNotFoundError for what is not there, StorageError for what cannot be asked (permission, credentials, network),
+    Each call asks the storage, except for entries that a listing of their folder has just returned.
+
+    Raises FileNotFoundError for what is not there, StorageError for a failed request (permission, credentials, network),
     UsageError where the extra is missing.
     """
 
@@ -69,16 +71,16 @@ class RemotePath(PosixPath):
         return str(self)
 
     def absolute(self) -> RemotePath:
-        """Itself: a URL is nothing relative."""
+        """The path itself: a URL is always absolute."""
         return self
 
     def resolve(self, strict: bool = False) -> RemotePath:
-        """Without `..`; storage has no links."""
+        """Path without `..`; storage has no links."""
         scheme, *rest = self.parts
         return RemotePath(f"{scheme}//{posixpath.normpath('/'.join(rest))}")
 
     def expanduser(self) -> RemotePath:
-        """Itself."""
+        """The path itself."""
         return self
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
@@ -86,11 +88,11 @@ class RemotePath(PosixPath):
         return _stat(self._info())
 
     def exists(self, *, follow_symlinks: bool = True) -> bool:
-        """Whether there is an object of this name, or one below it."""
+        """Whether an object has this name or lies below it."""
         return self._kind() != ""
 
     def is_dir(self, **_: Any) -> bool:
-        """Whether there are objects below it."""
+        """Whether objects lie below it."""
         return self._kind() == "directory"
 
     def is_file(self, **_: Any) -> bool:
@@ -98,7 +100,7 @@ class RemotePath(PosixPath):
         return self._kind() == "file"
 
     def iterdir(self) -> Generator[RemotePath, None, None]:
-        """What lies in it, in the order of the names."""
+        """Entries of the folder, sorted by name."""
         with _asking(self, "listed") as (system, place):
             entries = system.ls(place, detail=True)
         for entry in sorted(entries, key=lambda entry: str(entry["name"])):
@@ -107,26 +109,26 @@ class RemotePath(PosixPath):
                 yield self._told(name, entry)
 
     def glob(self, pattern: str, **_: Any) -> Generator[RemotePath, None, None]:
-        """Of one level."""
+        """Entries of the folder that match a pattern of one level."""
         try:
             yield from (path for path in self.iterdir() if fnmatch.fnmatchcase(path.name, pattern))
         except FileNotFoundError:
             return
 
     def files(self) -> Iterator[tuple[str, os.stat_result]]:
-        """Name below it and `stat` of every object, in the order of the names: one request for a thousand of them."""
+        """Relative name and `stat` of every object below, sorted by name, with one request per thousand objects."""
         with _asking(self, "listed") as (system, place):
             found = system.find(place, detail=True)
         for name in sorted(found):
             yield name.strip("/").removeprefix(place.strip("/")).lstrip("/"), _stat(found[name])
 
     def read_bytes(self) -> bytes:
-        """All of the object."""
+        """Whole content of the object."""
         with _asking(self, "read") as (system, place):
             return bytes(system.cat_file(place))
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, newline: str | None = None) -> str:
-        """All of the object as text."""
+        """Whole content of the object as text."""
         with self.open(encoding=encoding, errors=errors, newline=newline) as stream:
             return str(stream.read())
 
@@ -141,7 +143,7 @@ class RemotePath(PosixPath):
         return stream if "b" in mode else io.TextIOWrapper(stream, encoding, errors, newline)
 
     def read_ranges(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        """The bytes [begin, end) of the object for each of `ranges`, asked for together."""
+        """Bytes [begin, end) of the object for each of `ranges`, requested together."""
         with _asking(self, "read") as (system, place):
             if len(ranges) == 1:
                 return [bytes(system.cat_file(place, start=ranges[0][0], end=ranges[0][1]))]
@@ -150,16 +152,16 @@ class RemotePath(PosixPath):
             return [bytes(data) for data in found]
 
     def mkdir(self, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
-        """Nothing: folders of storage are names."""
+        """Do nothing: folders of storage are prefixes of names."""
 
     def write_bytes(self, data: Any) -> int:
-        """Put an object there, which is whole at once."""
+        """Write an object; it appears whole at once."""
         with _asking(self, "written") as (system, place):
             system.pipe_file(place, bytes(data))
         return len(data)
 
     def upload(self, file: Path) -> None:
-        """Put the object of a file of this machine there, which is whole at once; a large one goes in parts."""
+        """Upload a local file; the object appears whole at once. Large files are sent in parts."""
         with _asking(self, "written") as (system, place):
             system.put_file(str(file), place)
 
@@ -211,7 +213,7 @@ def _changed_ns(info: dict[str, Any]) -> int:
 
 @contextmanager
 def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
-    """The file system of a path and its name there; what goes wrong in the block is said in one sentence."""
+    """File system of a path and its name there. Errors of the block become one sentence."""
     scheme = str(path).partition("://")[0]
     try:
         from fsspec.core import url_to_fs
@@ -235,7 +237,7 @@ def _asking(path: RemotePath, what: str) -> Iterator[tuple[Any, str]]:
 
 @cache
 def _silence() -> None:
-    """What goes wrong is said in one sentence, and not in tracebacks of every attempt."""
+    """Suppress the tracebacks that the storage library logs for every attempt."""
     for name in ("gcsfs", "s3fs", "fsspec"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 

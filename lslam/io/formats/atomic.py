@@ -1,4 +1,4 @@
-"""Files appear whole or not at all."""
+"""Atomic file writing: a file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from lslam.io.remote import RemotePath
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[BinaryIO]:
-    """A binary stream on `<name>.part`, renamed to `path` when the block ends well and removed when it does not.
+    """Open a binary stream on `<name>.part`.
 
-    In storage the object is put there when the block ends well.
-    Raises OutputError naming the file when it cannot be written (permissions, a full disk), StorageError likewise.
+    It is renamed to `path` when the block ends without an error, and removed otherwise. A path in storage is uploaded at that
+    moment. Raises OutputError naming the file when it cannot be written (permissions, a full disk), StorageError likewise.
     """
     if isinstance(path, RemotePath):
         held = io.BytesIO()
@@ -39,12 +39,13 @@ def atomic_write(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Text as UTF-8, atomically; of a path that is not, what UTF-8 cannot hold is written as JSON does, `\\udcef`."""
+    """Write text as UTF-8, atomically; bytes of a path that are no UTF-8 are written as JSON does, `\\udcef`."""
     with atomic_write(path) as stream:
         stream.write(text.encode("utf-8", "backslashreplace"))
 
 
 def _remove(part: Path) -> None:
+    """Delete a file, if it is there."""
     try:
         part.unlink(missing_ok=True)
     except OSError:

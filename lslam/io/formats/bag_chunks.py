@@ -1,4 +1,4 @@
-"""Recordings read piece by piece: the index of a topic, and the chunks that ROS 1 bags and MCAP files keep messages in."""
+"""Random access to recordings: the index of a topic, and the compressed chunks of ROS 1 bags and MCAP files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Pairs = NDArray[np.int64]
 
 
 class RangedFile:
-    """Bytes of an object, from any thread; `size` of them."""
+    """Bytes of an object in storage, `size` of them, readable from any thread."""
 
     def __init__(self, path: RemotePath) -> None:
         self.path, self.size = path, path.stat().st_size
@@ -42,9 +42,9 @@ class RangedFile:
         self._lock = threading.Lock()
 
     def expect(self, ranges: Iterable[tuple[int, int]]) -> None:
-        """Say which (position, size) will be read next, in any order; what was expected before is forgotten.
+        """Announce the (position, size) ranges that will be read next, in any order; earlier announcements are forgotten.
 
-        Nothing is expected twice: what is read again later is asked for by itself.
+        Each range is prefetched once. A second read of it is a request of its own.
         """
         last = max(self.size - 1, 0) // BLOCK
         numbers = {
@@ -57,7 +57,7 @@ class RangedFile:
             self._expected = sorted(numbers)
 
     def read(self, position: int, size: int) -> bytes:
-        """`size` bytes from `position`, fewer where the object ends."""
+        """Read `size` bytes from `position`, fewer where the object ends."""
         size = min(size, self.size - position)
         if size <= 0:
             return b""
@@ -69,12 +69,15 @@ class RangedFile:
         return data[position - first * BLOCK :][:size]
 
     def _due(self, number: int) -> slice:
-        """Which of the expected blocks are fetched with this one; none where it is not expected itself."""
+        """Announced blocks to fetch together with this one; none if this one was not announced."""
         at = bisect_left(self._expected, number)
         return slice(at, at + _AHEAD if self._expected[at : at + 1] == [number] else at)
 
     def _block(self, number: int, last: int) -> bytes:
-        """A block; where it has to be fetched, those up to `last` and those expected next are fetched with it."""
+        """One block of the object.
+
+        If it must be fetched, the blocks up to `last` and the announced ones are fetched with it.
+        """
         if number not in self._blocks:
             due = self._due(number)
             wanted = np.array(sorted({*range(number, last + 1), *self._expected[due]} - self._blocks.keys()))
@@ -91,7 +94,7 @@ class RangedFile:
 
 
 class CutOffError(Exception):
-    """The file ends where there should be more of it."""
+    """Raised when a file ends before the data that it should hold."""
 
 
 @dataclass(frozen=True)
@@ -129,10 +132,10 @@ class Topic:
 
 
 class ChunkFile:
-    """Random access to a file and to its chunks, from any thread; one decompressed chunk is kept."""
+    """Random access to a file and to its chunks, from any thread; the last decompressed chunk is cached."""
 
     def __init__(self, path: Path, unpacked: Path | None = None) -> None:
-        """Open `path`, or what it holds, where it was unpacked."""
+        """Open `path`, or its decompressed copy `unpacked` if there is one."""
         self.path = path
         with input_errors(path):
             self._ranged = RangedFile(path) if isinstance(path, RemotePath) else None
@@ -141,7 +144,7 @@ class ChunkFile:
         self._kept: tuple[int, bytes] = (-1, b"")
 
     def read(self, position: int, size: int) -> bytes:
-        """`size` bytes from `position`. Raises CutOffError when the file ends before."""
+        """Read `size` bytes from `position`. Raises CutOffError when the file ends before."""
         if size < 0 or position + size > self.size:
             raise CutOffError
         data = self._read(position, size)
@@ -159,18 +162,18 @@ class ChunkFile:
         return os.pread(self._file.fileno(), size, position)
 
     def expect(self, ranges: Callable[[], Iterable[tuple[int, int]]]) -> None:
-        """Of a file in storage: say which (position, size) of it will be read next, as `RangedFile.expect`.
+        """Announce the (position, size) ranges of a file in storage that will be read next, as `RangedFile.expect`.
 
-        It is no more than a hint, and so are places that the file itself gives: what is wrong with them goes unsaid.
+        It is only a hint, so wrong positions raise no error here.
         """
         if self._ranged:
             with contextlib.suppress(CutOffError, struct.error, LookupError, ValueError, InputError):
                 self._ranged.expect(ranges())
 
     def part(self, chunk: Chunk | None, offset: int, size: int, is_head: bool = False) -> bytes:
-        """At most `size` bytes of the records of `chunk` from `offset`; None is the file itself.
+        """Read at most `size` bytes of the records of `chunk` from `offset`. If `chunk` is None, read from the file itself.
 
-        is_head : no more of the chunk will be wanted than the beginnings of its messages
+        is_head : only the beginnings of the chunk's messages will be read
 
         Raises InputError when the chunk cannot be decompressed.
         """
@@ -183,7 +186,7 @@ class ChunkFile:
         ]
 
     def _unpacked(self, chunk: Chunk, least: int) -> bytes:
-        """The records of a chunk, `least` bytes of them at the least."""
+        """Decompressed records of a chunk, at least the first `least` bytes of them."""
         kept, records = self._kept
         if kept == chunk.position and len(records) >= least:
             return records
@@ -206,9 +209,11 @@ class ChunkFile:
 
 
 def unpack(compression: str, pieces: Iterator[bytes], most: int) -> bytes:
-    """What is packed in `pieces`, one frame or several, its first `most` bytes: a few may unpack to any number.
+    """Decompress `pieces`, one frame or several, up to `most` bytes.
 
-    Raises EOFError when it is cut off before that, and what the decompressors raise (`damage`).
+    The limit matters: a few bytes may decompress to any number.
+
+    Raises EOFError when the data end before that, and the errors of the decompressors (`damage`).
     """
     records, size, engine = list[bytes](), 0, None
     while size < most:
@@ -227,7 +232,7 @@ def unpack(compression: str, pieces: Iterator[bytes], most: int) -> bytes:
 
 
 def _codec(name: str) -> Callable[[], Any]:
-    """What makes a decompressor that takes a `max_length`."""
+    """Factory of a decompressor whose `decompress` takes a `max_length`."""
     if name == "bz2":
         return bz2.BZ2Decompressor
     if name == "lz4":
@@ -238,12 +243,12 @@ def _codec(name: str) -> Callable[[], Any]:
 
 
 def damage() -> tuple[type[Exception], ...]:
-    """What the decompressors raise."""
+    """Exception types that the decompressors raise on damaged data."""
     return (OSError, EOFError, ValueError, RuntimeError, zstd().ZstdError)
 
 
 def zstd() -> Any:
-    """The module: Python's own from 3.14 on."""
+    """The zstd module: Python's own from 3.14 on, else the backport."""
     if sys.version_info >= (3, 14):
         from compression import zstd
     else:

@@ -82,13 +82,13 @@ class BagTopic:
         return np.asarray(self._rows[0], np.int64)
 
     def place(self, k: int) -> tuple[Recording, Topic, int]:
-        """Where message `k` lies, and its number there. Raises IndexError beyond the last."""
+        """Part that holds message `k`, and the number of the message there. Raises IndexError beyond the last."""
         _, part, row = self._rows[:, k].tolist()
         return *self.parts[part], row
 
     @cached_property
     def _rows(self) -> Longs:
-        """(3, N) when each message was recorded, its part and its number there."""
+        """(3, N) of each message: time of recording (ns), part, and number within the part."""
         tables = [(t.stamps_ns, np.full(len(t), n), np.arange(len(t))) for n, (_, t) in enumerate(self.parts)]
         rows = np.concatenate([np.stack(table) for table in tables], axis=1)
         return rows[:, np.argsort(rows[0], kind="stable")]
@@ -104,7 +104,7 @@ class Header(NamedTuple):
 
 
 class Bag:
-    """The files of one recording, as one bag; messages are read when they are asked for, from any thread."""
+    """All files of one recording as one bag. Messages are read on demand, from any thread."""
 
     def __init__(self, path: Path, files: list[Path]) -> None:
         """Open the files of a recording.
@@ -138,7 +138,7 @@ class Bag:
         return [t for t in self.topics if len(t) and t.encoding in _ENCODINGS and t.type.rsplit("/", 1)[-1] in names]
 
     def message(self, topic: BagTopic, k: int, limit: int | None = None) -> bytes:
-        """Message `k` of `topic` as it was serialised, or its first `limit` bytes at the least.
+        """Serialised bytes of message `k` of `topic`, at least the first `limit` of them.
 
         Raises InputError when it is damaged.
         """
@@ -149,9 +149,9 @@ class Bag:
     def each(
         self, topic: BagTopic, read: Callable[[bytes], T], problems: list[str], limit: int | None = None
     ) -> Iterator[tuple[int, T]]:
-        """The number of every message of `topic` and what `read` makes of it, or of its first `limit` bytes.
+        """Iterate over `topic`: the number of each message, and the result of `read` on its bytes, at least the first `limit`.
 
-        Of those that are damaged the first are named in `problems`, the others counted.
+        Damaged messages are skipped. The first few are named in `problems`, the others counted.
         """
         broken: list[str] = []
         for recording, part in topic.parts:
@@ -181,7 +181,10 @@ class Bag:
 
 
 def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[Recording]:
-    """The files opened; why others cannot be goes to `losses`. Raises InputError where none can."""
+    """Open the files.
+
+    The reasons why some cannot be opened are added to `losses`. Raises InputError where none can.
+    """
     packed: list[str] = []
     recordings: list[Recording] = []
     failures: list[InputError] = []
@@ -205,9 +208,9 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
 
 
 def _copies(files: list[list[Topic]]) -> dict[int, int]:
-    """Which files, by their topics, hold nothing but what another one holds, and which that is; of equal ones the first stays.
+    """For each file that duplicates another, by topics and times: the file that it duplicates. Of equal files the first stays.
 
-    A copy is made by converting, compressing, indexing or filtering: it keeps names of topics and times of recording.
+    Converting, compressing, indexing and filtering a bag keep the names of topics and the times of recording.
     """
     counts = [sum(map(len, topics)) for topics in files]
     copies: dict[int, int] = {}
@@ -222,7 +225,10 @@ def _copies(files: list[list[Topic]]) -> dict[int, int]:
 
 
 def _is_within(topics: list[Topic], others: list[Topic]) -> bool:
-    """Whether every message is among the others, by topic and time; where one begins or ends outside, no more is compared."""
+    """Whether every message of a file is also in the others, by topic and time.
+
+    The comparison stops early if its time range is not within theirs.
+    """
 
     def has_all(stamps: Longs, wanted: Longs) -> bool:
         is_around = len(stamps) > 0 and stamps[0] <= wanted[0] and wanted[-1] <= stamps[-1]
@@ -244,7 +250,7 @@ def _check_encodings(path: Path, topics: list[BagTopic]) -> None:
 
 
 def _reader(path: Path, there: Path) -> _Reader:
-    """By the file's first bytes, else by its name."""
+    """Reader of a file, chosen by its first bytes, else by its name."""
     by_name = READERS[suffix_of(path)]
     if isinstance(there, RemotePath):
         return by_name
@@ -279,7 +285,10 @@ def read_header(topic: BagTopic, data: bytes) -> Header:
 
 @cache
 def typestore(encoding: str) -> Any:
-    """The standard message types: their layout never changed, so what a bag says about them is not needed."""
+    """Standard message types of ROS.
+
+    Their layout never changed, so the definitions stored in a bag are not needed.
+    """
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
@@ -289,7 +298,7 @@ def typestore(encoding: str) -> Any:
 
 
 def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
-    """A message that was compressed by itself; what is wanted of its beginning lies in the first block."""
+    """Decompress a message that was compressed on its own; its beginning lies in the first block."""
     packed = recording.read(topic, k, None if limit is None else _ZSTD_BLOCK)
     try:
         data = unpack("zstd", iter([packed]), LARGEST + 1 if limit is None else limit)
@@ -302,9 +311,10 @@ def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> 
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Path, str]]:
-    """A file with what `path` holds, and what it lacks, a sentence; `path` itself where it is not compressed.
+    """Decompress a file that is compressed as a whole: path of the copy, and a sentence about missing data.
 
-    The file has no name any more after the `with`: whoever opened it meanwhile has it until it is closed.
+    A file that is not compressed gives `path` itself. The copy is deleted after the `with`. Handles that were opened within
+    stay valid until they are closed.
 
     Raises InputError when nothing can be unpacked, OutputError for a full disk, UsageError for storage.
     """
@@ -324,7 +334,7 @@ def unpacked(path: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _kind(path: Path) -> str:
-    """How it is compressed: by its first bytes, whatever its name; a name that they contradict is refused."""
+    """Compression of a file by its first bytes. A name that contradicts them is refused."""
     if isinstance(path, RemotePath):
         return packing_of(path)
     with input_errors(path), path.open("rb") as stream:

@@ -1,4 +1,4 @@
-"""Which files are bags, which of them make one recording, and what the numbers in their names and `metadata.yaml` miss."""
+"""Bag files on disk: which files are bags, which belong to one recording, and which parts are missing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _COMPANIONS = ("-wal", "-shm", "-journal")
 def list_bag_files(path: Path) -> list[Path]:
     """The file itself, or the bag files of a folder in natural order; empty when there are none.
 
-    Of a part that lies there as it is and compressed as well, the first.
+    If a part is there both plain and compressed, only the first is listed.
     """
     if path.is_file():
         return [path] if suffix_of(path) else []
@@ -36,7 +36,7 @@ def list_bag_files(path: Path) -> list[Path]:
 
 
 def left_out(path: Path, files: list[Path]) -> list[str]:
-    """Sentences about what lies in the folder `path` beside the bag files that are read and looks like a part of them."""
+    """Sentences about files in the folder `path` that look like parts of the recording but are not read."""
     if not path.is_dir():
         return []
     names = {p.name for p in files}
@@ -53,7 +53,7 @@ def left_out(path: Path, files: list[Path]) -> list[str]:
 
 
 def missing_parts(path: Path, files: list[Path]) -> list[str]:
-    """Sentences about parts that are not there, by the numbers in the names and by `metadata.yaml`."""
+    """Sentences about missing parts, judged by the numbers in the names and by `metadata.yaml`."""
     sentences = []
     series: dict[str, dict[int, Path]] = {}
     for file in files:
@@ -77,7 +77,7 @@ def missing_parts(path: Path, files: list[Path]) -> list[str]:
 
 
 def parts_beside(path: Path) -> list[Path]:
-    """Files beside a bag that recorders name so when they split it: as `path` but for the number at the end of the name."""
+    """Other parts of a split recording: files beside `path` whose names differ only in the number at the end."""
     own = _numbered(path)
     if own is None:
         return []
@@ -97,7 +97,7 @@ def packing_of(path: Path) -> str:
 
 
 def stem_of(path: Path) -> str:
-    """The name without what makes it a bag and without what says that it is compressed."""
+    """Name of a file without its bag suffix and its compression suffix."""
     return _unpacked(path.name)[: -len(suffix_of(path)) or None]
 
 
@@ -107,14 +107,14 @@ def _unpacked(name: str) -> str:
 
 
 def _numbered(path: Path) -> tuple[str, int] | None:
-    """What all parts of a recording are called, and the number of this one; None where the name has none."""
+    """Common name of all parts of a recording, and the number of this part; None where the name has none."""
     stem = _TIME.sub("", stem_of(path))
     match = _NUMBER.search(stem)
     return None if match is None or not match[1] else (match[1].rstrip("_-"), int(match[2]))
 
 
 def _unlisted(path: Path, files: list[Path]) -> list[str]:
-    """What ROS 2's `metadata.yaml`, of every version, lists and is not there; nothing where it cannot be read."""
+    """Files that ROS 2's `metadata.yaml`, of any version, lists but that are missing; empty if it cannot be read."""
     if not path.is_dir() or not (path / METADATA).is_file():
         return []
     from ruamel.yaml import YAML

@@ -56,7 +56,7 @@ class ChunkedBag(ABC):
     FOOTER: ClassVar[int] = 0
 
     def __init__(self, path: Path, unpacked: Path | None = None) -> None:
-        """Open `path`, or what it holds, where it was unpacked. Raises InputError for another format."""
+        """Open `path`, or its decompressed copy if there is one. Raises InputError for another format."""
         self.path, self.loss = path, ""
         self._file = ChunkFile(path, unpacked)
         self._chunks: list[Chunk] = []
@@ -78,7 +78,7 @@ class ChunkedBag(ABC):
                 topic.stamps_ns, topic.where = rows[:, 0].copy(), rows[:, 1:].copy()
 
     def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
-        """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
+        """Bytes of message `k` of `topic`; with `limit`, at least its first `limit` bytes."""
         number, offset = (int(v) for v in topic.where[k])
         chunk, is_head = None if number == IN_FILE else self._chunks[number], limit is not None
         try:
@@ -94,7 +94,7 @@ class ChunkedBag(ABC):
         return data
 
     def expect(self, topic: Topic, is_head: bool) -> None:
-        """Know that all messages of `topic` will be read next, or no more than their beginnings."""
+        """Announce that all messages of `topic`, or only their beginnings, will be read next."""
 
         def places() -> Iterator[tuple[int, int]]:
             for number, offset in topic.where.tolist():
@@ -108,7 +108,7 @@ class ChunkedBag(ABC):
 
     @abstractmethod
     def _misnomer(self, head: bytes) -> str:
-        """What a file is that begins otherwise."""
+        """Description of a file whose first bytes are of another format."""
 
     @abstractmethod
     def _record(self, chunk: Chunk | None, offset: int, is_head: bool = False) -> Record:
@@ -116,19 +116,19 @@ class ChunkedBag(ABC):
 
     @abstractmethod
     def _summary(self) -> int:
-        """Where the summary begins, as the file says; 0 where it has none."""
+        """Offset of the summary as the file states it; 0 where it has none."""
 
     @abstractmethod
     def _near(self, info: Record) -> list[tuple[int, int]]:
-        """Position and size of what the walk reads beside a chunk, by what the summary says of it."""
+        """Position and size of the records next to a chunk that the walk reads, as the summary states them."""
 
     @abstractmethod
     def _chunk(self, record: Record) -> Chunk:
-        """The chunk that a record is."""
+        """Chunk that a record describes."""
 
     @abstractmethod
     def _index(self, record: Record) -> tuple[int, NDArray[np.unsignedinteger[Any]]]:
-        """Channel, and stamps and offsets (N, 2) of its messages in the chunk before."""
+        """Channel of an index record, and (N, 2) stamps and offsets of that channel's messages in the preceding chunk."""
 
     @abstractmethod
     def _message(self, record: Record) -> tuple[int, int]:
@@ -136,14 +136,14 @@ class ChunkedBag(ABC):
 
     @abstractmethod
     def _note_name(self, record: Record, data: bytes) -> None:
-        """Keep what a record of `NAMES` says."""
+        """Store the channel, type and encoding that a record of `NAMES` states."""
 
     @abstractmethod
     def _named(self) -> dict[int, Topic]:
-        """An empty topic for each channel whose name was found."""
+        """An empty topic for each channel whose name is known."""
 
     def _beside_messages(self) -> Iterator[tuple[int, int]]:
-        """Where the summary says that records lie beside the messages: what the walk will read."""
+        """Positions and sizes of the records between the chunks, as the summary states them: the walk will read these."""
         position, size = self._summary(), self._file.size
         self._file.expect(lambda: [(position, size - position)] if position else [])
         while 0 < position < size:
@@ -153,7 +153,7 @@ class ChunkedBag(ABC):
             position = size if record.op == self.FOOTER else record.end
 
     def _walk(self) -> None:
-        """Note names, chunks and indices; stop where a record is not whole."""
+        """Collect names, chunks and indices by walking over the records; stop at the first incomplete one."""
         position, size = len(self.MAGIC), self._file.size
         unindexed: int | None = None  # the chunk that no index has followed yet
         loose: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -190,7 +190,7 @@ class ChunkedBag(ABC):
         self._add(IN_FILE, loose)
 
     def _salvage(self, record: Record, position: int) -> int:
-        """Note the whole messages of a chunk that was cut off, where it is not compressed; the end of the last one."""
+        """Collect the complete messages of an uncompressed chunk that was cut off. Returns the end of the last one."""
         chunk = self._chunk(record) if record.op == self.CHUNK else None
         if chunk is None or chunk.compression:
             return position
@@ -205,7 +205,7 @@ class ChunkedBag(ABC):
         return len(self._chunks) - 1
 
     def _add(self, chunk: int, found: Mapping[int, Any]) -> None:
-        """Note the messages of a chunk: stamps and offsets, (N, 2), by channel."""
+        """Add the messages of a chunk: stamps and offsets, (N, 2), by channel."""
         for channel, rows in found.items():
             if len(rows):
                 table = np.full((len(rows), 3), chunk, np.int64)
@@ -213,7 +213,7 @@ class ChunkedBag(ABC):
                 self._pieces[channel].append(table)
 
     def _index_by_hand(self, number: int | None) -> int:
-        """Note the messages of a chunk that no index follows; the end of the last record."""
+        """Collect the messages of a chunk without an index by reading it. Returns the end of the last record."""
         if number is None:
             return 0
         found: dict[int, list[tuple[int, int]]] = defaultdict(list)
@@ -228,7 +228,7 @@ class ChunkedBag(ABC):
         return end
 
     def _find_missing_names(self) -> None:
-        """Names stand in the summary and, where the end of the file is lost, in the chunks up to the first message."""
+        """Look up channels without a name in the summary and, if the end of the file is lost, in the chunks."""
         for channel, pieces in self._pieces.items():
             for number in range(int(pieces[0][0, 1]), -1, -1):
                 topic = self._named().get(channel)
@@ -243,7 +243,7 @@ class ChunkedBag(ABC):
                 self._each_record(chunk, note)
 
     def _each_record(self, chunk: Chunk, use: Callable[[Record, int], None]) -> int:
-        """Hand the records of a chunk and their offsets to `use` until one is damaged; the end of the last that was not."""
+        """Call `use` on the records of a chunk and their offsets until one is damaged. Returns the end of the last intact one."""
         offset = 0
         try:
             while offset < chunk.length:

@@ -20,7 +20,7 @@ class SqliteBag:
     """One `.db3` file: `topics`, and `loss`, a sentence when it was cut off."""
 
     def __init__(self, path: Path, unpacked: Path | None = None) -> None:
-        """Open `path`, or what it holds, where it was unpacked."""
+        """Open `path`, or its decompressed copy if there is one."""
         if isinstance(path, RemotePath):
             raise UsageError(
                 f"{path}: SQLite cannot be read in place from storage; *.mcap and *.bag are: `lslam convert` makes an MCAP file "
@@ -51,10 +51,10 @@ class SqliteBag:
             self.loss = self.loss or f"{path}-wal holds messages that were never merged: `ros2 bag reindex` does that"
 
     def expect(self, topic: Topic, is_head: bool) -> None:
-        """Nothing: the file is on a disk."""
+        """Do nothing: a file on a disk needs no prefetching."""
 
     def read(self, topic: Topic, k: int, limit: int | None = None) -> bytes:
-        """Message `k` of `topic`, its first `limit` bytes at the least when only these are wanted."""
+        """Bytes of message `k` of `topic`; with `limit`, at least its first `limit` bytes."""
         row = int(topic.where[k, 0])
         try:
             with self._lock, self._db.blobopen("messages", "data", row, readonly=True) as blob:
@@ -63,7 +63,7 @@ class SqliteBag:
             raise InputError(f"{self.path}: message {k} of {topic.name} is damaged: {error}") from None
 
     def _index(self) -> None:
-        """Stamps and rows of all messages; the data itself stays on disk."""
+        """Read stamps and row numbers of all messages; the data itself stays on disk."""
         found: dict[int, list[tuple[int, int]]] = {number: [] for number in self._topics}
         try:
             for row, topic, stamp in self._db.execute("SELECT id, topic_id, timestamp FROM messages ORDER BY id"):
@@ -85,7 +85,7 @@ class SqliteBag:
             self._topics[number].where = np.column_stack([table[:, 1], np.zeros(len(table), np.int64)])
 
     def _sizes(self) -> tuple[int, int]:
-        """Bytes of the file, and how many its header states (SQLite's file format, 1.3)."""
+        """Size of the file and the size that its header states, bytes (SQLite's file format, 1.3)."""
         with self._on_disk.open("rb") as file:
             header = file.read(100)
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
@@ -93,5 +93,5 @@ class SqliteBag:
 
 
 def _word(value: object) -> str:
-    """A column that should hold text."""
+    """Text of a column; empty if it holds something else."""
     return value if isinstance(value, str) else ""

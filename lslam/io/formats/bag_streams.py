@@ -1,4 +1,4 @@
-"""What rides along in a bag: IMU, satellite fixes, static transforms and poses, from messages to arrays."""
+"""Sensor streams of a bag as arrays: IMU samples, satellite fixes, static transforms and poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ _LARGEST = 1e9  # m, no pose on this planet; NaN is not less either
 
 @dataclass(frozen=True)
 class Stream:
-    """Stamped rows of one topic: stamps_ns (N,) int64 of the headers, values (N, K) float64, frame of the first, its name.
+    """Stamped rows of one topic.
+
+    stamps_ns : (N,) int64, of the headers; values : (N, K) float64; frame : of the first message; topic : its name
 
     recorded_ns : (N,) int64, when the messages were recorded
     """
@@ -92,7 +94,7 @@ def read_poses(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
 
 
 def _read(bag: Bag, topic: BagTopic, problems: list[str], width: int, row_of: Callable[[bytes], _Row]) -> Stream:
-    """The rows of `width` numbers that the messages of a topic say."""
+    """Rows of `width` numbers, made by `row_of` from the messages of a topic."""
     stamps, messages, values = array("q"), array("q"), array("d")
     frame = ""
     for k, row in bag.each(topic, row_of, problems):
@@ -107,12 +109,12 @@ def _read(bag: Bag, topic: BagTopic, problems: list[str], width: int, row_of: Ca
 
 
 def is_static(topic: BagTopic) -> bool:
-    """Whether transforms of this topic hold for good."""
+    """Whether the transforms of a topic are static."""
     return topic.name.rsplit("/", 1)[-1] == "tf_static"
 
 
 def read_transforms(bag: Bag, topic: BagTopic, problems: list[str], most: int | None = None) -> Transforms:
-    """`T_parent_child` (N, 4, 4) by (parent, child), what messages of a TFMessage topic, or the first so many, say of it."""
+    """`T_parent_child` (N, 4, 4) by (parent, child), from all or the first few messages of a TFMessage topic."""
     found: dict[tuple[str, str], list[list[float]]] = {}
 
     def note(data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Rigid transforms in files and on a command line: those of KITTI and the Multi-Campus Dataset, and as people write one."""
+"""Rigid transforms from files (KITTI, Multi-Campus Dataset) and from the command line."""
 
 from __future__ import annotations
 
@@ -112,7 +112,10 @@ def _entry(path: Path, entries: dict[str, str], name: str, count: int) -> Floats
 
 
 def _rigid(R: Floats, t: Floats, path: Path, name: str) -> Floats:
-    """(4, 4) with the rotation put back on SO(3): seven printed digits are not enough for `R^T` to be the inverse."""
+    """(4, 4) rigid transform.
+
+    The rotation is projected onto SO(3): with seven printed digits `R^T` is not exactly the inverse.
+    """
     if not so3.is_rotation(R, 1e-2):
         raise InputError(f"calibration {path}: {name} holds no rotation")
     return se3.normalise(se3.make(R, t))
@@ -167,7 +170,7 @@ def read_transform(text: str) -> Floats:
 
 
 def _named(path: Path) -> Floats:
-    """The transform of a file of named entries."""
+    """Transform in a file of `name: values` lines."""
     entries = read_entries(path)
     T = read_rigid(path) if "R" in entries and "T" in entries else _tr(path, entries)
     if T is None:
@@ -180,7 +183,7 @@ def _words(text: str) -> list[str]:
 
 
 def _numbers(words: list[str]) -> list[float] | None:
-    """None where one of them is no number."""
+    """Numbers in a list of words; None if one of them is no number."""
     try:
         return [float(word) for word in words]
     except ValueError:

@@ -76,7 +76,7 @@ class Ros1Bag(ChunkedBag):
 
 
 def _fields(block: bytes) -> dict[bytes, bytes]:
-    """The `name=value` fields of a record header."""
+    """Fields `name=value` of a record header."""
     fields, at = {}, 0
     while at < len(block):
         (n,) = struct.unpack_from("<I", block, at)
@@ -87,7 +87,7 @@ def _fields(block: bytes) -> dict[bytes, bytes]:
 
 
 def _number(value: bytes) -> int:
-    """A field of 4 or 8 bytes."""
+    """Integer in a field of 4 or 8 bytes."""
     (number,) = struct.unpack("<Q" if len(value) == 8 else "<I", value)
     return int(number)
 
@@ -153,7 +153,7 @@ class McapFile(ChunkedBag):
 
 
 def _type(name: str) -> str:
-    """As ROS 2 writes it: messages of ROS 1 may lie in MCAP files too."""
+    """Message type spelled as ROS 2 does; MCAP files may hold messages of ROS 1."""
     return name.replace("/", "/msg/") if name.count("/") == 1 else name
 
 

@@ -1,4 +1,4 @@
-"""GeoJSON (RFC 7946): the line of a trajectory, and outlines."""
+"""GeoJSON (RFC 7946): trajectories as lines, and outlines as polygons."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lslam.io.formats.osm_data import DECIMALS
 
 
 def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, Any]) -> None:
-    """Write a way (N, 3) of lat, lon (deg), height (m), WGS84, as one feature, a point where N is 1; atomically.
+    """Write a trajectory (N, 3) of lat, lon (deg), height (m), WGS84, as one line feature, atomically; a point if N is 1.
 
     Degrees have 7 decimals (1 cm), heights 3. Raises OutputError when the file cannot be written.
     """
@@ -38,10 +38,10 @@ def write_line(path: Path, lat_lon_alt: NDArray[Any], properties: Mapping[str, A
 def write_areas(
     path: Path, outlines: Iterable[Floats], properties: Iterable[Mapping[str, Any]], about: Mapping[str, Any]
 ) -> None:
-    """Write an outline (C, 2) each, counter-clockwise, as a polygon with its properties, and `about` of all; atomically.
+    """Write each outline (C, 2), counter-clockwise, as a polygon with its properties, atomically.
 
-    Longitude and latitude, deg, get 7 decimals; metres of a place that nobody knows, which `about` has to say, as many, too.
-    Raises OutputError when the file cannot be written.
+    `about` describes the collection. Coordinates have 7 decimals. They are longitude and latitude, deg, or metres if the
+    place is not georeferenced; `about` then says so. Raises OutputError when the file cannot be written.
     """
     features = [
         {
@@ -56,7 +56,7 @@ def write_areas(
 
 
 def read_line(path: Path) -> Floats:
-    """The one way of a file as (N, 3) lat, lon (deg), height (m, 0 where unknown), WGS84; a point is a way of one position.
+    """Read the only line of a file as (N, 3) lat, lon (deg), height (m, 0 where unknown), WGS84. A point gives N = 1.
 
     Raises InputError naming the file: unreadable, no GeoJSON, without exactly one line, with positions off the Earth.
     """
@@ -78,7 +78,7 @@ def read_line(path: Path) -> Floats:
 
 
 def _shapes(tree: Any) -> Iterator[Any]:
-    """The geometries of a document."""
+    """Geometries of a GeoJSON document."""
     if tree.get("type") == "FeatureCollection":
         for feature in tree["features"]:
             yield from _shapes(feature)

@@ -1,4 +1,4 @@
-"""Files of KITTI's layouts: samples of OXTS packets are read, scans, times and calibration are written."""
+"""Files of KITTI's layouts: reads OXTS packets; writes scans, times and calibration."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _LARGEST = 1e9
 
 
 def scan_files(folder: Path, number: int) -> tuple[Path, Path]:
-    """The points of scan `number` in the sequence folder, and the file with their times and rings."""
+    """Paths of the points of scan `number` in the sequence folder, and of their times and rings."""
     return folder / POINTS / f"{number:06d}.bin", folder / PER_POINT / f"{number:06d}.npz"
 
 
 def label_file(folder: Path, number: int) -> Path:
-    """The classes of the points of scan `number` in the sequence folder, as SemanticKITTI has them."""
+    """Path of the classes of the points of scan `number`, in SemanticKITTI's layout."""
     return folder / LABELS / f"{number:06d}.label"
 
 
@@ -49,7 +49,10 @@ def write_scan(
     rings: NDArray[np.uint16] | None,
     labels: NDArray[np.uint16] | None = None,
 ) -> None:
-    """Write points, their classes, and what is known of times, s from the stamp, and rings. That file comes last, always."""
+    """Write the points of a scan, their classes, and their times (s from the stamp) and rings where known.
+
+    The file of times and rings is always written last, so its presence marks a complete scan.
+    """
     cloud, beside = scan_files(folder, number)
     write_bin(cloud, points, intensity)
     if labels is not None:
@@ -71,7 +74,7 @@ def write_calib(folder: Path, T_cam0_lidar: Floats) -> None:
 
 
 def in_camera(truth: Trajectory, T_cam0_lidar: Floats) -> Trajectory:
-    """LiDAR poses as KITTI has them: camera 0 in camera 0 at the start."""
+    """LiDAR poses as poses of camera 0 in the frame of camera 0 at the start, as in KITTI's files."""
     poses = portable.product(portable.product(T_cam0_lidar, truth.poses), se3.inverse(T_cam0_lidar))
     return Trajectory(truth.stamps_ns, poses, "cam0", truth.has_stamps, source=truth.source)
 
@@ -82,7 +85,7 @@ class Oxts:
 
     numbers : (N,) int64 file numbers; stamps_ns : (N,) int64, the dates taken as UTC; None when the file is missing
     values : (N, 30) float64 as in dataformat.txt (deg, m, rad, m/s, m/s2, rad/s)
-    problems : what was found wrong, one sentence each
+    problems : one sentence each
     """
 
     numbers: Longs

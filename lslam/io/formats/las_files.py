@@ -1,7 +1,8 @@
 """LAS 1.4 and LAZ files, what every GIS reads: written block by block, read whole. The only file that knows laspy.
 
-What a file says of its own size is held against its size first: native code trusts it and aborts for want of memory. Offsets are
-those of the LAS 1.4 R15 specification, and for LAZ those of Isenburg's laszip (its VLR, its chunk table).
+Sizes in the header are first checked against the size of the file. The native decoder trusts them, and would abort when
+memory runs out. Offsets are those of the LAS 1.4 R15 specification, and for LAZ those of Isenburg's laszip (its VLR, its
+chunk table).
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ _BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
 def check_las(stream: BinaryIO) -> tuple[int, int]:
-    """Bytes of a point and of the largest chunk, decompressed. Raises ValueError saying which sizes contradict each other."""
+    """Bytes of a point, and of the largest decompressed chunk. Raises ValueError naming the sizes that contradict each other."""
     size = os.fstat(stream.fileno()).st_size
     head = stream.read(393)
     if head[:4] != b"LASF":
@@ -68,7 +69,7 @@ def check_las(stream: BinaryIO) -> tuple[int, int]:
 
 
 def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs.LazVlr, int]:
-    """How points are compressed, and in how many layers a chunk lies, 0 where it has none."""
+    """Compression scheme of the points, and the number of layers of a chunk; 0 where it has none."""
     import lazrs
 
     position = begin
@@ -92,7 +93,7 @@ def _laszip(stream: BinaryIO, begin: int, vlrs: int, record: int) -> tuple[lazrs
 
 
 def _check_chunks(stream: BinaryIO, laszip: lazrs.LazVlr, layers: int, count: int, offset: int, record: int) -> int:
-    """The most points a chunk has."""
+    """Largest number of points of a chunk. Raises ValueError if the chunk table contradicts the size of the file."""
     import lazrs
 
     size = os.fstat(stream.fileno()).st_size
@@ -164,7 +165,7 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
 
 
 def read_las(path: Path) -> tuple[ArrayCloud, str]:
-    """The points, m, 16-bit intensities and WKT, or "", of a LAS or LAZ file. Raises InputError naming one that is damaged."""
+    """Read points (m), 16-bit intensities and WKT (empty if none) of a LAS or LAZ file. Raises InputError if it is damaged."""
     with importing("laspy", _WAY_OUT):
         import laspy
         import lazrs  # noqa: F401

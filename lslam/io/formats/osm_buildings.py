@@ -52,7 +52,7 @@ def read_buildings(path: Path, origin: NDArray[Any] | None = None) -> tuple[OsmD
 
 
 def some_buildings_of(data: OsmData, origin: NDArray[Any], path: Path) -> BuildingExtract:
-    """`buildings_of` what was read from `path`; raises InputError naming it when there is not one."""
+    """`buildings_of` the data read from `path`. Raises InputError naming the file if there are none."""
     extract = buildings_of(data, origin, str(path))
     if not extract.buildings:
         why = ", ".join(f"{count} x {reason}" for reason, count in extract.skipped.items())
@@ -119,7 +119,7 @@ class _Positions:
         self.xy = to_local(fixes, origin)[:, :2]
 
     def distance(self) -> float:
-        """From the origin to the nearest node, m; inf where the projection has no answer."""
+        """Distance from the origin to the nearest node, m; inf where the projection is not defined."""
         return float(np.min(np.nan_to_num(np.linalg.norm(self.xy, axis=1), nan=np.inf)))
 
     def has(self, nodes: Iterable[int]) -> bool:
@@ -130,7 +130,7 @@ class _Positions:
 
 
 def _counts(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
-    """True for a building above the ground; other buildings are counted in `skipped`."""
+    """Whether an element is a building above the ground. Other buildings are counted in `skipped`."""
     kind = tags.get("building")
     if kind is None:
         return False
@@ -180,12 +180,12 @@ def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str,
 
 
 def _is_swapped(data: OsmData, origin: Floats) -> bool:
-    """True when data and origin are of one place, but for the order of latitude and longitude."""
+    """Whether data and origin would agree if latitude and longitude were swapped."""
     return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST
 
 
 def right_place(origin: Floats, is_swapped: bool = False) -> str:
-    """What to do about an extract of another place, for messages."""
+    """Advice for a message about an extract of another place."""
     if is_swapped:
         return (
             f"latitude and longitude are swapped, in --origin ({origin[0]:.5f},{origin[1]:.5f}; latitude first) or in the file "
@@ -195,12 +195,12 @@ def right_place(origin: Floats, is_swapped: bool = False) -> str:
 
 
 def distance_text(distance: float) -> str:
-    """A distance, m, for messages."""
+    """Distance (m) as text for messages."""
     return f"{distance / 1000:.1f} km" if distance > 1000 else f"{distance:.0f} m"
 
 
 def height_of(tags: Mapping[str, str]) -> float | None:
-    """Height in m from `height` (m, or feet and inches), else `building:levels` x 3 m; None when neither is a sensible number."""
+    """Height, m, from `height` (m, or feet and inches), else 3 m times `building:levels`; None when neither is plausible."""
     height = _length(tags.get("height", ""))
     if height is None:
         levels = _number(tags.get("building:levels", ""))
@@ -209,9 +209,9 @@ def height_of(tags: Mapping[str, str]) -> float | None:
 
 
 def base_of(tags: Mapping[str, str]) -> float:
-    """Where the walls begin, m above the ground: `min_height`, else `building:min_level` x 3 m, else 0.
+    """Height above the ground at which the walls begin, m: `min_height`, else 3 m times `building:min_level`, else 0.
 
-    What lies above the building's own height is nonsense and counts as 0.
+    A base above the building's own height counts as 0.
     """
     base = _length(tags.get("min_height", ""))
     if base is None:
@@ -276,7 +276,7 @@ def footprints_from_rings(outers: Sequence[Floats], inners: Sequence[Floats]) ->
 
 
 def _plain(outlines: list[Any], holes: list[Any]) -> tuple[Footprint, ...] | None:
-    """The usual case, corner for corner: valid outlines apart from each other, each hole inside one of them."""
+    """Footprints without repair if all outlines are valid and disjoint and each hole lies in one of them; else None."""
     from shapely import MultiPolygon, Polygon
 
     inside: list[list[Any]] = [[] for _ in outlines]
@@ -298,7 +298,7 @@ def _polygon(ring: Floats) -> Any | None:
 
 
 def _polygonal(geometry: Any) -> Any:
-    """Only the areas of a geometry, flat: repair leaves lines and points behind, and nests collections."""
+    """Flat list of the polygons of a geometry. Repair leaves lines and points behind, and nests collections."""
     from shapely import MultiPolygon
 
     parts = [geometry]

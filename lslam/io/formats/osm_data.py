@@ -34,7 +34,7 @@ class Way:
 
 @dataclass(frozen=True)
 class Member:
-    """What a relation holds: kind `node`, `way` or `relation`, its number, its role."""
+    """Reference to a member of a relation: kind `node`, `way` or `relation`, number, and role."""
 
     kind: str
     ref: int
@@ -43,7 +43,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Relation:
-    """Elements that belong together."""
+    """Group of elements with tags, such as a multipolygon."""
 
     id: int
     members: tuple[Member, ...]
@@ -85,7 +85,7 @@ class OsmData:
             self.relations[relation.id] = relation
 
     def add_element(self, element: Mapping[str, Any]) -> None:
-        """Add an element as Overpass says it in JSON. Raises LookupError, TypeError or ValueError for what is none."""
+        """Add an element of an Overpass reply in JSON. Raises LookupError, TypeError or ValueError if it is malformed."""
         kind, number = element["type"], int(element.get("id", 0))
         if (version := element.get("version")) is not None and int(version) != 1:
             self.versions[kind, number] = int(version)
@@ -110,12 +110,18 @@ class OsmData:
             self.add_relation(Relation(number, found, tags))
 
     def draw_way(self, number: int, geometry: Iterable[Mapping[str, Any] | None]) -> None:
-        """Say where a way runs whose nodes have no numbers (Overpass' `out geom`); nothing of those outside the box asked for."""
+        """Store the positions of a way whose nodes have no numbers (Overpass' `out geom`).
+
+        Points outside the requested box are None.
+        """
         places = [(float(p["lat"]), float(p["lon"])) if p and "lat" in p else None for p in geometry]
         self._drawn.setdefault(number, places)
 
     def number_drawn(self) -> None:
-        """When all is read: ways that are only drawn get nodes, with numbers below zero where the place has none yet."""
+        """Give node numbers to ways that have positions only; call it after reading. Ways with missing parts stay undrawn.
+
+        New nodes get negative numbers; existing nodes at the same position are reused.
+        """
         at = {place: number for number, place in self.nodes.items()} if self._drawn else {}
         fresh = min([0, *self.nodes]) - 1
         for number, places in self._drawn.items():

@@ -54,7 +54,7 @@ def read_osm(path: Path) -> OsmData:
 
 
 class GaveUpError(ValueError):
-    """What Overpass says, `remark`, when it ran out of time or memory: the reply is valid JSON but incomplete."""
+    """Raised when Overpass ran out of time or memory, with its `remark`: the reply is valid JSON but incomplete."""
 
     def __init__(self, remark: Any) -> None:
         super().__init__(f"the server gave up: {str(remark)[:200]}")
@@ -62,7 +62,7 @@ class GaveUpError(ValueError):
 
 
 def add_elements(data: OsmData, items: JsonItems) -> None:
-    """Add the elements of an Overpass reply. Raises ValueError saying what is wrong with one."""
+    """Add the elements of an Overpass reply. Raises ValueError naming a malformed one."""
     for element in items:
         try:
             data.add_element(element)
@@ -71,7 +71,7 @@ def add_elements(data: OsmData, items: JsonItems) -> None:
 
 
 def check_reply(items: JsonItems) -> None:
-    """Raise ValueError for what was no reply; GaveUpError, which is such, when the server did."""
+    """Raise ValueError if a document is no reply of Overpass, GaveUpError (a ValueError) if the server gave up."""
     if not items.has_list:
         raise ValueError("no list of elements, so this is no Overpass reply")
     if items.rest.get("remark"):
@@ -79,7 +79,7 @@ def check_reply(items: JsonItems) -> None:
 
 
 def write_osm(path: Path, data: OsmData) -> None:
-    """Write `data` as OSM XML 0.6, atomically, degrees with 7 decimals; what it read, or rounded, reads back equal."""
+    """Write `data` as OSM XML 0.6, atomically, degrees with 7 decimals. Data that were read or rounded read back equal."""
     with atomic_write(path) as stream:
         stream.write("".join(_xml_lines(data)).encode("utf-8", "replace"))
 
@@ -123,7 +123,7 @@ def _read_xml(path: Path, is_wide: bool) -> OsmData:
 
 
 def _parsed_xml(path: Path, stream: IO[Any]) -> OsmData:
-    """Element by element, each forgotten once it is understood: a town's extract is large."""
+    """Iterate over the elements of an XML file, freeing each after use: the extract of a town is large."""
     from defusedxml.ElementTree import iterparse
 
     data, root = OsmData(), None
@@ -248,7 +248,7 @@ def _place(position: Any) -> Place:
 
 
 def _areas(tree: Any, properties: Any = None, name: Any = None) -> Iterator[Area]:
-    """(kind, number) or None, tags, and polygons as lists of rings, of everything in the tree that has an area."""
+    """All areas of a GeoJSON tree: (kind, number) or None, tags, and polygons as lists of rings."""
     kind = str(tree.get("type")) if isinstance(tree, dict) else ""
     if kind in _PARTS:
         parts = tree.get(_PARTS[kind]) or []
@@ -269,7 +269,7 @@ def _areas(tree: Any, properties: Any = None, name: Any = None) -> Iterator[Area
 
 
 def _named(properties: dict[str, Any], name: Any) -> tuple[str, int] | None:
-    """`way/12` of Overpass turbo and lslam, a plain number of osmium and QGIS."""
+    """Kind and number in an identifier: `way/12` of Overpass turbo and lslam, a plain number of osmium and QGIS."""
     for value in (properties.get("@id"), properties.get("osm_id"), name):
         found = re.fullmatch(r"(?:(way|relation)/)?(-?\d{1,18})", str(value))
         if found:

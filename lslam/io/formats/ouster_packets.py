@@ -1,4 +1,4 @@
-"""Lidar and IMU packets of Ouster sensors, and the metadata that says how they are laid out, by the sensor's user manual."""
+"""Lidar and IMU packets of Ouster sensors, and the metadata that describe their layout (sensor's user manual)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GRAVITY = 9.80665  # m/s2 of the unit g
 
 @dataclass(frozen=True)
 class Profile:
-    """Where things are in a lidar packet.
+    """Byte layout of a lidar packet.
 
     head, foot : bytes about the packet; column_head, column_foot : about each column; channel : of a beam in a column
     range_bits, range_mm : width and unit of the first return's range, which opens the channel; reflectivity : its byte
@@ -43,7 +43,7 @@ class Profile:
 
     @property
     def positions(self) -> tuple[int, ...]:
-        """Of the bytes of a packet that tell its frame and its time."""
+        """Positions of the bytes that hold the frame number and the time of a packet."""
         return (self.frame, self.frame + 1, *range(self.head, self.head + 8))
 
 
@@ -60,7 +60,7 @@ _IMU_TO_SENSOR = (1, 0, 0, 6.253, 0, 1, 0, -11.775, 0, 0, 1, 7.645, 0, 0, 0, 1)
 
 @dataclass(frozen=True)
 class OusterSensor:
-    """What the metadata say.
+    """Sensor description from its metadata.
 
     columns, width : columns of a packet, and of a revolution; altitudes, azimuths : (beams,) rad
     offset_m : from the rotor's axis to the beams' origin; T_sensor_lidar, T_sensor_imu : (4, 4), m
@@ -85,17 +85,17 @@ class OusterSensor:
 
     @property
     def column_bytes(self) -> int:
-        """Of a column of a packet."""
+        """Bytes of a column of a packet."""
         return self.profile.column_head + self.beams * self.profile.channel + self.profile.column_foot
 
     @property
     def packet_bytes(self) -> int:
-        """Of a lidar packet."""
+        """Bytes of a lidar packet."""
         return self.profile.head + self.columns * self.column_bytes + self.profile.foot
 
 
 def read_metadata(path: Path) -> OusterSensor:
-    """The metadata of a sensor as its software writes them, of any firmware.
+    """Read the metadata file of a sensor, as its software writes it, of any firmware.
 
     Raises InputError naming the file when it is unreadable, lacks something or names a layout lslam does not know.
     """
@@ -104,7 +104,7 @@ def read_metadata(path: Path) -> OusterSensor:
 
 
 def parse_metadata(text: str | bytes, where: str) -> OusterSensor:
-    """As `read_metadata`, of a text from `where`."""
+    """As `read_metadata`, from text; `where` names its source in messages."""
     try:
         found = _flat(parse_json(text))
     except MISFIT as error:
@@ -122,7 +122,7 @@ def parse_metadata(text: str | bytes, where: str) -> OusterSensor:
 
 
 def _flat(tree: Any) -> dict[str, Any]:
-    """Values by key, those of inner tables too: firmware 3 groups what older ones had side by side."""
+    """Values by key with nested tables flattened: firmware 3 groups keys that older ones had side by side."""
     found: dict[str, Any] = {}
     if isinstance(tree, dict):
         for value in tree.values():
@@ -162,13 +162,13 @@ def _transform(numbers: Any) -> Floats:
 
 
 def frames_and_times(heads: NDArray[np.uint8]) -> tuple[Longs, Longs]:
-    """(P,) the frame of each packet and the time of its first column, ns, by its bytes (P, 10) at `Profile.positions`."""
+    """Frame number (P,) and time of the first column (P,), ns, of packets, from their bytes (P, 10) at `Profile.positions`."""
     frame, time = _numbers(heads[:, :2], np.dtype("<u2")), _numbers(heads[:, 2:], np.dtype("<u8"))
     return frame[:, 0].astype(np.int64), time[:, 0].astype(np.int64)
 
 
 def points_of(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[PointCloud, Longs]:
-    """Points of the packets' first returns, column by column, in the sensor's frame, and their times, ns."""
+    """Points of the first returns of packets, column by column, in the sensor's frame, and their times, ns."""
     p = sensor.profile
     body = packets[:, p.head : p.head + sensor.columns * sensor.column_bytes].reshape(-1, sensor.column_bytes)
     status = body[:, p.status % sensor.column_bytes]
@@ -202,9 +202,9 @@ def points_of(packets: NDArray[np.uint8], sensor: OusterSensor) -> tuple[PointCl
 
 
 def imu_of(packets: NDArray[np.uint8]) -> ImuStream:
-    """Samples of IMU packets (P, 48); g and deg/s become m/s2 and rad/s. Stamps are those of the gyroscope.
+    """Samples of IMU packets (P, 48), in m/s2 and rad/s. The stamps are those of the gyroscope.
 
-    A sample that is not finite is left out: a gap, as of a lost packet.
+    Samples that are not finite are left out, as lost packets would be.
     """
     stamps = _numbers(packets[:, 16:24], np.dtype("<u8"))[:, 0].astype(np.int64)
     values = _numbers(packets[:, 24:48], np.dtype("<f4")).astype(np.float64)
@@ -213,5 +213,5 @@ def imu_of(packets: NDArray[np.uint8]) -> ImuStream:
 
 
 def _numbers(data: NDArray[np.uint8], kind: np.dtype[Any]) -> NDArray[Any]:
-    """The last axis as little-endian numbers."""
+    """Little-endian numbers made of the bytes along the last axis."""
     return np.ascontiguousarray(data).view(kind)

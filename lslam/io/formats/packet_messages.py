@@ -23,18 +23,18 @@ _WORDS = {"Hesai": r"hesai|pandar", "RoboSense": r"rslidar|robosense", "Velodyne
 
 
 def is_decoded(topic: BagTopic) -> bool:
-    """Whether a topic holds packets that are decoded."""
+    """Whether a topic holds packets that lslam can decode."""
     package, name = topic.type.partition("/")[0], topic.type.rsplit("/", 1)[-1]
     return (name == SCANS and package.startswith("velodyne")) or (name == PACKET and package.startswith("ouster"))
 
 
 def packet_topics(bag: Bag) -> list[BagTopic]:
-    """Topics of LiDAR packets that are decoded."""
+    """Topics of LiDAR packets that lslam can decode."""
     return [t for t in bag.of_type(SCANS, PACKET) if is_decoded(t) and not is_imu(bag, t)]
 
 
 def read_packets(topic: BagTopic, data: bytes) -> tuple[Longs, NDArray[np.uint8], str]:
-    """Stamps (P,), ns, 0 where there are none, and bytes (P, size) of the packets of a message, and its frame.
+    """Packets of a message: stamps (P,), ns, 0 if unknown; bytes (P, size); and the frame.
 
     Raises InputError when it is cut off.
     """
@@ -60,7 +60,7 @@ def read_packets(topic: BagTopic, data: bytes) -> tuple[Longs, NDArray[np.uint8]
 
 
 def is_imu(bag: Bag, topic: BagTopic) -> bool:
-    """Whether a topic of Ouster's packets is that of its IMU, by the size of the first that can be read."""
+    """Whether a topic of Ouster packets is that of its IMU, judged by the size of the first readable packet."""
     if not topic.type.endswith(PACKET):
         return False
     for k in range(min(len(topic), 5)):
@@ -72,14 +72,14 @@ def is_imu(bag: Bag, topic: BagTopic) -> bool:
 
 
 def maker_by_bytes(data: bytes, size: int) -> str:
-    """The maker of a packet of `size` bytes that begins so, of those not decoded; empty where it may be anybody's."""
+    """Maker of an undecodable packet, by its `size` and first bytes; empty where several makers fit."""
     if data.startswith(b"\xff\xee") and size != 1206:  # as Velodyne's, but for their size
         return "Hesai"
     return next((maker for head, maker in _FIRST_BYTES.items() if data.startswith(head)), "")
 
 
 def maker_by_name(*names: str) -> str:
-    """The maker by the names of a topic and its type; empty where they do not tell."""
+    """Maker by the names of a topic and its type; empty where they do not tell."""
     text = " ".join(names).lower()
     return next((maker for maker, words in _WORDS.items() if re.search(words, text)), "")
 
@@ -90,7 +90,10 @@ def is_packets(kind: str) -> bool:
 
 
 def not_decoded(maker: str, where: str = "") -> str:
-    """What a recording holds and the way out, after `holds`; `where` says topic, type and number."""
+    """Text for messages about packets that cannot be decoded, and what to do; it follows `holds`.
+
+    `where` is inserted after the maker.
+    """
     whose = f"a {maker} LiDAR" if maker else "a LiDAR"
     driver = f"{maker}'s own driver" if maker else "the sensor's driver"
     return (

@@ -1,7 +1,7 @@
-"""Captures of network traffic, pcap and pcapng: their UDP datagrams, put together again where IP sent them in pieces.
+"""Network captures, pcap and pcapng: reads UDP datagrams and reassembles IP fragments.
 
-Own code and no library: dpkt parses a packet at a time and leaves fragments apart, and a scan of an Ouster sensor comes in
-some thousand fragments.
+No library is used: dpkt parses one packet at a time and does not reassemble fragments, and a scan of an Ouster sensor comes
+in about a thousand of them.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _CUT = (EOFError, struct.error)
 
 @dataclass(frozen=True)
 class Datagrams:
-    """UDP datagrams of a capture in the order of its first pieces; their bytes stay on disk.
+    """UDP datagrams of a capture in the order of their first fragments; their bytes stay on disk.
 
     data : the file, uint8; stamps_ns : (N,) when each was captured; sizes : (N,) bytes of payload
     sources : (N,) IPv4 address and port of the sender as one number
     first, count : (N,) which rows of `begin` and `length` (M,) are its pieces
-    loss : what the capture lacks, a sentence, empty where that is nothing
+    loss : a sentence about missing data, empty if nothing is missing
     """
 
     data: NDArray[np.uint8]
@@ -59,7 +59,7 @@ class Datagrams:
         return len(self.sizes)
 
     def bytes_at(self, which: Longs, positions: tuple[int, ...]) -> NDArray[np.uint8]:
-        """(K, P) the bytes at `positions` of the payloads `which`, which are so long."""
+        """(K, P) bytes at `positions` of the payloads `which`, which must be long enough."""
         at = np.repeat(np.array([positions], np.int64), len(which), axis=0)
         piece = np.repeat(self.first[which][:, None], len(positions), axis=1)
         while (beyond := at >= self.length[piece]).any():
@@ -68,7 +68,7 @@ class Datagrams:
         return np.asarray(self.data[self.begin[piece] + at])
 
     def payloads(self, which: Longs) -> NDArray[np.uint8]:
-        """(K, size) the payloads `which`, which are of one size."""
+        """(K, size) payloads `which`, which must be of one size."""
         size = int(self.sizes[which[0]]) if len(which) else 0
         out = np.empty((len(which), size), np.uint8)
         for row, k in zip(out, which.tolist(), strict=True):
@@ -96,7 +96,7 @@ def read_datagrams(path: Path) -> Datagrams:
 
 
 def _frames(path: Path, data: memoryview) -> tuple[Longs, str]:
-    """(N, 4) begin, captured bytes, stamp (ns) and link type of each frame, and what is lost at the end of the file."""
+    """(N, 4) begin, captured bytes, stamp (ns) and link type of each frame; and a sentence about data lost at the end."""
     magic = bytes(data[:4])
     if magic in _PCAP:
         walk = _walk_pcap(data, *_PCAP[magic])
@@ -128,7 +128,7 @@ def _walk_pcap(data: memoryview, order: str, unit_ns: int) -> Iterator[tuple[int
 
 
 def _walk_pcapng(data: memoryview) -> Iterator[tuple[int, int, int, int]]:
-    """As `_walk_pcap`. Blocks that are no packets are passed over."""
+    """As `_walk_pcap`; blocks that are no packets are skipped."""
     at, end, order = 0, len(data), "<"
     interfaces: list[tuple[int, int]] = []
     while at < end:
@@ -151,7 +151,7 @@ def _walk_pcapng(data: memoryview) -> Iterator[tuple[int, int, int, int]]:
 
 
 def _ticks_per_second(options: memoryview, order: str) -> int:
-    """By the option if_tsresol: a power of 10, of 2 where its highest bit is set; millionths without it."""
+    """Clock ticks per second by the option if_tsresol: a power of 10, or of 2 if its highest bit is set; 1e6 without it."""
     at = 0
     while at + 4 <= len(options):
         code, length = struct.unpack_from(order + "HH", options, at)
@@ -165,7 +165,7 @@ def _ticks_per_second(options: memoryview, order: str) -> int:
 
 
 def _assemble(data: NDArray[np.uint8], frames: Longs, loss: str) -> Datagrams:
-    """The UDP datagrams in the frames; those that lack a piece are left out and counted."""
+    """UDP datagrams of the frames. Those with a missing fragment are left out and counted."""
 
     def word(at: Longs, size: int = 2) -> Longs:
         """Big-endian numbers at these places."""
@@ -212,9 +212,9 @@ def _assemble(data: NDArray[np.uint8], frames: Longs, loss: str) -> Datagrams:
 
 
 def _datagram_of(address: Longs, number: Longs, is_piece: Bools) -> Longs:
-    """(N,) the frame that came first of the datagram that each frame is of.
+    """(N,) for each frame, the index of the first frame of its datagram.
 
-    Pieces of one datagram share sender and number; numbers come again after 65,536 datagrams, never side by side.
+    Fragments of a datagram share sender and number. A number repeats only after 65,536 datagrams.
     """
     group = np.arange(len(address), dtype=np.int64)
     pieces = np.flatnonzero(is_piece)

@@ -44,7 +44,7 @@ class _Header:
 
 
 def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """The points of a PCD file by field, in its own frame (without VIEWPOINT, as PCL). Raises InputError naming the place."""
+    """Read the fields of a PCD file, in its own frame (VIEWPOINT is ignored, as in PCL). Raises InputError naming the place."""
     with input_errors(path):
         data = path.read_bytes()
     header = _read_header(path, data)
@@ -155,9 +155,10 @@ def _ascii_columns(path: Path, header: _Header, body: memoryview) -> dict[str, N
 
 
 def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[Floats, set[int]] | None:
-    """Numbers of lines in which columns hold bytes in place of digits, a blank or the end of a line among them.
+    """Numbers of ASCII lines in which columns hold raw bytes in place of digits, among them blanks and line ends.
 
-    C++ streams a char so: all columns of one byte are read as that. Any other one column of a few bytes is left NaN and named.
+    C++ streams write a char so. Columns of one byte are therefore read as raw bytes. Other such columns become NaN, and are
+    named.
     """
     counts = [math.prod(kind.shape) for kind in header.kinds]
     if 2 * sum(counts) * header.points > len(body) + 1:
@@ -179,7 +180,7 @@ def _rows_with_raw_bytes(header: _Header, body: bytes) -> tuple[Floats, set[int]
 
 
 def _matches(line: re.Pattern[bytes], body: bytes, count: int) -> list[tuple[bytes, ...]]:
-    """Groups of `line` in lines that follow each other, as far as they match."""
+    """Groups of the pattern `line` in consecutive lines, up to the first that does not match."""
     rows: list[tuple[bytes, ...]] = []
     position = 0
     while len(rows) < count and (match := line.match(body, position)):

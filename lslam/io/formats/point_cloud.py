@@ -1,4 +1,4 @@
-"""One point cloud as files hold it, and the one table of names by which the fields of all drivers and file kinds are known."""
+"""A point cloud as files hold it, and the table of field names that drivers and file formats use."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ class TimeColumn:
 
     @property
     def is_constant(self) -> bool:
-        """Whether all points have one value: nobody filled the field in."""
+        """Whether all points have one value: the driver did not fill the field."""
         return len(self.values) > 1 and bool((self.values == self.values[0]).all())
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """What a point file holds.
+    """Content of a point file.
 
     points : (N, 3) float32 (of maps float64), m; intensity : (N,) float32 or None
     rings : (N,) uint16, `NO_RING` where a point has none, or None
@@ -97,11 +97,11 @@ class PointCloud:
 
     @property
     def times(self) -> NDArray[Any] | None:
-        """(N,) per-point times as stored, of any type and unit, by the likeliest field alone; None without one."""
+        """(N,) per-point times as stored, of any type and unit, from the most likely field; None without one."""
         return self.clocks[0].values if self.clocks else None
 
     def select(self, mask: NDArray[Any]) -> PointCloud:
-        """The points that `mask` (bool or indices) keeps, with all their fields."""
+        """Cloud of the points that `mask` (bool or indices) keeps, with all their fields."""
         return replace(
             self,
             points=self.points[mask],
@@ -113,14 +113,14 @@ class PointCloud:
 
 
 def organised(rows: int, cols: int) -> dict[str, NDArray[Any]]:
-    """The shorter side of an organised cloud as a column, which gives the rings where no field does; nothing of a plain list."""
+    """Ring of each point of an organised cloud, as a column along its shorter side; empty for an unorganised cloud."""
     if min(rows, cols) < 2:
         return {}
     return {ORGANISED: np.asarray(np.divmod(np.arange(rows * cols), cols)[0 if rows <= cols else 1], np.uint32)}
 
 
 def beyond(count: int, more: int) -> dict[str, NDArray[Any]]:
-    """What names points behind those that a header counts, as a column that nobody reads."""
+    """Column without values whose name states that points follow behind those that the header counts; empty if none do."""
     return {f"{more} points behind the {count} of the header": np.zeros(0)} if more > 0 else {}
 
 
@@ -128,9 +128,9 @@ def packed_columns(
     path: Path, kind: str, names: Sequence[str], dtype: np.dtype[Any], count: int, data: memoryview, at: int = 0, *,
     is_last: bool = True,
 ) -> dict[str, NDArray[Any]]:  # fmt: skip
-    """One array per field, numbered in `dtype`, of `count` points from byte `at` on. Raises InputError when data end early.
+    """Read `count` records of `dtype` from byte `at` on: one array per field. Raises InputError when the data end early.
 
-    is_last : nothing else follows; zeros that fill a file up are no points
+    is_last : nothing else follows; trailing zeros that pad a file are no points
     """
     record = dtype.itemsize
     room = max(len(data) - at, 0)
@@ -144,7 +144,7 @@ def packed_columns(
 
 
 def text_columns(table: Floats, names: Sequence[str], kinds: Sequence[np.dtype[Any]]) -> dict[str, NDArray[Any]]:
-    """Columns of numbers (N, K) that were text, by field; axes hold the digits that they hold, whatever type a header names."""
+    """Numeric columns (N, K) of a text file by field. Coordinates stay float64 whatever type a header states."""
     columns, k = {}, 0
     for name, kind in zip(names, kinds, strict=True):
         end = k + math.prod(kind.shape)
@@ -240,7 +240,7 @@ def _find_labels(candidates: Mapping[str, NDArray[Any]]) -> tuple[str | None, ND
 
 
 def _clocks(names: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> Iterator[TimeColumn]:
-    """Two columns of seconds and their fractions first, then single fields in the order of the table."""
+    """Candidates for per-point times: pairs of seconds and fraction first, then single fields in the order of the table."""
     parted = {plain: _part_unit(plain) for plain in names}
     by_unit = {part: names[plain] for plain, part in parted.items()}
     for (clock, unit), name in by_unit.items():
@@ -260,7 +260,7 @@ def _clocks(names: Mapping[str, str], columns: Mapping[str, NDArray[Any]]) -> It
 
 
 def _part_unit(plain: str) -> tuple[str, str]:
-    """`time_offset_ns` -> ("time_offset", "ns"); no unit where the last word is none."""
+    """Split a unit off a field's name: `time_offset_ns` -> ("time_offset", "ns"); no unit where the last word is none."""
     if plain in TIME_NAMES:
         return plain, ""
     clock, _, word = plain.rpartition("_")
@@ -268,7 +268,7 @@ def _part_unit(plain: str) -> tuple[str, str]:
 
 
 def _seconds_and(fine: str, name: str, seconds: NDArray[Any], parts: NDArray[Any]) -> Iterator[TimeColumn]:
-    """ns from whole seconds and `parts` of a second in the unit `fine`; nothing where the values are something else."""
+    """Time column, ns, from whole seconds and `parts` of a second in the unit `fine`; none where the values do not fit."""
     whole, part = _integers(seconds), _integers(parts)
     if whole is None or part is None or 2 * np.count_nonzero((part >= 0) & (part < 10**9 // UNITS[fine])) < len(part):
         return
@@ -276,7 +276,7 @@ def _seconds_and(fine: str, name: str, seconds: NDArray[Any], parts: NDArray[Any
 
 
 def _two_words(name: str, values: NDArray[Any]) -> Iterator[TimeColumn]:
-    """What a field of two numbers of 32 bits can be: content decides."""
+    """Interpretations of a field of two 32-bit numbers, judged by its content."""
     words = _integers(values)
     if words is None or (values.dtype.kind in "iu" and values.dtype.itemsize != 4):
         return

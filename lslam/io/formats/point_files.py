@@ -38,7 +38,7 @@ log = logging.getLogger("lslam")
 def read_points(path: Path, record: PointRecord | None = None) -> PointCloud:
     """Read one point file, chosen by its suffix; NaN, Inf and zero points are kept as they are.
 
-    record : of a `.bin` file or of a plain NumPy array; None recognises it. Raises InputError naming the file and the place.
+    record : of a `.bin` file or of a plain NumPy array; None detects it. Raises InputError naming the file and the place.
     """
     return cloud_from_fields(path, _read_columns(path, record))
 
@@ -67,7 +67,7 @@ def read_bytes(path: Path) -> NDArray[np.uint8]:
 
 
 def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
-    """Raise InputError when the bytes of a file are no multiple of those of a point."""
+    """Raise InputError when the size of a file is no multiple of the size of a point, bytes."""
     if len(raw) % record.size:
         what = "x, y, z, intensity as float32" if record == KITTI else str(record)
         raise InputError(
@@ -77,7 +77,9 @@ def check_size(path: Path, raw: NDArray[np.uint8], record: PointRecord) -> None:
 
 
 def record_of(files: Mapping[Path, NDArray[np.uint8]]) -> tuple[PointRecord, str]:
-    """The record of the points in `.bin` files, by their values, and why it is not KITTI's; empty where it is.
+    """Detect the point record of `.bin` files by their values.
+
+    The second result says why it is not KITTI's; it is empty if it is.
 
     Raises InputError with the sizes that would fit when no record fits or several do.
     """
@@ -111,7 +113,7 @@ def write_bin(path: Path, points: NDArray[Any], intensity: NDArray[Any] | None =
 
 
 def read_labels(path: Path, count: int) -> NDArray[np.uint16]:
-    """Classes (count,) of the points of a scan: the lower halves of SemanticKITTI's numbers, the upper ones tell instances.
+    """Classes (count,) of the points of a scan: the lower 16 bits of SemanticKITTI's labels; the upper ones are instances.
 
     Raises InputError when the file cannot be read, or holds another number of labels.
     """
@@ -122,7 +124,7 @@ def read_labels(path: Path, count: int) -> NDArray[np.uint16]:
 
 
 def write_labels(path: Path, labels: NDArray[np.uint16]) -> None:
-    """Write the classes of a scan's points, atomically, as SemanticKITTI has them. Raises OutputError."""
+    """Write the classes of a scan's points as SemanticKITTI does, atomically. Raises OutputError."""
     with atomic_write(path) as stream:
         stream.write(labels.astype("<u4").data)
 
@@ -155,7 +157,7 @@ def _npy_columns(path: Path, record: PointRecord | None) -> Mapping[str, NDArray
 
 
 def _of_structure(table: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Fields of one number each; three together are x, y and z where no field has these names."""
+    """Fields of a structured array, one number each. A field of three numbers is x, y and z if no field has these names."""
     numbers = [name for name in table.dtype.names or () if table[name].dtype.kind in "fiu"]
     columns = {name: table[name] for name in numbers if table[name].ndim == 1}
     is_placed = "x" in map(str.lower, columns)
@@ -216,7 +218,7 @@ def read_cloud(path: Path) -> ArrayCloud:
 
 
 def coordinate_step(points: Floats) -> float:
-    """Step of which all coordinates along an axis are multiples, m, the largest of the axes; 0 for those near the origin."""
+    """Quantisation step of the coordinates, m: the largest of the axes; 0 for coordinates near the origin."""
     steps = [0.0]
     for column in points.T:
         values = np.unique(column[np.isfinite(column)])

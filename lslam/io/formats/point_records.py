@@ -1,4 +1,4 @@
-"""Records of points without a header, in `.bin` files and plain NumPy arrays: recognised by their values, or stated.
+"""Point records without a header, in `.bin` files and plain NumPy arrays: detected from their values, or stated.
 
 A `.bin` file does not say what a point is. Four float32, as KITTI writes them, are assumed only where the values allow it; other
 records are tried on several files together. A wrong record size mixes the columns, which shows: coordinates that no sensor
@@ -55,7 +55,7 @@ class PointRecord:
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """Packed, its fields numbered."""
+        """Packed NumPy type with numbered fields."""
         return np.dtype([(str(k), code) for k, code in enumerate(self.types)])
 
     @property
@@ -75,7 +75,7 @@ class PointRecord:
         return {name: table[str(k)] for k, name in enumerate(self.names) if name != "_"}
 
     def unread(self) -> str:
-        """Which columns are not read, as words; empty when all are."""
+        """Columns that are not read, as words; empty when all are."""
         which = [str(k + 1) for k, name in enumerate(self.names) if name == "_"]
         return f"column{'s' if len(which) > 1 else ''} {', '.join(which)} not read" if which else ""
 
@@ -98,7 +98,9 @@ KITTI = parse_record("x y z intensity")
 
 @dataclass(frozen=True)
 class Recognition:
-    """What the bytes of files are: `record` of their points, None where none fits or several do, and which are `fitting`.
+    """Result of `recognise`.
+
+    record : None where none or several fit; fitting : all that fit
 
     reason : why it is not KITTI's, empty where it is
     """
@@ -110,7 +112,7 @@ class Recognition:
 
 @np.errstate(all="ignore")
 def recognise(files: Sequence[NDArray[np.uint8]]) -> Recognition:
-    """The record of all the files: KITTI's unless their sizes or values contradict it. Few points decide nothing."""
+    """Detect the record of the files: KITTI's unless their sizes or values contradict it. Short files are skipped."""
     files = [raw for raw in files if len(raw) >= KITTI.size]
     if not files:
         return Recognition(KITTI)
@@ -147,7 +149,7 @@ def name_columns(tables: Sequence[NDArray[Any]]) -> tuple[str, ...]:
 
 
 def _whole(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> list[Floats]:
-    """(N, K) of each file that holds whole points; empty unless most do: one may be cut off."""
+    """Whole points (N, K) of each file; empty unless most files hold whole points, since one may be cut off."""
     whole = [raw[: _MOST_BYTES // record.size * record.size] for raw in files if len(raw) % record.size == 0]
     if 2 * len(whole) <= len(files):
         return []
@@ -175,7 +177,7 @@ def _candidates(files: Sequence[NDArray[np.uint8]]) -> list[PointRecord]:
 
 
 def _faults(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> tuple[str, str] | None:
-    """What no measurement can be, and what is only unlikely; empty words where nothing is, None where few points tell."""
+    """Values that no measurement can have, and values that are only unlikely, in words; None where there are too few points."""
     tables = _whole(record, files)
     if not tables:
         return f"{len(files[0])} bytes are no multiple of {record.size}", ""
@@ -234,12 +236,12 @@ def _depends_on_row(columns: list[Floats], period: int) -> bool:
 
 
 def _negative(values: Floats) -> float:
-    """Share of negative ones; -1 stands for none."""
+    """Share of negative values; -1 marks a missing value and is not counted as one."""
     return float(np.mean((values < 0) & (values != -1)))
 
 
 def _is_intensity(scans: Sequence[Floats], k: int) -> bool:
-    """Whether column k may be that: not negative, and not the range."""
+    """Whether column k may be the intensity: not negative, and not the range."""
     rows = np.concatenate(scans)
     lengths = np.linalg.norm(rows[:, :3], axis=1)
     is_range = np.mean(np.abs(rows[:, k] - lengths) < 0.01 * lengths) > 0.9

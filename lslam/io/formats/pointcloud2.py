@@ -19,7 +19,7 @@ _LIVOX = [
 
 
 def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
-    """Points of a PointCloud2, those without a finite place left out with all their fields.
+    """Decode the points of a PointCloud2; points without finite coordinates are left out.
 
     Rows may be padded and numbers big-endian. An organised cloud without a ring field gets its rows (its columns, where there
     are fewer of them) as rings. Raises InputError naming `where` when fields and data contradict each other.
@@ -40,7 +40,7 @@ def decode_pointcloud2(message: Any, where: Path) -> PointCloud:
 
 
 def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path) -> tuple[PointCloud, int]:
-    """Points of a Livox CustomMsg whose header ends at `start`, and its `timebase`, ns. Raises InputError when it is cut."""
+    """Decode a Livox CustomMsg whose header ends at `start`: points, and `timebase`, ns. Raises InputError when it is cut off."""
     at = _livox_body(start, is_ros1)
     try:
         timebase = int(np.frombuffer(data, f"{order}u8", 1, at)[0])
@@ -55,13 +55,13 @@ def decode_livox(data: bytes, start: int, is_ros1: bool, order: str, where: Path
 
 
 def livox_id(data: bytes, start: int, is_ros1: bool) -> int | None:
-    """Which LiDAR a Livox CustomMsg is of, whose header ends at `start`; None when it is cut off before that."""
+    """LiDAR number (`lidar_id`) of a Livox CustomMsg whose header ends at `start`; None when it is cut off before that."""
     at = _livox_body(start, is_ros1) + 12
     return data[at] if at < len(data) else None
 
 
 def _livox_body(start: int, is_ros1: bool) -> int:
-    """Where the numbers of a CustomMsg begin; those of CDR are aligned from behind its first four bytes."""
+    """Offset of the first number of a CustomMsg. CDR aligns numbers relative to the end of its 4-byte header."""
     return start if is_ros1 else 4 + -(-(start - 4) // 8) * 8
 
 

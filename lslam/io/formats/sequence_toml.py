@@ -1,4 +1,4 @@
-"""`sequence.toml`: what a folder of scans cannot say by itself. Read and written; unknown keys are errors."""
+"""`sequence.toml`: facts that a folder of scans cannot state by itself. Reader and writer; unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Matrix = NDArray[np.float64]
 
 
 def is_rate(rate_hz: float) -> bool:
-    """Whether it can be a sensor's: stamps are made of it."""
+    """Whether a number can be the rate of a sensor, Hz: stamps are made of it."""
     return 1e-3 < rate_hz < 1e6
 
 
@@ -51,7 +51,7 @@ def _is_record(value: Any) -> bool:
 
 
 def _key(is_valid: Callable[[Any], bool], expected: str) -> Any:
-    """A key and what its values are."""
+    """Field of `SequenceInfo` for one key, with the check of its values."""
     return field(default=None, metadata={"is_valid": is_valid, "expected": expected})
 
 
@@ -70,7 +70,7 @@ def _one_of(choices: Iterable[str]) -> Any:
 
 @dataclass(frozen=True)
 class SequenceInfo:
-    """What `sequence.toml`, or the user, says about a sequence; None where nothing is said.
+    """Facts about a sequence from `sequence.toml` or the user; None where nothing is stated.
 
     sensor : its name, for example `HDL-64E`; rings : number of beams
     rows, cols : organised clouds, point r * cols + c is row (ring) r; rate_hz : scans per second
@@ -126,20 +126,20 @@ class SequenceInfo:
     frames: Mapping[str, Matrix] | None = None
 
     def over(self, other: SequenceInfo) -> SequenceInfo:
-        """What this says, and what `other` says where this is silent."""
+        """Merge with `other`: its values are taken where this has none."""
         pairs = ((f.name, getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return SequenceInfo(**{name: theirs if mine is None else mine for name, mine, theirs in pairs})
 
 
 def read_sequence_toml(path: Path) -> SequenceInfo:
-    """Read such a file. Raises InputError naming the file, the key and the nearest known key or the values allowed."""
+    """Read a `sequence.toml`. Raises InputError naming the file, the key and the nearest known key or the values allowed."""
     with input_errors(path, UnicodeDecodeError, as_what="TOML"):
         text = path.read_text(encoding="utf-8")
     return parse_sequence_toml(text, path)
 
 
 def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
-    """The same from text that was found at `path`."""
+    """As `read_sequence_toml`, from text; messages name `path`."""
     with input_errors(path, tomllib.TOMLDecodeError, as_what="TOML"):
         tree = parse_toml(text)
     tables = {key: tree.pop(key, {}) for key in _TABLES}
@@ -166,12 +166,12 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
 
 
 def write_sequence_toml(path: Path, info: SequenceInfo) -> None:
-    """Write `info` to `path` atomically, leaving out what is None; it reads back equal."""
+    """Write `info` to `path` atomically, without keys that are None; it reads back equal."""
     write_text(path, sequence_toml_text(info))
 
 
 def sequence_toml_text(info: SequenceInfo) -> str:
-    """`info` as TOML, without what is None."""
+    """`info` as TOML, without keys that are None."""
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, *_TABLES)}
     extrinsics = {key: getattr(info, key) for key in EXTRINSICS}
     tables: dict[str, Mapping[str, Matrix | None]] = {

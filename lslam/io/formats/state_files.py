@@ -73,7 +73,7 @@ def _name(source: Path | BinaryIO) -> str:
 
 @dataclass(frozen=True)
 class Records:
-    """Records of one dataclass, to be written as columns."""
+    """Instances of one dataclass, to be written column by column."""
 
     rows: Sequence[Any]
 
@@ -86,7 +86,7 @@ def write_state(path: Path, value: Any, level: int = 0) -> None:
 
 
 def read_state(path: Path, classes: Sequence[type]) -> Any:
-    """The value that was written; only dataclasses among `classes` are made. Raises InputError naming a file that is damaged."""
+    """Read a value that `write_state` wrote; only dataclasses among `classes` are made. Raises InputError if it is damaged."""
     arrays = read_npz(path)
     try:
         return _decode(parse_json(arrays["tree"].tobytes()), arrays, {c.__name__: c for c in classes})
@@ -147,7 +147,7 @@ def _decode_records(tree: Any, arrays: Arrays, classes: Classes) -> list[Any]:
 
 
 def _encode_column(values: list[Any], arrays: Arrays) -> Any:
-    """One field of all records; None wherever it may be."""
+    """Encode one field of all records; the value may be None in some."""
     known = [value for value in values if value is not None]
     inside: Any
     if not known:

@@ -57,7 +57,7 @@ class TextTable:
     comments: list[str]
 
     def error(self, k: int, what: str) -> InputError:
-        """What is wrong with row `k`, with its place in the file."""
+        """An InputError about row `k`, naming file and line."""
         return InputError(f"{self.path}, line {self.rows[k].number}: {what}")
 
     def numbers(self, column: int) -> Floats:
@@ -66,7 +66,7 @@ class TextTable:
         return np.array([_number(cell) for cell in cells], np.float64)
 
     def values(self, columns: list[int]) -> Floats:
-        """(N, K) float64 of columns, NaN where a number is missing; InputError with the line of a cell that is text."""
+        """(N, K) float64 of columns, NaN where a cell is empty. Raises InputError naming the line of a cell that is text."""
         values = np.empty((len(self.rows), len(columns)))
         for k, (_, text, cells) in enumerate(self.rows):
             try:
@@ -76,9 +76,9 @@ class TextTable:
         return values
 
     def lost_rows(self, values: Floats, what: str) -> Bools:
-        """Where `values` (N, K) of poses hold NaN, which messages call `what`.
+        """(N,) whether `values` (N, K) of poses hold NaN; `what` names the values in messages.
 
-        Raises InputError when that is everywhere, and with the line of one that is infinite.
+        Raises InputError when all rows do, and naming the line of an infinite value.
         """
         lost = np.asarray(np.isnan(values).any(axis=1), np.bool_)
         if lost.all():
@@ -89,13 +89,16 @@ class TextTable:
         return lost
 
     def check_widths(self, width: int, whose: str, is_least: bool = False) -> None:
-        """InputError with the line that is not as wide as `whose` width; wider ones pass where it is the least."""
+        """Raise InputError naming the first line with another number of cells than required.
+
+        If `is_least`, wider lines pass.
+        """
         for k, row in enumerate(self.rows):
             if len(row.cells) < width or (len(row.cells) > width and not is_least):
                 raise self.error(k, f"{len(row.cells)} columns where {whose} has {width}")
 
     def check_increasing(self, stamps_ns: Longs) -> None:
-        """InputError with the first line whose stamp is not after the one before."""
+        """Raise InputError naming the first line whose stamp does not increase."""
         wrong = np.flatnonzero(np.diff(stamps_ns) <= 0)
         if len(wrong):
             k = int(wrong[0]) + 1
@@ -104,7 +107,7 @@ class TextTable:
             raise self.error(k, f"{now} s {how}; sort the poses and keep one per stamp")
 
     def select(self, mask: Bools) -> TextTable:
-        """The rows where `mask` (N,) is true."""
+        """Table of the rows where `mask` (N,) is true."""
         return replace(self, rows=[self.rows[k] for k in np.flatnonzero(mask).tolist()])
 
 
@@ -142,7 +145,7 @@ def looks_like_header(line: str) -> bool:
 
 
 def separator_of(text: str) -> str | None:
-    """What stands between the cells of a line: a semicolon, a tab, a comma, else blanks (None)."""
+    """Separator of the cells of a line: a semicolon, a tab or a comma, else blanks (None)."""
     return next((s for s in (";", "\t", ",") if s in text), None)
 
 
@@ -163,7 +166,7 @@ def split_cells(text: str, separator: str | None) -> list[str]:
 
 
 def _split(text: str, separator: str | None) -> list[str]:
-    """Parts between separators; one within quotes is a part of its cell."""
+    """Split at separators, except within quotes."""
     if separator is not None and '"' in text:
         with suppress(csv.Error):
             return next(csv.reader([text], delimiter=separator, skipinitialspace=True))
@@ -189,7 +192,7 @@ def text_table(path: Path, rows: list[Row], comments: list[str]) -> TextTable:
 
 
 def _whole_dates(rows: list[Row], names: list[str]) -> tuple[list[Row], list[str]]:
-    """Rows and names with a day and the time of day in the column behind it as one column."""
+    """Rows and names after merging a column of days with the time of day in the next column."""
     cells = rows[0].cells if rows else []
     for k, (day, time) in enumerate(pairwise(cells)):
         if re.fullmatch(DAY, day) and re.match(r"\d\d:", time):
@@ -270,7 +273,7 @@ def date_to_ns(text: str) -> int | None:
 
 
 def utc_of(stamps_ns: Longs) -> list[datetime] | None:
-    """The instants of stamps (N,) ns, to the microsecond, or None when they are no Unix time: they tell no date then."""
+    """UTC times of stamps (N,), ns, to the microsecond; None when they are no Unix time."""
     if not len(stamps_ns) or int(np.min(stamps_ns)) < _FIRST_NS:
         return None
     return [_EPOCH + timedelta(microseconds=int(stamp) // 1000) for stamp in stamps_ns]

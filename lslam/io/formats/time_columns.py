@@ -1,6 +1,6 @@
-"""The time of a table's rows: one column, seconds beside their fraction, with or without names, told from a mere index.
+"""Time columns of a table: one column, or seconds and their fraction, with or without names, and not a mere index.
 
-One rule for trajectories, IMU, fixes and stamps files. A name proposes; what stands in the column confirms.
+One rule for trajectories, IMU, fixes and stamps files. A column's name proposes it, its values confirm it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ _STAMPED, _TIMED, _ENDING = 0, 1, 2
 
 
 class RowTimes(NamedTuple):
-    """stamps_ns : (N,); note : which columns hold them and which might have, empty without others; columns : all of these"""
+    """Times of the rows of a table.
+
+    stamps_ns : (N,); note : columns used, and other candidates, in words; columns : all of these columns
+    """
 
     stamps_ns: Longs
     note: str
@@ -54,9 +57,9 @@ def tokens_of(name: str) -> list[str]:
 
 
 def find_clock(table: TextTable, taken: Collection[int] = (), default_ns: int | None = None) -> RowTimes | None:
-    """The time of the rows, by names or, where there are none, by the first columns; None when no column is a time.
+    """Find the times of the rows, by column names or, without names, in the first columns; None when no column is a time.
 
-    taken : columns that are something else; default_ns : ns in a unit where the name states none, by size and step when None
+    taken : columns already used otherwise; default_ns : ns in a unit where the name states none, by size and step when None
     Raises InputError with the line of a cell that is no time.
     """
     candidates = _by_name(table, taken) if table.names else _by_place(table, taken)
@@ -113,8 +116,9 @@ def read_stamps(path: Path, must_increase: bool = False) -> Longs:
 
 
 def is_index(values: Floats, is_beside_date: bool = False) -> bool:
-    """Whether a column counts rows: whole numbers one apart but where rows are lost, three at least, smaller than any time
-    since 1970; in steps of any length beside times since 1970.
+    """Whether a column counts rows: at least three whole numbers, smaller than any time since 1970, that rise by one.
+
+    Larger steps are allowed if they are rare (lost rows), or if the column stands beside times since 1970.
     """
     steps = np.diff(values)
     is_count = (
@@ -124,7 +128,7 @@ def is_index(values: Floats, is_beside_date: bool = False) -> bool:
 
 
 def unread_columns(table: TextTable, columns: Collection[int]) -> list[str]:
-    """Names of the columns that are none of `columns` and do not just count the rows."""
+    """Names of the columns that are not in `columns` and do not merely count the rows."""
     others = [k for k, name in enumerate(table.names) if name and k not in columns]
     return [table.names[k] for k in others if not is_index(table.numbers(k))]
 
@@ -178,7 +182,7 @@ def _by_name(table: TextTable, taken: Collection[int]) -> list[Units]:
 
 
 def _rank(words: list[str]) -> int | None:
-    """How likely a column of this name is the time of the row, 0 first; None when it is no time."""
+    """Rank of a column's name as a time, 0 for the most likely; None when it is no time."""
     core = words[:-1] if len(words) > 1 and words[-1] in UNITS_NS else words
     if core[-1] in ("stamp", "timestamp", "stamps", "timestamps"):
         return _STAMPED
@@ -211,7 +215,10 @@ def _with_fraction(table: TextTable, words: list[list[str]], k: int, free: list[
 
 
 def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
-    """First columns without names: a time, seconds and nanoseconds, and either behind an index or a text."""
+    """Time columns by position in a table without names.
+
+    They are a time, or seconds and nanoseconds, perhaps after an index or a text.
+    """
     width = min([3, *taken, *(len(row.cells) for row in table.rows)]) if table.rows else 0
     numbers = [table.numbers(k) for k in range(width)]
     out: list[Units] = []
@@ -226,7 +233,7 @@ def _by_place(table: TextTable, taken: Collection[int]) -> list[Units]:
 
 
 def _increases(values: Floats) -> bool:
-    """Whether all are numbers and hardly any stands behind the one before: lines may be wrong, clocks not."""
+    """Whether all values are numbers and nearly all increase: single lines may be wrong, clocks are not."""
     if not len(values) or not np.isfinite(values).all():
         return False
     return len(values) < 2 or float(np.mean(np.diff(values) > 0)) > 0.9

@@ -41,22 +41,22 @@ _XYZW = {"last": [0, 1, 2, 3], "first": [1, 2, 3, 0]}
 
 
 def fits_csv(first: str) -> bool:
-    """Whether the first line is of a table and not of numbers between blanks."""
+    """Whether the first line is of a table with separators, not of numbers between blanks."""
     return any(separator in first for separator in ",;") or looks_like_header(first)
 
 
 def fits_euroc(first: str) -> bool:
-    """A bare table that starts with integer nanoseconds."""
+    """Whether the first line is of a table without names that starts with integer nanoseconds."""
     return fits_csv(first) and re.fullmatch(r"\d{15,}", re.split(r"[,;]", first)[0].strip()) is not None
 
 
 def read_euroc(table: TextTable, times: Path | None) -> Trajectory:
-    """Poses of the IMU, if no comment names another body."""
+    """Read poses of the IMU, or of the body that a comment names."""
     return parse(table, scalar="first", default_ns=1, frame="imu")
 
 
 def read_csv(table: TextTable, times: Path | None) -> Trajectory:
-    """Poses of the body that a comment names."""
+    """Read poses of the body that a comment names."""
     return parse(table)
 
 
@@ -88,7 +88,7 @@ def frame_in(comments: list[str]) -> str | None:
 
 
 def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, frame: str = "unknown") -> Trajectory:
-    """Read a table by the names of its columns, which may stand in a comment, else by what stands in them.
+    """Read a trajectory table by its column names, which may stand in a comment, else by the values in the columns.
 
     scalar : place of w in quaternions without names, `first` or `last`; default_ns : unit of times without one
     frame : the body, if no comment names another
@@ -134,10 +134,10 @@ def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, fra
 
 
 def poses_of(values: Floats, table: TextTable) -> tuple[Floats, bool, list[str]]:
-    """Poses (N, 4, 4) of positions (N, 3) or positions and quaternions xyzw (N, 7), whether their rotations are any, and notes.
+    """Poses (N, 4, 4), whether they have rotations, and notes, from positions (N, 3) or positions and quaternions xyzw (N, 7).
 
-    Quaternions of zeros everywhere are none, nor is one axis or identity everywhere along a path that bends: tools write
-    those for positions alone. Raises InputError with the line of a quaternion far from unit length.
+    Constant quaternions along a path that bends, and quaternions of zeros, are placeholders: tools write them for positions
+    alone. Raises InputError with the line of a quaternion far from unit length.
     """
     p, q = values[:, :3], values[:, 3:]
     alone = se3.make(np.eye(3), p)
@@ -169,7 +169,7 @@ class PoseColumns(NamedTuple):
 
 
 def named_columns(table: TextTable) -> PoseColumns | None:
-    """The columns by their names; None when none of them is a position.
+    """Pose columns by their names; None when none of them is a position.
 
     Raises InputError when an axis is missing, or when several bodies have positions.
     """
@@ -209,7 +209,7 @@ def named_columns(table: TextTable) -> PoseColumns | None:
 
 
 def _kind(words: list[str]) -> tuple[bool, Prefix, str] | None:
-    """Whether a name is of a rotation or else of a position, the words before, and the axis; None when it is of neither.
+    """Parse a column's name: whether it is of a rotation or a position, its prefix, and the axis; None for other names.
 
     `field.pose.pose.position.x`, `p_RS_R_x [m]`, `q_RS_w []`, `pose.orientation.w`, `tx`, `qw`, `gt_x`, `easting`.
     """
@@ -280,7 +280,7 @@ def placed_columns(table: TextTable, scalar: str) -> PoseColumns:
 
 
 def _leading_times(values: Floats) -> list[int]:
-    """How many of the first columns of a table (N, K) may be the time: one, two or three."""
+    """Possible numbers of leading time columns in a table (N, K): one, two or three."""
     if values.shape[1] < 4:
         return []
     a, b, c = values[np.isfinite(values[:, :3]).all(axis=1), :3].T
@@ -300,7 +300,10 @@ def _are_unit(q: Floats) -> bool:
 
 
 def _scalar_by_motion(positions: Floats, q: Floats) -> str:
-    """`first` or `last`, where w stands by the motion: a vehicle keeps to one direction of its body; empty when unclear."""
+    """Place of w in a quaternion, `first` or `last`, judged by the motion; empty when unclear.
+
+    A vehicle moves along one fixed direction of its body.
+    """
     good = np.isfinite(q).all(axis=1) & np.isfinite(positions).all(axis=1)
     q, steps = q[good], np.diff(positions[good], axis=0)
     path_m = np.linalg.norm(steps, axis=1).sum()

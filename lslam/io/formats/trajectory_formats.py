@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrajectoryFormat:
-    """One format; its functions are imported when they are asked for.
+    """One trajectory format; its module is imported on first use.
 
     module : with `fits_NAME(first line)`, `read_NAME(table, times)` and `write_NAME(path, trajectory)`
     frame : the body whose poses it holds by convention, empty where the file says
@@ -30,12 +30,12 @@ class TrajectoryFormat:
 
     @property
     def fits(self) -> Callable[[str], bool]:
-        """Whether a file whose first line of data is this one may be of the format."""
+        """Whether a file with this first line of data may be of the format."""
         return self._function("fits")
 
     @property
     def read(self) -> Callable[[TextTable, Path | None], Trajectory]:
-        """The trajectory of a table; the last argument names a file of stamps."""
+        """Read the trajectory of a table; `times` names a file of stamps."""
         return self._function("read")
 
     @property

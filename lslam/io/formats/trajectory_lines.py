@@ -1,4 +1,4 @@
-"""Trajectories of one pose a line, numbers between blanks: KITTI and TUM."""
+"""Trajectory formats with one pose per line and blanks between the numbers: KITTI and TUM."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WIDTHS = (12, 13, 16, 17)
 
 
 def fits_kitti(first: str) -> bool:
-    """The upper 3x4 of a pose or the whole 4x4, with an index or a time before it or not: 12, 13, 16 or 17 numbers."""
+    """Whether a line holds a 3x4 or 4x4 pose, perhaps after an index or a time: 12, 13, 16 or 17 numbers."""
     separator = separator_of(first)
     cells = split_cells(first, separator)
     if len(cells) not in WIDTHS or looks_like_header(first):
@@ -45,7 +45,7 @@ def _is_matrix(cells: list[str]) -> bool:
 
 
 def read_kitti(table: TextTable, times: Path | None) -> Trajectory:
-    """Poses of camera 0; stamps of `times`, else of the times that belong to the file."""
+    """Read poses of camera 0, with the stamps of `times`, else of the times file that belongs to the poses."""
     trajectory = read_matrices(table)
     if not trajectory.has_stamps:
         stamps_ns = _stamps_of_kitti(table.path, scans_of(trajectory), times)
@@ -60,7 +60,7 @@ def scans_of(trajectory: Trajectory) -> Longs:
 
 
 def without_lost(trajectory: Trajectory) -> Trajectory:
-    """The poses that are no NaN, and a note about the others."""
+    """Poses without NaN, and a note about the ones left out."""
     lost = np.asarray(np.isnan(trajectory.poses).any(axis=(1, 2)), np.bool_)
     if not lost.any():
         return trajectory
@@ -107,18 +107,18 @@ def read_matrices(table: TextTable) -> Trajectory:
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
-    """Write a KITTI file, atomically: the poses as they are; the caller brings them into camera 0 (`T_cam0_lidar`)."""
+    """Write a KITTI file, atomically. The caller has transformed the poses to camera 0 (`T_cam0_lidar`)."""
     rows = trajectory.poses[:, :3, :].reshape(-1, 12).tolist()
     write_text(Path(path), "".join(" ".join(f"{v:.12e}" for v in row) + "\n" for row in rows))
 
 
 def fits_tum(first: str) -> bool:
-    """Other numbers between blanks: eight, or a time and a position, with an index or a second column of time or not."""
+    """Whether a line holds eight numbers between blanks, or a time and a position, perhaps after an index or a second time."""
     return not trajectory_csv.fits_csv(first) and not fits_kitti(first)
 
 
 def read_tum(table: TextTable, times: Path | None) -> Trajectory:
-    """Poses of the body that a comment names."""
+    """Read poses of the body that a comment names."""
     return trajectory_csv.parse(table, scalar="last")
 
 
@@ -132,7 +132,7 @@ def write_tum(path: str | Path, trajectory: Trajectory, comment: str = "") -> No
 
 
 def find_times(path: str | Path) -> Path | None:
-    """The times that belong to a KITTI pose file: `times.txt` beside it, `times/NN.txt` or `sequences/NN/times.txt`."""
+    """Times file that belongs to a KITTI pose file: `times.txt` beside it, `times/NN.txt` or `sequences/NN/times.txt`."""
     path = as_path(path)
     above = path.resolve().parent
     candidates = (
@@ -144,7 +144,7 @@ def find_times(path: str | Path) -> Path | None:
 
 
 def _stamps_of_kitti(path: Path, scans: Longs, times: Path | None) -> Longs | None:
-    """Stamps of the poses that belong to `scans` (N,), of a file with one for each scan."""
+    """Stamps of the poses of `scans` (N,), from a file with one stamp per scan."""
     source = find_times(path) if times is None else times
     if source is None:
         return None

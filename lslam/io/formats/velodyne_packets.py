@@ -25,7 +25,7 @@ DUAL = 0x39
 
 @dataclass(frozen=True)
 class VelodyneModel:
-    """What the manual says of a sensor.
+    """Properties of a sensor from its manual.
 
     elevations_deg, turned_deg, raised_mm : of each laser: angle up, angle by which it is ahead of the block's azimuth, height of
         its beam's origin
@@ -116,7 +116,8 @@ def points_of(blocks: Blocks, use: Bools, began: int, model: VelodyneModel) -> t
 
     began : what unwrapped azimuths count from, 0.01 deg
 
-    The azimuth of a slot is that of its block and what the sensor turns until it is measured, by the azimuth of the next block.
+    The azimuth of a slot is that of its block plus the rotation until the slot is measured, interpolated to the azimuth of
+    the next block.
     """
     steps, spans = np.diff(blocks.azimuth), np.diff(blocks.times_ns)
     rate = np.where(spans > 0, steps / np.maximum(spans, 1), 0.0)

@@ -1,7 +1,8 @@
-"""A data set on disk becomes a Sequence. A new reader is one file with `locate` and `open_folder` and one line here.
+"""Readers: each turns a data set on disk into a Sequence.
 
-Others register such a module as entry point `lslam.readers`; it is asked about folders that no reader of ours takes.
-Nothing heavy is imported before the folder is found.
+A new reader is one file with `locate` and `open_folder`, and one line here. Other packages register such a module as entry
+point `lslam.readers`; it is tried on folders that no built-in reader accepts. Nothing heavy is imported before the reader is
+chosen.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def open_sequence(
     point_times : what tells the times of points: field, columns, order, azimuth or none; None and auto find out
     extrinsics : T_lidar_imu, as numbers or a file (see `read_transform`)
         What is given wins over `sequence.toml`, which wins over what the layout implies.
-    imu, gnss : the stream is asked for: where the recording has none it is sought, as in the raw drive of a KITTI sequence
+    imu, gnss : whether the stream is needed: if the recording has none, it is searched elsewhere, as in KITTI's raw drive
 
     Raises
     ------
@@ -106,7 +107,7 @@ def open_sequence(
 
 @contextmanager
 def _readable(name: str | Path) -> Iterator[None]:
-    """Turn an OSError of the block into an InputError that names the file, or what was asked for."""
+    """Turn an OSError of the block into an InputError that names the file or the requested path."""
     try:
         yield
     except OSError as error:
@@ -114,7 +115,7 @@ def _readable(name: str | Path) -> Iterator[None]:
 
 
 def _merged(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
-    """With the LiDARs that the table `lidars` of its `sequence.toml` names. Raises InputError when one of them is not there."""
+    """Sequence merged with the LiDARs in the table `lidars` of its `sequence.toml`. Raises InputError when one is missing."""
     from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo
     from lslam.io.readers.sidecars import read_info
     from lslam.registration.preprocessing.merged_lidars import FurtherLidar, MergedLidars

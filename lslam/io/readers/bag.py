@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 as sequences: topics chosen, stamps put in order, extrinsics found; scans are read one at a time."""
+"""Bags of ROS 1 and ROS 2 as sequences: chooses topics, orders stamps, finds extrinsics; scans are read one at a time."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ class BagSequence(SequenceOnDisk):
     """A recording in a bag.
 
     messages : (N,) int64, which message of `topic` each scan is; headers_ns : (N,) int64, stamps of their headers
-    uses : what each topic that is used is used for; halves : further messages of a scan
-    revolutions : of packets, which then are read in place of messages
+    uses : purpose of each topic in use; halves : further messages of a scan
+    revolutions : set for packets, and then read in place of messages
     """
 
     bag: Bag
@@ -79,7 +79,7 @@ class BagSequence(SequenceOnDisk):
 
     @property
     def recorded_ns(self) -> Longs:
-        """When the message of each scan was recorded, (N,)."""
+        """Time of recording of each scan's message, (N,) ns."""
         return self.topic.stamps_ns[self.messages]
 
     def _read(self, index: int) -> Scan:
@@ -101,20 +101,20 @@ class BagSequence(SequenceOnDisk):
         return Scan(cloud.points, stamp, index, cloud.intensity, timed.times, cloud.rings, fault, cloud.labels)
 
     def cloud(self, index: int) -> tuple[PointCloud, int]:
-        """The points of scan `index` as the message holds them, and ns from its header's stamp to the base of their times."""
+        """Points of scan `index` as its message holds them, and the offset of their time base from the header's stamp, ns."""
         k = int(self.messages[index])
         cloud, shift, _ = put_together(self.bag, self.topic, (k, *self.halves.get(k, ())))
         return in_metres(cloud, self.unit_m), shift
 
     def ahead(self, stamps: Longs, recorded: Longs, what: str) -> int:
-        """By how much another clock is ahead of that of these scans, ns, see `ahead_of`."""
+        """Offset of the clock of another stream from that of the scans, ns, positive if ahead; see `ahead_of`."""
         if self.revolutions is not None:
             return 0
         voice = Voice(self.notes, self.problems)
         return ahead_of(self.headers_ns, self.recorded_ns, stamps, recorded, what, voice)
 
     def on_its_clock(self, stream: Stream, what: str) -> Stream:
-        """What rides along, on the clock of these scans."""
+        """Another stream with its stamps shifted to the clock of the scans."""
         return replace(stream, stamps_ns=stream.stamps_ns - self.ahead(stream.stamps_ns, stream.recorded_ns, what))
 
 
@@ -123,7 +123,10 @@ _Lidar = tuple[ScanIndex, BagSequence, Opened | None]
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
-    """The bag at or in `path` and why it is one; None when there is none, or when it lies in one of KITTI's layouts."""
+    """Bag at or in `path`, and the reason why it is one.
+
+    None when there is none, or when it lies in one of KITTI's layouts.
+    """
     if path.is_dir() and any((path / name).is_dir() for name in _LAYOUTS):
         return None
     files = list_bag_files(path)
@@ -135,7 +138,7 @@ def locate(path: Path) -> tuple[Path, str] | None:
 
 
 def _others(path: Path) -> str:
-    """The other parts of a recording of which one is named."""
+    """Other parts of the recording of which `path` is one part."""
     names = [p.name for p in parts_beside(path)]
     if not names:
         return ""
@@ -194,7 +197,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
 
 
 def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_leading: bool) -> list[_Lidar]:
-    """The LiDARs of a topic that are read; what `info` says of the sensor is said of the leading one."""
+    """LiDARs of a topic that are read. What `info` states about the sensor applies to the leading one."""
     if is_decoded(topic):
         turns, frame = open_packets(bag, topic, voice)
         stamps = turns.revolutions.stamps_ns
@@ -212,7 +215,7 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
 
 
 def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceInfo, voice: Voice) -> BagSequence:
-    """The scans of one LiDAR, of packets that are `opened` or of messages, without what rides along."""
+    """Scans of one LiDAR, from the packets `opened` or from messages, without IMU and fixes."""
     sequence = BagSequence(
         name=info.name or printable(stem_of(bag.path)), path=bag.path, kind=KIND, bag=bag, topic=index.topic,
         messages=index.messages, headers_ns=index.stamps_ns, stamps_ns=index.stamps_ns,
@@ -240,7 +243,7 @@ def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceI
 
 
 def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links: Links) -> dict[str, str]:
-    """By the name of a topic."""
+    """Purpose of each topic, by its name."""
     uses = {INFO_TOPIC: "sequence.toml", **sequence.uses}
     for topic in sequence.bag.of_type("TFMessage"):
         if links.static if is_static(topic) else links.is_tf_used:
@@ -254,14 +257,14 @@ def _uses(sequence: BagSequence, imu: Stream | None, gnss: Stream | None, links:
 
 
 def _info(path: Path, bag: Bag, overrides: SequenceInfo) -> SequenceInfo:
-    """What the user says, over a `sequence.toml` beside the bag, over what the bag says itself."""
+    """Merged settings: those of the user, then of a `sequence.toml` beside the bag, then of the bag itself."""
     said, _ = read_info(path if path.is_dir() else path.parent, overrides)
     text = bag_streams.read_text(bag, INFO_TOPIC)
     return said if text is None else said.over(parse_sequence_toml(text, f"{path}, {INFO_TOPIC}"))
 
 
 def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
-    """Find out on a few scans how per-point times are meant; stamps move to the scans' starts."""
+    """Learn on a few scans how per-point times are encoded, and move the stamps to the scans' starts."""
 
     def sample(index: int) -> Sample:
         cloud, shift = sequence.cloud(index)
@@ -294,7 +297,7 @@ def _open_clock(sequence: BagSequence, info: SequenceInfo) -> None:
 def find_extrinsics(
     links: Links, lidar: str, imu: Stream | None, gnss: Stream | None, info: SequenceInfo, voice: Voice
 ) -> tuple[Calibration, bool]:
-    """Extrinsics that the user or the recording states, else by the transforms, else the identity with a warning (True).
+    """Extrinsics as stated, else by the bag's transforms, else the identity, with a warning and True.
 
     lidar : the frame of the scans
     """

@@ -1,4 +1,4 @@
-"""LiDARs of a bag: which share a topic, which publish a revolution in several messages, and where sensors sit."""
+"""LiDARs of a bag: sensors that share a topic, revolutions split into several messages, and the places of sensors."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _TRANSFORMS_LOOKED_AT = 100
 
 @dataclass(frozen=True)
 class ScanIndex:
-    """The scans of one LiDAR: its name and frame, which messages of `topic` they are, (N,), and their header stamps, (N,) ns.
+    """Scans of one LiDAR: its name and frame, the message numbers (N,) on `topic`, and their header stamps (N,), ns.
 
     halves : further messages of a scan
     """
@@ -61,7 +61,7 @@ class ScanIndex:
 
 
 def name_lidars(frames: Sequence[str], ids: Sequence[int | None]) -> list[str]:
-    """A name for the sensor of each message: its frame, with Livox's `lidar_id` where one frame has several, `livox:1`."""
+    """Name of the sensor of each message: its frame; with Livox's `lidar_id` where one frame has several, `livox:1`."""
     several = {frame for frame, count in Counter(f for f, _ in set(zip(frames, ids, strict=True))).items() if count > 1}
     return [
         f"{frame or UNNAMED}:{number}" if frame in several else frame or UNNAMED
@@ -70,12 +70,13 @@ def name_lidars(frames: Sequence[str], ids: Sequence[int | None]) -> list[str]:
 
 
 def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voice: Voice) -> list[tuple[str, Bools]]:
-    """The LiDARs of a topic that are read, the first one leads: their names, and which of the N messages are theirs, (N,) bool.
+    """LiDARs of a topic that are read, the leading one first: their names, and (N,) bool which messages are theirs.
 
     names : (N,) of the sensor of each message; wanted : names with commas between them, `all`, or None
 
-    Without a wish it is the LiDAR with the most messages, and the others go to the problems. A name that takes the place of
-    another in the middle of the recording is no other LiDAR. Raises UsageError for names that the topic does not have.
+    If `wanted` is None the LiDAR with the most messages is read, and the others are named in the problems. A name that
+    replaces another in the middle of the recording is the same LiDAR. Raises UsageError for names that the topic does not
+    have.
     """
     counts = Counter(names)
     changes = [k for k, (a, b) in enumerate(pairwise(names), 1) if a != b]
@@ -113,7 +114,7 @@ def _wished(topic: BagTopic, counts: Counter[str], wanted: str) -> list[str]:
 
 
 def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
-    """The points of message `k`, and ns from its header's stamp to the base of their times.
+    """Points of message `k`, and the offset of their time base from the header's stamp, ns.
 
     Raises InputError when it is damaged.
     """
@@ -128,7 +129,7 @@ def read_cloud(bag: Bag, topic: BagTopic, k: int) -> tuple[PointCloud, int]:
 
 
 def put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[PointCloud, int, tuple[int, ...]]:
-    """The cloud of messages of one stamp, ns from it to the base of their times, and which messages add to the first.
+    """Cloud of the messages of one scan, the offset of its time base from the first stamp (ns), and the joined messages.
 
     Raises InputError when one is damaged.
     """
@@ -144,9 +145,9 @@ def put_together(bag: Bag, topic: BagTopic, group: tuple[int, ...]) -> tuple[Poi
 
 
 def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, frames: list[str], voice: Voice) -> Halves:
-    """Which of `messages` (N,), by their stamps (N,) and frames, are further parts of a scan; said in `voice`.
+    """Find further parts of scans among `messages` (N,), by their stamps (N,) and frames; notes go to `voice`.
 
-    On many stamps not all are looked at: what is no part of a scan after all is left out when the scan is read.
+    With many stamps only a sample is checked. A message that turns out to be no part is left out when the scan is read.
     """
     by_stamp: dict[tuple[int, str], list[int]] = {}
     for message, stamp, frame in zip(messages.tolist(), stamps.tolist(), frames, strict=True):
@@ -173,9 +174,9 @@ def find_halves(bag: Bag, topic: BagTopic, messages: Stamps, stamps: Stamps, fra
 
 
 def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
-    """Both as one cloud in the order they were measured, where they are parts of one scan; None where they are not.
+    """One cloud of two parts of a scan, in the order they were measured; None where they are not parts of one scan.
 
-    later_ns : of the base of b's times, which are ns then
+    later_ns : offset of the base of b's times, in which case times are ns
     """
     if not len(a) or not len(b):
         return a if len(a) else b
@@ -201,13 +202,13 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
 
 
 def _moved(cloud: PointCloud, later_ns: int) -> PointCloud:
-    """The cloud with times in ns that count from an earlier base."""
+    """Cloud with times in ns from an earlier base."""
     clocks = (replace(clock, values=clock.values.astype(np.int64) + later_ns) for clock in cloud.clocks)
     return replace(cloud, clocks=tuple(clocks))
 
 
 def _is_complement(a: PointCloud, b: PointCloud) -> bool:
-    """Whether b sees other azimuths, other rings, or, of a sensor that does not turn, at another time."""
+    """Whether b covers other azimuths or rings than a, or, for a sensor that does not turn, other times."""
     of_a, of_b = _azimuths(a), _azimuths(b)
     if np.minimum(of_a, of_b).sum() <= _SHARED * min(of_a.sum(), of_b.sum()):
         return True
@@ -224,12 +225,12 @@ def _is_complement(a: PointCloud, b: PointCloud) -> bool:
 
 
 def _azimuths(cloud: PointCloud) -> Longs:
-    """(90,) points of each 4 deg."""
+    """(90,) number of points in each sector of 4 deg."""
     return np.histogram(np.degrees(np.arctan2(cloud.points[:, 1], cloud.points[:, 0])), _BINS, (-180, 180))[0]
 
 
 def _when(times: NDArray[Any]) -> tuple[float, float, float]:
-    """Beginning, middle and end of times, in their unit, strays left out; zeros where there are none."""
+    """Begin, middle and end of the times, in their unit, without outliers; zeros where there are none."""
     values = times.astype(np.float64)
     values = values[np.isfinite(values)]
     begin, middle, end = np.percentile(values, (1, 50, 99)) if len(values) else (0.0, 0.0, 0.0)
@@ -249,7 +250,7 @@ class Links:
     is_tf_used: bool = False
 
     def __post_init__(self) -> None:
-        """Read /tf_static; a pair of which it, or the beginning of /tf, says another thing is named."""
+        """Read /tf_static; name pairs of frames with contradicting transforms."""
         for pair, poses in self._read(True).items():
             self.static[pair] = poses[-1]
             if not _is_still(poses):
@@ -263,7 +264,7 @@ class Links:
                 )
 
     def find(self, a: str, b: str) -> tuple[Floats, str] | None:
-        """`T_a_b` (4, 4) along transforms that hold for good, and what says so; None when no chain connects the frames."""
+        """`T_a_b` (4, 4) along static transforms, and their source in words; None when no chain connects the frames."""
         if (T := chain(self.static, a, b)) is not None:
             return T, "the same frame" if a == b else "from /tf_static"
         if not a or not b:
@@ -274,7 +275,7 @@ class Links:
         return None
 
     def why_not(self, a: str, b: str) -> str:
-        """Why `find` gives nothing."""
+        """Reason, in words, why `find` returns no transform."""
         if not a or not b:
             return "messages name no frame"
         moving = {pair: poses[0] for pair, poses in self._of_tf.items() if pair not in self._still}
@@ -292,12 +293,12 @@ class Links:
 
     @cached_property
     def _of_tf(self) -> Transforms:
-        """All that /tf says, (N, 4, 4) by pair."""
+        """All transforms of /tf, (N, 4, 4) by pair of frames."""
         return self._read(False)
 
     @cached_property
     def _still(self) -> Transforms:
-        """/tf_static, and of /tf what it says more than once and always the same."""
+        """Transforms of /tf_static, and those of /tf that are repeated without a change."""
         same = {pair: poses[0] for pair, poses in self._of_tf.items() if len(poses) > 1 and _is_still(poses)}
         return {**same, **self.static}
 
@@ -314,12 +315,12 @@ class Links:
 def places_of(
     lidars: Sequence[ScanIndex], links: Links, stated: Mapping[str, Floats] | None
 ) -> list[tuple[Floats, str]]:
-    """`T_leading_other` (4, 4) of each of the LiDARs behind the first, which leads, and what says so.
+    """`T_leading_other` (4, 4) of each LiDAR after the first, which leads, and their sources in words.
 
-    stated : `T_lidar_other` by frame or topic. The only LiDAR that it does not name is the one that it is about.
+    stated : `T_lidar_other` by frame or topic. If all LiDARs but one are named, the transforms are relative to that one.
 
-    Raises InputError for a LiDAR whose place nothing says: clouds of one frame may be in it already, or their drivers do not
-    know better.
+    Raises InputError for a LiDAR without a known place. A shared frame proves nothing: the clouds may be in it already, or
+    the drivers may all use one name.
     """
     named = [(stated or {}).get(one.name, (stated or {}).get(one.topic.name)) for one in lidars]
     if stated and sum(T is None for T in named) == 1:
@@ -346,7 +347,7 @@ def places_of(
 
 
 def _spread(poses: Floats) -> tuple[float, float]:
-    """By how much poses (N, 4, 4) differ from the first at most: m, rad."""
+    """Largest difference of poses (N, 4, 4) from the first: m, rad."""
     off = se3.inverse(poses[0]) @ poses
     metres, turns = (np.linalg.norm(part, axis=1) for part in (off[:, :3, 3], so3.log(off[:, :3, :3])))
     return float(metres.max()), float(turns.max())

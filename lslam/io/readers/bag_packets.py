@@ -1,4 +1,4 @@
-"""Packets of Velodyne and Ouster sensors in bags: read as those of a capture are, a scan is a revolution."""
+"""Packets of Velodyne and Ouster sensors in bags, read like those of a capture: one scan is one revolution."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OUSTER_FRAME = "os_sensor"
 
 @dataclass(frozen=True)
 class BagPackets:
-    """Satisfies `Packets`.
+    """Packets of a bag; satisfies `Packets`.
 
     stamps_ns, sizes, sources : (N,); places : (N, 3) which of `topics`, message of the topic, and packet of the message
     heads : (N, P) the bytes at `positions` of each
@@ -46,11 +46,11 @@ class BagPackets:
         return len(self.sizes)
 
     def bytes_at(self, which: Longs, positions: tuple[int, ...]) -> NDArray[np.uint8]:
-        """(K, P) the bytes at `positions`, which are some of those that were kept, of the packets `which`."""
+        """(K, P) bytes at `positions` of the packets `which`; the positions must be among those that were kept."""
         return self.heads[which][:, [self.positions.index(p) for p in positions]]
 
     def payloads(self, which: Longs) -> NDArray[np.uint8]:
-        """(K, size) the packets `which`, which are of one size."""
+        """(K, size) payloads of the packets `which`, which must be of one size."""
         rows = []
         for (n, message), places in groupby(self.places[which].tolist(), itemgetter(0, 1)):
             packets = read_packets(self.topics[n], self.bag.message(self.topics[n], message))[1]
@@ -76,7 +76,7 @@ def open_packets(bag: Bag, topic: BagTopic, voice: Voice) -> tuple[Opened, str]:
 
 
 def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice: Voice) -> tuple[BagPackets, str]:
-    """All packets of the topics, and the first frame; messages that are damaged are named."""
+    """All packets of the topics, and the first frame. Damaged messages are named in the problems."""
     stamps, sizes, heads, places = [], [], [], []
     frame = ""
     for n, topic in enumerate(topics):
@@ -102,7 +102,7 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
 
 
 def _metadata(bag: Bag, topic: BagTopic) -> tuple[OusterSensor, str]:
-    """What the sensor says of itself, on a topic beside its packets or in a file beside the bag, and where that was."""
+    """Metadata of an Ouster sensor, from a topic beside its packets or a file beside the bag, and their source."""
     named = [t for t in bag.of_type("String") if "metadata" in t.name.rsplit("/", 1)[-1]]
     own = [t for t in named if _namespace(t) == _namespace(topic)] or named
     if len(own) == 1 and (text := read_text(bag, own[0].name)) is not None:

@@ -1,4 +1,4 @@
-"""Which topics of a bag are read, and their messages in the order of their stamps."""
+"""Choice of the topics of a bag, and the order of their messages by stamp."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def choose_clouds(bag: Bag, wanted: str | None, voice: Voice) -> list[BagTopic]:
 def check_parts(bag: Bag, topic: BagTopic) -> None:
     """Raise UsageError when the files of a folder are no parts of one recording.
 
-    They are when the next one begins where one has ended, or soon after, and neither tells of the time of the other.
+    Parts of one recording follow each other closely in time and do not overlap.
     """
     stamps: dict[Path, list[Stamps]] = {}
     for recording, part in topic.parts:
@@ -93,7 +93,7 @@ def check_parts(bag: Bag, topic: BagTopic) -> None:
 
 @dataclass(frozen=True)
 class Companion:
-    """A kind of messages that ride along: its name, flag and message type, how it is read, and the options that need it."""
+    """Kind of stream beside the scans: name, flag, message type, reader, and the options that need it."""
 
     name: str
     flag: str
@@ -107,7 +107,10 @@ GNSS = Companion("GNSS", "--gnss-topic", "NavSatFix", read_fixes, "--gnss and --
 
 
 def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) -> Stream | None:
-    """What rides along on topic `wanted`, or on the only one of its kind; None, said in `voice`, when there are several."""
+    """Stream of topic `wanted`, or of the only topic of its kind.
+
+    None, with a problem in `voice`, when there are several topics or no usable samples.
+    """
     topics = bag.of_type(kind.type)
     if wanted is not None:
         topics = [_named(bag, topics, wanted, kind.flag, f"{kind.type} messages")]
@@ -130,7 +133,7 @@ def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) 
 
 
 def why_none(bag: Bag, kind: Companion) -> LslamError:
-    """What to tell one who asks for what a bag did not give: choose among several, or there is none."""
+    """Advice for a user who needs a stream that was not loaded: choose one of several topics, or there is none."""
     topics = bag.of_type(kind.type)
     if len(topics) > 1:
         flags = _flags(topics, kind.flag)
@@ -140,10 +143,10 @@ def why_none(bag: Bag, kind: Companion) -> LslamError:
 
 
 def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> list[ScanIndex]:
-    """The scans of each LiDAR of `topic` that is read, see `choose_lidars`; their stamps increase.
+    """Scans of each chosen LiDAR of `topic`, see `choose_lidars`, with increasing stamps.
 
-    Only headers are read, where stamps do not repeat. Raises InputError when not a single one can be, UsageError for a LiDAR
-    that is not there.
+    Only headers are read, unless stamps repeat. Raises InputError when none can be read, UsageError for a LiDAR that is not
+    there.
     """
     is_livox, is_ros1 = topic.type.endswith("CustomMsg"), topic.encoding == "ros1"
 
@@ -181,7 +184,7 @@ def index_scans(bag: Bag, topic: BagTopic, wanted: str | None, voice: Voice) -> 
 
 
 def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice: Voice) -> Bools:
-    """Which messages (N,) are no copies of earlier ones, as of a recording that was played in a loop; said in `voice`."""
+    """(N,) whether a message is no duplicate of an earlier one, as in a bag played in a loop. Notes go to `voice`."""
     own = np.ones(len(stamps), bool)
     _, first, again = np.unique(stamps, return_index=True, return_inverse=True)
     repeats = np.flatnonzero(first[again] < np.arange(len(stamps)) - 1)
@@ -198,11 +201,11 @@ def _no_copies(stamps: Stamps, content: Callable[[int], bytes], what: str, voice
 
 
 def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> tuple[Stamps, Stamps]:
-    """Which messages stay, in order, and their stamps, which then increase; what was wrong goes to the problems.
+    """Messages that are kept, in order, and their increasing stamps; faults are added to the problems.
 
-    Stamps that stand still give way to the times of recording, and their steps are taken out by these (`clocks`). What is late
-    by a few messages is sorted in; what goes back further by both clocks, or tells again of a time that is told of, is dropped,
-    as repeated stamps are.
+    Constant stamps are replaced by the times of recording, which also correct steps of the stamps (`clocks`). Messages that
+    are a few places late are sorted in. Dropped are repeated stamps, and messages that go back further by both clocks or
+    repeat a span of time.
     """
     if stands_still(stamps, recorded):
         still = f" that stand still at {seconds_text(int(stamps[0]))} s" if stamps.any() else ""
@@ -232,7 +235,7 @@ def put_in_order(stamps: Stamps, recorded: Stamps, what: str, voice: Voice) -> t
 
 
 def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
-    """By how much messages are stamped earlier than one before them, ns, and which of them are so by no mere jitter."""
+    """(N,) lateness of each stamp against the latest one before, ns, and whether it is more than jitter."""
     late = np.maximum.accumulate(stamps) - stamps if len(stamps) else stamps
     steps = np.diff(stamps)
     if not (late > 0).any() or not (steps > 0).any():
@@ -242,7 +245,7 @@ def _lateness(stamps: Stamps) -> tuple[Stamps, Bools]:
 
 
 def _told_again(stamps: Stamps, late: Stamps, step: float) -> Bools:
-    """Which messages, late by `late` ns, are behind a clock that was set back: they do not fill a hole, they interleave."""
+    """(N,) whether late messages repeat a span of time: a clock was set back, so they interleave with others and fill no gap."""
     again = np.zeros(len(stamps), bool)
     ahead = stamps[late == 0]
     for begin, end in runs(late > 0):

@@ -1,7 +1,7 @@
-"""Clocks of a stream of messages held against each other: where one is impossible the others win, and a sentence says so.
+"""Comparison of the clocks of a stream of messages: an impossible clock is corrected by the others, and reported.
 
-The stamps of the headers are the finest clock and the one that fails: it steps when the sensor learns the time, stands still when
-a driver repeats its own start, or is two clocks in turns. The times of recording are late, never early, and go on.
+Header stamps are the finest clock, and the one that fails. They step when the sensor learns the time, stand still when a
+driver repeats its own start, or alternate between two clocks. Times of recording are late, never early, and always advance.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Clock:
 
 
 def stands_still(stamps: Stamps, witness: Stamps) -> bool:
-    """Whether a clock gives several messages in a row one reading nearly everywhere, while the witness goes on."""
+    """Whether a clock nearly always repeats the reading before, while the witness advances."""
     if not len(stamps) or np.any(np.diff(witness) < 0) or len(np.unique(witness)) < len(witness) / 2:
         return False
     if len(stamps) == 1:
@@ -49,9 +49,9 @@ def stands_still(stamps: Stamps, witness: Stamps) -> bool:
 
 
 def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Voice) -> Stamps:
-    """`headers` (N,) with their steps taken out by the witness (N,), both in the order of recording; themselves without any.
+    """Stamps `headers` (N,) with their steps removed with help of the witness (N,), both in the order of recording.
 
-    late_ns : (N,) by how much messages came after their turn, 0 for most; these say nothing about the clock
+    late_ns : (N,) delay of messages that came out of order, 0 for most; delayed ones say nothing about the clock
 
     Where both clocks pause, nothing is wrong. An interval of the headers is a step where the witness contradicts it and it is
     impossible for a clock whose messages are recorded late and never early. Regular headers remain regular: the interval
@@ -105,7 +105,7 @@ def agree(headers: Stamps, late_ns: Stamps, witness: Clock, what: str, voice: Vo
 
 
 def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Voice) -> Stamps:
-    """Stamps (N,) moved as `repaired` (M,) from `scans` (M,) where they step with these; otherwise as they are."""
+    """Stamps (N,) corrected like the scans, from `scans` to `repaired` (M,), if they step with these; else unchanged."""
     interval = float(np.median(np.diff(repaired))) if len(scans) > 1 else 0.0
     removed = np.diff(scans) - np.diff(repaired)
     at = np.flatnonzero(np.abs(removed) > 0.5 * interval)
@@ -127,7 +127,7 @@ def follow(stamps: Stamps, scans: Stamps, repaired: Stamps, what: str, voice: Vo
 
 
 def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
-    """`repaired` (M,) on that of the clocks of `scans` (M,) on which it shares the most time with another stream (N,)."""
+    """`repaired` (M,) on the one of the clocks of `scans` (M,) that overlaps most with another stream (N,)."""
     shared = {
         int(offset): np.count_nonzero((repaired + offset >= stamps.min()) & (repaired + offset <= stamps.max()))
         for offset in [0, *np.unique(scans - repaired)[:_OFFSETS]]
@@ -137,11 +137,10 @@ def onto(stamps: Stamps, scans: Stamps, repaired: Stamps) -> Stamps:
 
 
 def ahead_of(own: Stamps, recorded: Stamps, stamps: Stamps, its_recorded: Stamps, what: str, voice: Voice) -> int:
-    """By how much the clock of a stream, `stamps` (N,), is ahead of that of the scans, `own` (M,), ns; 0 unless these are two
-    clocks of one time.
+    """Offset of a stream's clock, `stamps` (N,), from that of the scans, `own` (M,), ns; 0 unless both measure the same time.
 
-    recorded, its_recorded : when the messages of each were recorded; the one with the least delay says how far apart clocks are,
-    unless the times of recording run at another speed
+    recorded, its_recorded : times of recording of each. The messages with the least delay determine the offset, unless the
+    times of recording run at another speed.
     """
     for h, w in (own, recorded), (stamps, its_recorded):
         if len(h) < 2 or not _SLOWEST <= _period_and_speed(h, w)[1] <= _FASTEST:
@@ -159,7 +158,7 @@ def ahead_of(own: Stamps, recorded: Stamps, stamps: Stamps, its_recorded: Stamps
 
 
 def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
-    """Note that intervals vary more than those of a sensor do, (N,) stamps that increase."""
+    """Add a note if the intervals of increasing stamps (N,) vary more than those of a sensor."""
     steps = np.diff(stamps).astype(np.float64)
     if len(steps) < _SPREAD_SAMPLES or steps.min() <= 0:
         return
@@ -174,7 +173,7 @@ def say_jitter(stamps: Stamps, what: str, voice: Voice) -> None:
 
 
 def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
-    """The interval, ns, 0 where a clock does not go on, and by how much faster `w` runs, by the windows that agree best."""
+    """Interval, ns, 0 for a clock that stands still, and the relative speed of `w`, from the windows that agree best."""
     best = (np.inf, 0.0, 0.0)
     for length in _WINDOWS:
         if len(h) < 2 * length:
@@ -186,7 +185,7 @@ def _period_and_speed(h: Stamps, w: Stamps) -> tuple[float, float]:
 
 
 def _in_turns(h: Stamps, w: Stamps) -> bool:
-    """Whether two clocks take turns: many stamps are late, and sorted they are irregular, unlike the times of recording."""
+    """Whether two clocks alternate: many stamps are late and irregular once sorted, unlike the times of recording."""
     if len(h) < _SPREAD_SAMPLES or np.mean(np.maximum.accumulate(h) > h) < _MANY:
         return False
     period, _ = _period_and_speed(h, w)
@@ -195,12 +194,12 @@ def _in_turns(h: Stamps, w: Stamps) -> bool:
 
 
 def runs(mask: Bools) -> Longs:
-    """(K, 2) where each run of true values begins and, behind its last, ends."""
+    """(K, 2) begin and end (exclusive) of each run of true values."""
     return np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]]))).reshape(-1, 2)
 
 
 def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
-    """(N,) which late messages came in their turn, of a clock that was set back: those behind are as far from the witness."""
+    """(N,) whether late messages came in order, from a clock that was set back and stayed so."""
     back = np.zeros(len(h), np.bool_)
     if not late_ns.any():
         return back
@@ -214,14 +213,14 @@ def _set_back(h: Stamps, w: Stamps, late_ns: Stamps) -> Bools:
 
 
 def _in_parts(h: Stamps) -> bool:
-    """Whether each scan comes as the same number of messages of one stamp."""
+    """Whether every scan consists of the same number of messages with one stamp."""
     counts = np.bincount(np.unique(h, return_inverse=True)[1], minlength=1)
     usual = int(np.median(counts))
     return 1 < usual < MESSAGES_PER_STAMP and bool(np.mean(counts == usual) > 1 - _MIN_SHARE)
 
 
 def _recording_spread(w: Stamps, period: float) -> float:
-    """How far apart the delays of neighbouring messages lie, ns: they often arrive in batches."""
+    """Spread of the recording delays of neighbouring messages, ns: messages often arrive in batches."""
     even = w - w[0] - np.arange(len(w)) * period
     spread = 0.0
     for length in _SPREAD_SAMPLES, 4 * _SPREAD_SAMPLES:
@@ -232,7 +231,7 @@ def _recording_spread(w: Stamps, period: float) -> float:
 
 
 def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
-    """Step of the clock `h` between messages k and k + 1 for every k of `edges`, ns, 0 where there is none.
+    """Step of the clock `h` between messages k and k + 1 for every k of `edges`, ns; 0 where there is none.
 
     h - w is an offset less the delay of recording, so its largest values tell. Where the clock goes back or stands still it is
     wrong. Where it goes on, a delay could be the reason instead: it is a step only if no message on the same stretch that
@@ -259,7 +258,7 @@ def _step_sizes(h: Stamps, w: Stamps, edges: Stamps, limit: float) -> Stamps:
 
 
 def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
-    """Intervals across steps, ns: whole periods where the clock ticks regularly, positive ever."""
+    """Intervals across steps, ns: whole periods where the clock ticks regularly; always positive."""
     is_regular = np.median(np.abs(steps - np.float64(period))) < _REGULAR * period
     count = np.maximum(np.rint(across / period), 1)
     is_near = np.abs(across / period - count) < _SNAP
@@ -268,7 +267,7 @@ def _intervals(across: NDArray[Any], steps: Stamps, period: float) -> Stamps:
 
 
 def _offsets(offset: Stamps, ahead: Stamps, limit: float) -> Stamps:
-    """Offsets of all messages, ns: one for each clock, 0 for the one nearest to the witness that tells enough messages."""
+    """Clock offset of each message, ns, relative to the clock nearest to the witness that stamps enough messages."""
     order = np.argsort(offset, kind="stable")
     clocks = np.split(order, np.flatnonzero(np.diff(offset[order]) > 0.5 * limit) + 1)
     levels = offset[[int(clock[len(clock) // 2]) for clock in clocks]]

@@ -1,4 +1,4 @@
-"""Sequences whose scans are files of one folder: what all folder readers give, and how they open one."""
+"""Base of all folder readers: sequences whose scans are files of one folder."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class FolderSequence(SequenceOnDisk):
     record: PointRecord | None = None
 
     def _read(self, index: int) -> Scan:
-        """Raises InputError naming the file also where it contradicts `sequence.toml`."""
+        """Read a scan file. Raises InputError naming the file, also where it contradicts `sequence.toml`."""
         path = self.files[index]
         stamp = int(self.stamps_ns[index])
         cloud = in_metres(read_points(path, self.record), self.unit_m)
@@ -83,7 +83,7 @@ class FolderSequence(SequenceOnDisk):
 
 @dataclass
 class Folder:
-    """A folder of scans while it is opened: its files and their `record`, what is stated about it, where sentences go."""
+    """Folder of scans while it is opened: files, `record`, stated facts, and the lists for notes and problems."""
 
     path: Path
     kind: str
@@ -97,7 +97,10 @@ class Folder:
     def begin(
         cls, path: Path, kind: str, why: str, overrides: SequenceInfo, scans: tuple[list[Path], list[str]], nothing: str
     ) -> Folder:
-        """Raises InputError, which says `nothing` where there are no scans, else what is wrong with `sequence.toml` or points."""
+        """Start opening a folder.
+
+        Raises InputError: with the text `nothing` if there are no scans, else about `sequence.toml` or the points.
+        """
         info, has_toml = read_info(path, overrides)
         files, left_out = scans
         if not files:
@@ -110,7 +113,7 @@ class Folder:
         return read_points(file, self.record)
 
     def calibration(self, path: Path, read: Callable[[Path], Matrix | None]) -> Matrix | None:
-        """What `read` makes of the file; None, which is a problem, where it cannot be read."""
+        """Result of `read` on a calibration file; None, with a problem, where it cannot be read."""
         try:
             return read(path)
         except InputError as error:
@@ -118,24 +121,24 @@ class Folder:
             return None
 
     def take_rows(self, source: Path, stamps: Longs) -> tuple[Longs, float]:
-        """Keep the scans that have a row of stamps in `source`; the stamps of these, which increase, and the rate, Hz."""
+        """Drop scans without a stamp in `source`. Returns the increasing stamps of the others and the rate, Hz."""
         self.files, stamps = rows_of_scans(source, stamps, self.files, self.voice)
         return check_stamps(stamps, self.info.rate_hz, source, self.voice.problems)
 
     def clock(self, stamps: Longs, rate_hz: float) -> PointClock | None:
-        """How per-point times of the files are read, learnt on a few scans."""
+        """Reader of the files' per-point times, learnt on a few scans."""
         if self.record == KITTI:
             return None
         samples = read_samples(len(self.files), lambda k: Sample(self.read(self.files[k]), int(stamps[k])))
         return open_clock(list(samples.values()), rate_hz, self.info, self.voice.notes, self.voice.problems)
 
     def truth(self, path: Path | None, stamps: Longs) -> Trajectory | None:
-        """The poses in a file, of the body that is stated or else that the file names."""
+        """Poses in a file, of the stated body, else of the body that the file names."""
         truth = None if path is None else load_poses(path, stamps, self.files, self.voice)
         return None if truth is None else replace(truth, frame=self.info.ground_truth_frame or truth.frame)
 
     def sequence(self, **parts: Any) -> FolderSequence:
-        """The sequence of `parts`, see `FolderSequence`, with what is stated of every kind of folder, its points in m."""
+        """Sequence made of `parts`, see `FolderSequence`, and the stated facts, with points in m."""
         info, problems = self.info, self.voice.problems
         if "imu" not in parts:
             parts["imu"], parts["gnss"] = load_streams(self.path, info, self.voice)
@@ -152,7 +155,7 @@ class Folder:
 def _read_per_point(
     path: Path, count: int, names: tuple[str, ...]
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
-    """Times and rings of a scan's points, (count,) each, of which `names` are read."""
+    """Times and rings of a scan's points, (count,) each; only those in `names` are read."""
     with (
         input_errors(f"{path}, named by per_point of sequence.toml,", *DAMAGE), HEADERS, path.open("rb") as stream,
         np.load(stream, allow_pickle=False) as file,

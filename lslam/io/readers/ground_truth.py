@@ -1,4 +1,4 @@
-"""Ground truth of a sequence as LiDAR poses: found, paired with the scans, carried into the LiDAR frame, said aloud."""
+"""Ground truth of a sequence as LiDAR poses: found, matched with the scans and transformed to the LiDAR frame."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _BEYOND_NS = 100_000_000
 
 @dataclass
 class Voice:
-    """Where a reader's sentences go."""
+    """Lists for the notes and problems of a reader."""
 
     notes: list[str]
     problems: list[str]
@@ -69,7 +69,7 @@ def load_poses(path: Path, stamps_ns: Longs, files: list[Path], voice: Voice) ->
 
 
 class Numbered(NamedTuple):
-    """Scans and poses of the same numbers: the truth of scans that `have` (N,) a pose, stamps_ns (N,) of all scans."""
+    """Scans and poses matched by number: truth of the scans that `have` (N,) a pose, and stamps_ns (N,) of all scans."""
 
     truth: Trajectory
     have: Bools
@@ -77,10 +77,11 @@ class Numbered(NamedTuple):
 
 
 def pair_by_number(truth: Trajectory, files: list[Path]) -> Numbered | None:
-    """The poses of a named CSV that belong to the scans by its first column, `num` (MCD), and the scans' file names.
+    """Poses of a CSV matched with scan files by its first column, `num` (MCD).
 
-    Scans without a pose get their stamps from their numbers. None when the file has no such column or fewer than two of the
-    scans, and when it has as many poses as there are scans, but of other numbers: one of them is numbered from elsewhere.
+    Scans without a pose get their stamps from their numbers. The result is None when the file has no such column or fewer
+    than two of the scans. It is None, too, when poses and scans are equally many but of different numbers, since then their
+    numbering differs.
     """
     numbers_of_files = file_numbers(files)
     table = read_table(as_path(truth.source))
@@ -144,7 +145,7 @@ def to_lidar(
 
 
 def _pair(truth: Trajectory, stamps_ns: Longs, files: list[Path], voice: Voice) -> Trajectory | None:
-    """The poses of the scans, by the numbers of their files or by index, with the stamps of the scans."""
+    """Poses matched with the scans by file number or by index, with the scans' stamps."""
     numbers = scans_of(truth)
     count = int(numbers[-1]) + 1
     scans, rule = rows_of(files, count)
@@ -164,7 +165,7 @@ def _pair(truth: Trajectory, stamps_ns: Longs, files: list[Path], voice: Voice) 
 
 
 def oxts_truth(oxts: Oxts, scan_stamps_ns: Longs, T_lidar_imu: Floats | None, voice: Voice) -> Trajectory | None:
-    """LiDAR poses at the stamps of the scans, in the frame of the first; None, with the reason said, when something is missing.
+    """LiDAR poses from OXTS at the stamps of the scans, in the frame of the first; None, with a note, when data are missing.
 
     As the devkit's convertOxtsToPose (R = Rz(yaw) Ry(pitch) Rx(roll)), but with positions in a transverse Mercator
     projection at the first fix: the devkit's spherical one stretches Karlsruhe by 0.1 to 0.2 %.

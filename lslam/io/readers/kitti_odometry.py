@@ -22,7 +22,10 @@ KIND = "kitti-odometry"
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """The sequence folder in or at `folder` and why it is one, else None. Raises InputError listing them where several are."""
+    """Sequence folder in or at `folder` and the reason why it is one, else None.
+
+    Raises InputError listing the sequences if there are several.
+    """
     if (folder / "velodyne").is_dir():
         return folder, "it has velodyne/, as KITTI odometry sequences do"
     for sequences in (folder / "sequences", folder / "dataset" / "sequences"):

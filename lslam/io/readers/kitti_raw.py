@@ -1,8 +1,8 @@
 """KITTI raw drives: `<date>/<date>_drive_NNNN_{sync,extract}` with `velodyne_points/` and `oxts/`.
 
-`sync` scans go with the camera and OXTS sample of their number, at the instant at which the scanner looks ahead. They are
+A `sync` scan has the number of its camera image and OXTS sample, taken when the scanner looks ahead. Its points are
 distorted: KITTI's readme of the raw data asks to untwist them, that of the odometry benchmark says that its scans are
-compensated "in contrast to the raw data". Times from the azimuth lie about that instant, so poses belong to it.
+compensated "in contrast to the raw data". Times from the azimuth are relative to that instant, so poses belong to it.
 
 On drive 0005 points lie nearest to the map's planes when all of a sweep's motion is taken out (46 mm for 56 in a bend), and
 icp, gicp, vgicp, ndt and loam, .02 to .17 deg apart over 10 m with it left in, agree to .01 to .03 deg. All of them are then .21
@@ -58,7 +58,10 @@ _UPWARDS = 4
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """The drive in or at `folder` and why it is one, else None. Raises InputError listing the drives of a day of several."""
+    """Drive in or at `folder` and the reason why it is one, else None.
+
+    Raises InputError listing the drives of a day with several.
+    """
     if (folder / "velodyne_points").is_dir():
         return folder, "it has velodyne_points/, as KITTI raw drives do"
     if (folder / "oxts").is_dir():
@@ -133,7 +136,7 @@ def _oxts(folder: Folder) -> Oxts | None:
 
 
 def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[Longs, float, float | None]:
-    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the share of the sweep that is over by then."""
+    """Stamps of the LiDAR, else of OXTS by index, else nominal; the rate, Hz; and the elapsed share of the sweep at the stamp."""
     info, voice = folder.info, folder.voice
     compensated = bool(info.motion_compensated)
     passed = {"timestamps.txt": AHEAD, "timestamps_start.txt": AT_START}
@@ -163,9 +166,9 @@ def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[Longs,
 
 
 def _evened(numbers: Longs, stamps_ns: Longs, folder: Folder) -> Longs:
-    """Stamps of scans `numbers`, each that of an OXTS sample near to it, as a scanner that turns evenly takes them.
+    """Stamps of scans `numbers` with the jitter of OXTS samples removed, since the scanner turns evenly.
 
-    Its rate wanders by parts in a thousand: each stamp becomes that of the line through the `_EVEN` about it.
+    The scanner's rate drifts by a thousandth or so, so a line is fitted to the `_EVEN` stamps about each.
     """
     if len(stamps_ns) < 3:
         return stamps_ns
@@ -212,12 +215,12 @@ def _calibration(folder: Folder) -> Calibration:
 
 
 def _frames(T_lidar_imu: Floats | None) -> dict[str, Floats]:
-    """The middle of the car on the ground."""
+    """Further frame of the car: the middle of the car on the ground."""
     return {} if T_lidar_imu is None else {"base_link": T_lidar_imu @ se3.inverse(T_BASE_IMU)}
 
 
 def oxts_streams(oxts: Oxts, stamps_ns: Longs) -> tuple[ImuStream, GnssStream]:
-    """The IMU and the fixes of OXTS at `stamps_ns` (N,)."""
+    """IMU and fixes of OXTS at `stamps_ns` (N,)."""
     imu = ImuStream(stamps_ns, oxts.values[:, ACCEL].copy(), oxts.values[:, GYRO].copy())
     return imu, GnssStream(stamps_ns, oxts.values[:, :3].copy(), oxts.values[:, POS_ACC].copy())
 
@@ -230,7 +233,7 @@ def _ground_truth(folder: Folder, stamps: Longs, oxts: Oxts | None, calibration:
 
 
 def with_streams(sequence: Sequence, imu: bool, gnss: bool, data_root: Path | None = None) -> Sequence:
-    """The sequence with the streams that are asked for, by `with_imu` and `with_gnss`; those it has stay."""
+    """Sequence with the required streams, by `with_imu` and `with_gnss`; existing ones stay."""
     if imu:
         sequence = with_imu(sequence, data_root)
     return with_gnss(sequence, data_root) if gnss else sequence
@@ -270,13 +273,13 @@ def with_gnss(sequence: Sequence, data_root: Path | None = None) -> Sequence:
 
 
 def _is_cut(sequence: Sequence) -> bool:
-    """Whether a sequence is known to be cut from a raw drive."""
+    """Whether a sequence is known to be a part of a raw drive."""
     is_kitti = isinstance(sequence, FolderSequence) and sequence.kind == KITTI_ODOMETRY
     return is_kitti and sequence_number(sequence.path.name) in DRIVES
 
 
 def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what: str, file: str) -> Sequence:
-    """The sequence with a stream of its raw drive. Raises InputError naming `what` is missing and the `file` with it."""
+    """Sequence with a stream of its raw drive. Raises InputError naming `what` is missing, and the `file` that holds it."""
     if not isinstance(sequence, FolderSequence):
         raise why_none(sequence.bag, kind)  # type: ignore[attr-defined]
     date, number, first = DRIVES[sequence_number(sequence.path.name)]
@@ -320,7 +323,7 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
 
 
 def _begin(drive: Path, first: int) -> tuple[int, str]:
-    """When the first scan was taken, ns, and which file says so: camera 0 is what KITTI's times.txt counts from."""
+    """Time of the first scan, ns, and the file that states it. KITTI's times.txt counts from camera 0's first image."""
     sync = drive.with_name(drive.name.replace("_extract", "_sync"))
     for name in ("image_00", "velodyne_points", "oxts"):
         path = sync / name / "timestamps.txt"

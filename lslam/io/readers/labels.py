@@ -1,4 +1,4 @@
-"""Classes of points beside the scans: `labels/<stem>.label`, as SemanticKITTI has them. They are read only when asked for."""
+"""Point classes beside the scans: `labels/<stem>.label`, as in SemanticKITTI. They are read only when needed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ _LOOKED_AT = 5
 
 
 class Labelled(SequenceView):
-    """A sequence whose scans take their labels from files, where their points have none; all else is the sequence's own."""
+    """Sequence whose scans get labels from files where their points have none; all else is unchanged."""
 
     def __init__(self, whole: Sequence, folder: Path, scans: list[Path]) -> None:
         super().__init__(whole, notes=[*whole.notes, f"labels of points from {folder}"])
         self._files = [folder / f"{scan.stem}.label" for scan in scans]
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` and its labels; it says so where they are missing or others. Raises InputError as the sequence."""
+        """Read scan `index` and its labels.
+
+        Labels that are missing or do not match are reported. Raises InputError as the sequence does.
+        """
         scan = self.whole.scan(index)
         if scan.labels is not None or not len(scan):
             return scan
@@ -35,7 +38,7 @@ class Labelled(SequenceView):
 
 
 def labelled(sequence: Sequence) -> Sequence:
-    """The sequence with the labels of points that lie in files beside its scans, where there are any."""
+    """Sequence with point labels from files beside its scans, if there are any."""
     files: list[Path] = getattr(sequence, "files", [])
     folder = sequence.path / LABELS
     # Where LiDARs are merged, or some scans chosen, the files are of other scans.
@@ -44,7 +47,7 @@ def labelled(sequence: Sequence) -> Sequence:
 
 
 def with_labels(sequence: Sequence, key: str) -> Sequence:
-    """The sequence with the labels of its points. Raises InputError where it has none, naming the `key` that asks for them."""
+    """Sequence with point labels. Raises InputError where it has none, naming the `key` that needs them."""
     whole = labelled(sequence)
     scans = [scan for _, scan in islice(readable(range(len(whole)), whole.scan), _LOOKED_AT)]
     if scans and all(scan.labels is None for scan in scans):

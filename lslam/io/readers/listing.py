@@ -19,7 +19,7 @@ DEFAULT_RATE_HZ = 10.0
 
 
 def list_scans(folder: Path, suffixes: tuple[str, ...] = SUFFIXES) -> tuple[list[Path], list[str]]:
-    """Point files of the most frequent suffix in natural order (scan2 before scan10), and notes about what was left out."""
+    """Point files of the most frequent suffix in natural order (scan2 before scan10), and notes about the others."""
     with input_errors(folder):
         files = [p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith(".")]
     kinds = Counter(p.suffix.lower() for p in files)
@@ -58,12 +58,15 @@ def rows_of(files: list[Path], count: int) -> tuple[Longs, str]:
 
 
 def nominal_stamps(count: int, rate_hz: float, start_ns: int = 0) -> Stamps:
-    """(count,) ns at `rate_hz` from `start_ns`."""
+    """Stamps (count,), ns, at `rate_hz` from `start_ns`."""
     return start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
 
 
 def filled_stamps(numbers: NDArray[Any], at: NDArray[Any], stamps: Stamps) -> Stamps:
-    """(N,) ns of scans by their `numbers`: `stamps` (M,) of those numbered `at`, evenly between, at the median step beyond."""
+    """Stamps (N,), ns, of all scans `numbers`, from `stamps` (M,) of the scans `at`.
+
+    Stamps between those are interpolated, those beyond extrapolated by the median step.
+    """
     steps = np.diff(stamps) / np.diff(at)
     step = float(np.median(steps)) if len(steps) else 0.0
     since = np.interp(numbers, at, stamps - stamps[0])
@@ -89,7 +92,7 @@ def load_stamps(path: Path, problems: list[str]) -> Stamps | None:
 def check_stamps(
     stamps: Stamps, rate_hz: float | None, source: Path | str, problems: list[str]
 ) -> tuple[Stamps, float]:
-    """The stamps if they increase, else, which is a problem, nominal ones from the first; the rate, stated or measured."""
+    """Stamps if they increase, else nominal ones from the first, with a problem; and the rate, Hz, stated or measured."""
     steps = np.diff(stamps)
     rate = rate_hz or measured_rate(stamps)
     wrong = np.flatnonzero(steps <= 0)

@@ -1,4 +1,4 @@
-"""From what the user typed to a folder: a path, or a name looked up under the data root."""
+"""Lookup of a sequence by what the user typed: a path, or a name under the data root."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ROOTS = ("", "dataset", "kitti", "kitti/dataset", "raw", "kitti_raw", "kitti/ra
 
 
 def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path:
-    """The folder or bag of a sequence: `name_or_path` itself when it exists, else the name looked up under `data_root`.
+    """Folder or bag of a sequence: `name_or_path` itself if it exists, else the name looked up under `data_root`.
 
     `data_root` is LSLAM_DATA when None; the current folder comes after it. `seq07`, `07` and `kitti/07` find `sequences/07`
     and folders of those names; a drive is found by its name, by `drive_0005` or `0005` when only one has it.
@@ -61,12 +61,12 @@ def find_folder(name_or_path: str | Path, data_root: Path | None = None) -> Path
 
 
 def is_recording(path: Path) -> bool:
-    """Whether `path` is a bag, or a folder of its parts, or the capture of a sensor's packets."""
+    """Whether `path` is a bag, a folder of its parts, or a packet capture."""
     return bool(list_bag_files(path)) or (path.suffix.lower() in CAPTURES and path.is_file())
 
 
 def sequence_number(name: str) -> str:
-    """The number of a KITTI odometry sequence by a name that a user or a folder gives it, empty when it is none.
+    """Number of a KITTI odometry sequence in a name of the user or of a folder; empty when it is none.
 
     >>> sequence_number("seq07"), sequence_number("kitti/7"), sequence_number("town")
     ('07', '07', '')

@@ -1,4 +1,4 @@
-"""Captures of Velodyne and Ouster sensors as sequences: a scan is a revolution, read when it is asked for."""
+"""Packet captures of Velodyne and Ouster sensors as sequences: a scan is a revolution, read on demand."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ _PACKET_BYTES, _LOOKED_AT = 200, 20  # LiDAR packets are larger; so many tell wh
 
 @dataclass(kw_only=True)
 class PcapSequence(SequenceOnDisk):
-    """A recording in a capture, of `revolutions`."""
+    """Recording in a capture.
+
+    revolutions : its scans
+    """
 
     revolutions: Revolutions
 
@@ -38,7 +41,7 @@ class PcapSequence(SequenceOnDisk):
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
-    """The capture at `path`, or the only one in this folder, and why; None when there is none, or when scans lie beside it.
+    """Capture at `path`, or the only one in this folder, and the reason; None when there is none, or when scans lie beside it.
 
     Raises InputError listing the captures when a folder has several.
     """
@@ -88,7 +91,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
 
 
 def _opener(path: Path, datagrams: Datagrams) -> Callable[..., Opened]:
-    """Whose packets these are, told by their size: Velodyne's all have 1206 bytes and a flag, Ouster's come with metadata."""
+    """Function that opens the packets, by their size: Velodyne's all have 1206 bytes and a flag, Ouster's need metadata."""
     of_size = np.flatnonzero(datagrams.sizes == velodyne_packets.SIZE)
     flags = datagrams.bytes_at(of_size, (0, 1))
     if (flags == velodyne_packets.FLAG).all(axis=1).any():

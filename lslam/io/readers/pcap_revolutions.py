@@ -1,4 +1,4 @@
-"""What the packets of a sensor give, of a capture or a bag: revolutions with their stamps, and what is known of the sensor."""
+"""Packets of a sensor, from a capture or a bag, split into revolutions with their stamps."""
 
 from __future__ import annotations
 
@@ -43,28 +43,28 @@ _UNIX_NS = 10**18  # a clock that tells less was never told the time
 
 
 class Packets(Protocol):
-    """Packets that lie somewhere; of what they hold only that is read which is asked for. See `lslam.io.formats.pcap_files`."""
+    """Source of packets; only the requested bytes are read. See `lslam.io.formats.pcap_files`."""
 
     @property
     def stamps_ns(self) -> Longs:
-        """(N,) when each arrived."""
+        """(N,) ns, time of arrival of each."""
 
     @property
     def sizes(self) -> Longs:
-        """(N,) bytes."""
+        """(N,) size of each, bytes."""
 
     @property
     def sources(self) -> Longs:
-        """(N,) whose they are."""
+        """(N,) sender of each, as a number."""
 
     def __len__(self) -> int:
         """Number of packets."""
 
     def bytes_at(self, which: Longs, positions: tuple[int, ...]) -> NDArray[np.uint8]:
-        """(K, P) the bytes at `positions` of the packets `which`, which are so long."""
+        """(K, P) bytes at `positions` of the packets `which`, which must be long enough."""
 
     def payloads(self, which: Longs) -> NDArray[np.uint8]:
-        """(K, size) the packets `which`, which are of one size."""
+        """(K, size) payloads of the packets `which`, which must be of one size."""
 
 
 class Revolutions(Protocol):
@@ -72,15 +72,15 @@ class Revolutions(Protocol):
 
     @property
     def stamps_ns(self) -> Longs:
-        """(N,) when the first point of each was measured."""
+        """(N,) ns, time of the first point of each."""
 
     def read(self, index: int) -> tuple[PointCloud, Longs]:
-        """Points of revolution `index` in the order they were measured, and when each was, ns."""
+        """Points of revolution `index` in the order they were measured, and the time of each, ns."""
 
 
 @dataclass(frozen=True)
 class Opened:
-    """Revolutions and their sensor; `uses` says what further topics of a bag are used for."""
+    """Revolutions and facts about their sensor; `uses` : purpose of further topics of a bag."""
 
     revolutions: Revolutions
     rate_hz: float
@@ -92,7 +92,7 @@ class Opened:
 
 
 def read_scan(revolutions: Revolutions, index: int, is_timed: bool) -> Scan:
-    """Revolution `index` as a scan, with the times of its points unless they are not to be used."""
+    """Revolution `index` as a scan, with the times of its points if they are to be used."""
     cloud, times_ns = revolutions.read(index)
     stamp = int(revolutions.stamps_ns[index])
     times = ((times_ns - stamp) * 1e-9).astype(np.float32) if is_timed else None
@@ -100,7 +100,7 @@ def read_scan(revolutions: Revolutions, index: int, is_timed: bool) -> Scan:
 
 
 def of_one_sender(datagrams: Packets, which: Longs, what: str, voice: Voice) -> Longs:
-    """Those of the datagrams `which` that come from the sender of most; others are named among the problems."""
+    """Datagrams, among `which`, of the sender that has most of them; other senders are named in the problems."""
     senders, counts = np.unique(datagrams.sources[which], return_counts=True)
     if len(senders) < 2:
         return which
@@ -111,9 +111,9 @@ def of_one_sender(datagrams: Packets, which: Longs, what: str, voice: Voice) -> 
 
 
 def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> Bools:
-    """Which revolutions are scans, by the share of its packets that each has.
+    """(N,) whether a revolution is a scan, by its share of the usual number of packets.
 
-    Where revolutions are missing, a packet or two of the one before are kept with the next: that is no scan.
+    Where revolutions are missing, one or two packets of an incomplete one remain: these are no scan.
     """
     keep = shares >= SLIVER
     if keep.all() or not keep.any():
@@ -125,7 +125,7 @@ def no_slivers(shares: NDArray[np.floating[Any]], voice: Voice) -> Bools:
 
 
 def in_order(times_ns: Longs, what: str, voice: Voice) -> Longs:
-    """Order of packets by their own times, each time once; said where it is not that of the capture."""
+    """Order of packets by their own times, duplicates once; a note is added where it is not that of the capture."""
     order = np.argsort(times_ns, kind="stable")
     if late := int((np.diff(times_ns) < 0).sum()):
         voice.problems.append(f"{what} are out of order in {late} places: sorted by their own times")
@@ -137,7 +137,7 @@ def in_order(times_ns: Longs, what: str, voice: Voice) -> Longs:
 
 
 def metadata_beside(path: Path) -> Sequence[Path]:
-    """JSON files that may say how the packets of the capture are laid out: of its name, else all of its folder."""
+    """JSON files that may be the metadata of the capture: of its name, else all of its folder."""
     own = [p for p in (path.with_suffix(".json"), path.with_name(path.stem + "_0.json")) if p.is_file()]
     return own[:1] or sorted(p for p in path.parent.glob("*.json") if p.is_file())
 
@@ -148,7 +148,7 @@ def _address(source: int) -> str:
 
 @dataclass(frozen=True)
 class VelodyneRevolutions:
-    """Satisfies `Revolutions`.
+    """Revolutions of a Velodyne sensor; satisfies `Revolutions`.
 
     began : azimuth of the first block, 0.01 deg
     packets : (P,) datagrams in order; azimuth : (P,) of their first blocks from `began`, unwrapped; times_ns : (P,)
@@ -165,11 +165,11 @@ class VelodyneRevolutions:
 
     @cached_property
     def stamps_ns(self) -> Longs:
-        """(N,) when the first block of each revolution was measured."""
+        """(N,) ns, time of the first block of each revolution."""
         return np.array([self._stamp(turn) for turn in self.turns.tolist()], np.int64)
 
     def read(self, index: int) -> tuple[PointCloud, Longs]:
-        """Points of revolution `index` in the order they were measured, and when each was, ns."""
+        """Points of revolution `index` in the order they were measured, and the time of each, ns."""
         turn = int(self.turns[index])
         # One packet more: the azimuth of the next block tells how far the last one turns.
         blocks = self._blocks(self._begin(turn), int(np.searchsorted(self.azimuth, (turn + 1) * TURN)) + 1)
@@ -182,7 +182,7 @@ class VelodyneRevolutions:
         return int(times_ns[0] if len(times_ns) else self.times_ns[begin:][:2][-1])
 
     def _begin(self, turn: int) -> int:
-        """The packet within which the revolution begins."""
+        """Packet in which a revolution begins."""
         return max(int(np.searchsorted(self.azimuth, turn * TURN, "right")) - 1, 0)
 
     def _blocks(self, begin: int, end: int) -> Blocks:
@@ -191,7 +191,7 @@ class VelodyneRevolutions:
 
 
 def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
-    """Raises InputError for a model that is not known, and for less than one revolution."""
+    """Open the packets of a Velodyne sensor. Raises InputError for an unknown model, and for less than one revolution."""
     which = np.flatnonzero(datagrams.sizes == SIZE)
     which = which[(datagrams.bytes_at(which, (0, 1)) == FLAG).all(axis=1)]
     if not len(which):
@@ -241,9 +241,9 @@ _LONGEST_NS = 86_400 * 10**9
 
 
 def _absolute(past_hour_us: Longs, captured_ns: Longs, voice: Voice) -> Longs:
-    """Times of the sensor's clock, which tells the hour's microseconds, in ns with the hour that the capture tells.
+    """Packet times, ns: the hour of the capture's clock and the microseconds past the hour of the sensor's clock.
 
-    A sensor without satellites counts from another minute: by how much is found in the first packet and stays.
+    A sensor without satellite time counts from another minute. That offset is taken from the first packet.
     """
     within = past_hour_us * 1000
     apart = int((within[0] - captured_ns[0] + _HOUR_NS // 2) % _HOUR_NS - _HOUR_NS // 2)
@@ -254,7 +254,7 @@ def _absolute(past_hour_us: Longs, captured_ns: Longs, voice: Voice) -> Longs:
 
 
 def _unwrapped(path: Path, angle: Longs, times_ns: Longs) -> tuple[Longs, float]:
-    """Azimuths from the first, 0.01 deg, and the rate, 0.01 deg/ns; lost packets are bridged by the rate."""
+    """Azimuths from the first, unwrapped, 0.01 deg, and the rate, 0.01 deg/ns; lost packets are bridged by the rate."""
     steps, spans = np.diff(angle) % TURN, np.diff(times_ns)
     if len(spans) and float(np.abs(spans.astype(np.float64)).max()) > _LONGEST_NS:
         raise InputError(f"{path}: the times of its packets leap by days: the capture is damaged")
@@ -269,7 +269,7 @@ def _unwrapped(path: Path, angle: Longs, times_ns: Longs) -> tuple[Longs, float]
 
 @dataclass(frozen=True)
 class OusterRevolutions:
-    """Satisfies `Revolutions`.
+    """Revolutions of an Ouster sensor; satisfies `Revolutions`.
 
     packets : (P,) datagrams in order; first, count : (N,) which of them are a revolution
     shift_ns : from the sensor's clock to that of the stamps
@@ -284,7 +284,7 @@ class OusterRevolutions:
     shift_ns: int
 
     def read(self, index: int) -> tuple[PointCloud, Longs]:
-        """Points of revolution `index` in the order they were measured, and when each was, ns."""
+        """Points of revolution `index` in the order they were measured, and the time of each, ns."""
         first = int(self.first[index])
         packets = self.datagrams.payloads(self.packets[first : first + int(self.count[index])])
         cloud, times = ouster_points(packets, self.sensor)
@@ -292,7 +292,7 @@ class OusterRevolutions:
 
 
 def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> Opened:
-    """Raises InputError without metadata, and when no packet of the capture is laid out as they say."""
+    """Open the packets of an Ouster sensor. Raises InputError without metadata, or when no packet fits them."""
     beside = metadata_beside(path)
     if len(beside) != 1:
         there = "there is no *.json beside it" if not beside else f"{len(beside)} *.json lie beside it"
@@ -304,7 +304,7 @@ def open_ouster(path: Path, datagrams: Packets, voice: Voice) -> Opened:
 
 
 def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, metadata: str, voice: Voice) -> Opened:
-    """As `open_ouster`, by metadata that were read from what is called `metadata`."""
+    """As `open_ouster`, with metadata already read; `metadata` names their source."""
     which = np.flatnonzero(datagrams.sizes == sensor.packet_bytes)
     if not len(which):
         sizes, counts = np.unique(datagrams.sizes, return_counts=True)
@@ -330,7 +330,10 @@ def open_with_metadata(path: Path, datagrams: Packets, sensor: OusterSensor, met
 
 
 def _shift(times_ns: Longs, captured_ns: Longs, voice: Voice) -> int:
-    """What makes Unix time of a clock that counts from when the sensor was switched on: the fastest packet tells."""
+    """Offset from the sensor's clock, which counts from power-up, to Unix time, ns.
+
+    The packet with the least delay determines it.
+    """
     if times_ns[0] >= _UNIX_NS:
         return 0
     shift = int((captured_ns - times_ns).min())
@@ -339,7 +342,7 @@ def _shift(times_ns: Longs, captured_ns: Longs, voice: Voice) -> int:
 
 
 def _whole(count: Longs, voice: Voice) -> Longs:
-    """Which frames are scans: where a capture begins or ends within a revolution, that one is not."""
+    """Frames that are scans. The first and the last may be cut off by the capture, and then are none."""
     keep = np.ones(len(count), bool)
     if len(count) > 2:
         keep[[0, -1]] = count[[0, -1]] == count.max()

@@ -1,4 +1,4 @@
-"""The per-point times of each scan by the rule of its recording; a scan or a point that breaks the rule is treated by itself."""
+"""Per-point times of each scan by the rule learnt for its recording; scans and points that break the rule are handled singly."""
 
 from __future__ import annotations
 
@@ -40,9 +40,10 @@ _SLOW_HZ = 1.0  # tried where no rate is stated and no sweep is as short as usua
 
 
 class TimedCloud(NamedTuple):
-    """The points of a scan and their times, (N,) float32 s, or None; ns to add to the stamp; what was wrong, or empty.
+    """Points of a scan with times, (N,) float32 s or None; ns to add to the stamp; and a fault in words, empty if none.
 
-    unmeasured : points without a place whose times lie outside the sweep; they stay, at its beginning
+    unmeasured : number of points without coordinates whose times lie outside the sweep; they stay, with times at its
+    beginning
     """
 
     cloud: PointCloud
@@ -61,9 +62,9 @@ class PointClock:
     is_of_one_scan: bool = False
 
     def read(self, cloud: PointCloud, stamp_ns: int) -> TimedCloud:
-        """Times of the points and their shift from `stamp_ns`, the stamp of the header.
+        """Points of a scan with their times, and the shift from `stamp_ns`, the stamp of the header.
 
-        Points that were measured and whose time cannot be right are left out. Others stay: no method looks at them.
+        Measured points with an impossible time are left out. Points that were not measured stay, since no method uses them.
         """
         timed = self._timed(cloud, stamp_ns)
         # Another clock or only nominal stamps: the sequence's own stamps stay.
@@ -71,7 +72,7 @@ class PointClock:
         return timed._replace(shift_ns=0) if is_other else timed
 
     def begin_ns(self, cloud: PointCloud) -> int | None:
-        """When the first point was measured, by absolute times; None for a scan that breaks the rule."""
+        """Time of the first point, ns, from absolute times; None for a scan that breaks the rule."""
         times, begin = replace(self, is_of_one_scan=True)._timed(cloud, 0)[1:3]
         return None if times is None or not len(times) else begin
 
@@ -124,7 +125,7 @@ class PointClock:
         return TimedCloud(cloud, times, shift, "; ".join(faults), unmeasured)
 
     def _is_sound(self, values: NDArray[Any], count: int) -> bool:
-        """Whether all times of a scan of `count` points can belong to one sweep; not where one of them is NaN."""
+        """Whether all times of a scan of `count` points can belong to one sweep; False if one of them is NaN."""
         rule = self.rule
         low, high = values.min(), values.max()
         span = float(high) - float(low)
@@ -135,7 +136,7 @@ class PointClock:
         return rule.is_absolute or bool(low >= -rule.reach and high <= rule.reach)
 
     def _by_itself(self, cloud: PointCloud, stamp_ns: int, why: str) -> TimedCloud:
-        """The times of a scan that breaks the rule by what it says alone, or none."""
+        """Times of a scan that breaks the rule, judged by this scan alone, or none."""
         with suppress(InputError):
             rule = None if self.is_of_one_scan else learn_rule([Sample(cloud, stamp_ns)], self.rate_hz)
             if rule is not None:
@@ -146,8 +147,10 @@ class PointClock:
 
 
 def read_samples(count: int, read: Callable[[int], Sample]) -> dict[int, Sample]:
-    """The scans of a recording of `count` that a rule is learnt on, by their number: the first with points, one in the middle
-    and the last; those that cannot be read are left out."""
+    """Scans of a recording of `count` from which a rule is learnt, by number.
+
+    These are the first one with points, one in the middle and the last. Unreadable scans are left out.
+    """
     first = range(min(count, 2 * _FIRST))
     others = [k for k in dict.fromkeys((count // 2, count - 1)) if k not in first]
     some = chain(islice(readable(first, read), _FIRST), readable(others, read))
@@ -157,7 +160,7 @@ def read_samples(count: int, read: Callable[[int], Sample]) -> dict[int, Sample]
 def open_clock(
     samples: Sequence[Sample], rate_hz: float, info: SequenceInfo, notes: list[str], problems: list[str]
 ) -> PointClock | None:
-    """The clock of a recording's points by a few of its scans, and what is to be said of it and of fields that nobody reads."""
+    """Clock of a recording's points, learnt on a few scans, with notes about it and about unread fields."""
     rule = None
     if not info.motion_compensated:
         try:
@@ -188,7 +191,7 @@ def open_clock(
 
 
 def _unwrapped(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[Any], int]:
-    """The values, integers as int64 and short ones counted on beyond their range, and how many usable ones that changed."""
+    """Values with wrapped counters unwrapped, integers as int64, and the number of usable values that changed."""
     if values.dtype.kind not in "iu":
         return values, 0
     plain = values.astype(np.int64)
@@ -203,7 +206,7 @@ def _unwrapped(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArr
 
 
 def _step(values: NDArray[Any], usable: Bools, good: Bools, sweep: float) -> tuple[NDArray[Any], Bools] | None:
-    """Values with those behind a step of the clock moved to follow on the others, and which are good then; None without a step.
+    """Values with a step of the clock removed, and (N,) which are valid then; None if there is no step.
 
     good : the largest part; sweep : usual length of one
     """
@@ -224,7 +227,7 @@ def _step(values: NDArray[Any], usable: Bools, good: Bools, sweep: float) -> tup
 
 
 def _is_set_back(values: NDArray[Any], sweep: float) -> bool:
-    """Whether times (N,) are too many for a sweep because those of the points that come first are the later ones."""
+    """Whether times (N,) span too much for a sweep because the points that come first have the later times."""
     parts = _parts(values) if np.ptp(values) > _LONGER * sweep else None
     if parts is None or not all(values[part][0] < values[part][-1] for part in parts):
         return False
@@ -232,7 +235,7 @@ def _is_set_back(values: NDArray[Any], sweep: float) -> bool:
 
 
 def _parts(values: NDArray[Any]) -> tuple[Bools, Bools] | None:
-    """The times (N,) on either side of the largest hole, those first that come first; None where few are on one side."""
+    """Split times (N,) at the largest gap, in point order; None if one side has few points."""
     if len(values) < 2:
         return None
     ordered = np.sort(values)
@@ -244,7 +247,7 @@ def _parts(values: NDArray[Any]) -> tuple[Bools, Bools] | None:
 
 
 class PointStamps(NamedTuple):
-    """When the first points of the scans were measured, (N,) ns, how long a sweep takes, s, and the name of the field."""
+    """Begin of each scan by its points, (N,) ns, the duration of a sweep, s, and the name of the field."""
 
     stamps_ns: Longs
     sweep_s: float
@@ -252,9 +255,9 @@ class PointStamps(NamedTuple):
 
 
 def point_stamps(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: float | None) -> PointStamps | None:
-    """Begin of every scan by its points' own clock; None when their times are no clock's readings or do not increase.
+    """Begin of every scan by its points' own clock; None when their times are not absolute or do not increase.
 
-    A scan whose points tell nothing gets its stamp from those beside it. All scans are read where the first few have a clock.
+    A scan without valid times gets its stamp from its neighbours. All scans are read, if the first few have absolute times.
     """
     count = len(scans)
     clock = _clock(scans, read, rate_hz)
@@ -283,9 +286,9 @@ def _clock(scans: Sequence[T], read: Callable[[T], PointCloud], rate_hz: float |
 
 
 def onto_recording(points: PointStamps, recorded: Stamps) -> tuple[Stamps, str]:
-    """Stamps (N,) by the points, on the clock of the recording where theirs is of another epoch, and a sentence.
+    """Stamps (N,) by the points, shifted to the clock of the recording if their epoch differs, and a sentence about it.
 
-    The scan that was recorded with the least delay tells how far apart the clocks are.
+    The scan recorded with the least delay determines the offset.
     """
     ahead = int((points.stamps_ns - recorded).max())
     note = f"scan stamps from the absolute times of the points, field {points.field!r}"
@@ -295,7 +298,7 @@ def onto_recording(points: PointStamps, recorded: Stamps) -> tuple[Stamps, str]:
 
 
 def step_against(clock: PointClock, samples: Iterable[Sample]) -> float:
-    """By how much, s, absolute times of points step against the headers of a few scans; 0 below a period."""
+    """Step, s, of absolute point times against the headers of a few scans; 0 if below a period."""
     if not clock.rule.is_absolute:
         return 0.0
     begins = [(clock.begin_ns(sample.cloud), sample.stamp_ns) for sample in samples]
@@ -307,10 +310,10 @@ def step_against(clock: PointClock, samples: Iterable[Sample]) -> float:
 def points_off(
     clock: PointClock, headers: Stamps, stamps: Stamps, index: int, begin_ns: int, times: NDArray[np.float32] | None
 ) -> int:
-    """By how much the absolute times of a scan's points contradict its header, ns; 0 where they do not, or it is uneven itself.
+    """Offset of a scan's absolute point times from its header, ns; 0 if they agree, or if the header itself is irregular.
 
-    headers : (N,) of all scans; stamps : (N,) their begins as they follow from these; begin_ns, times : when the points of the
-    scan were measured. A part of a sweep begins or ends with a whole one.
+    headers : (N,) of all scans; stamps : (N,) begins of the scans by the headers; begin_ns, times : of the scan's points, by
+        their own times. A partial sweep agrees if it begins or ends together with a whole one.
     """
     if not clock.rule.is_absolute or times is None or not len(times):
         return 0

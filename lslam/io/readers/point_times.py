@@ -1,4 +1,4 @@
-"""Per-point times of any sensor to seconds from the scan's stamp: the rule is learnt on several scans and said aloud."""
+"""Per-point times of any sensor as seconds from the scan's stamp: the rule is learnt on several scans and logged."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class TimeRule:
 
 @dataclass(frozen=True)
 class Sample:
-    """A scan by which a rule is learnt: its points, or every `step`-th of them, and the stamp of its header, ns."""
+    """Scan from which a rule is learnt: its points, or every `step`-th of them, and its header stamp, ns."""
 
     cloud: PointCloud
     stamp_ns: int
@@ -67,7 +67,7 @@ class Sample:
 
 
 class _TimeReading(NamedTuple):
-    """What the times of one scan can be: unit, dtype, limits of the sweep in that unit, from which instant they count."""
+    """Possible reading of one scan's times: unit, dtype, limits of the sweep in that unit, and reference instant."""
 
     unit: str
     dtype: np.dtype[Any]
@@ -113,7 +113,7 @@ def learn_rule(
 def _agree(
     name: str, readings: list[_TimeReading], points: float, rate_hz: float, unit: str | None, reference: str | None
 ) -> TimeRule:
-    """The rule that most of the scans obey, which have so many points."""
+    """Rule that fits most of the scans with the usual number of points."""
     usual = Counter(r.unit for r in readings).most_common(1)[0][0]
     readings = [r for r in readings if r.unit == usual]
     # A clock that started with the recording looks like an offset in the first scans.
@@ -137,7 +137,7 @@ def _agree(
 
 
 def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, reference: str | None) -> _TimeReading:
-    """What the times of one scan can be, by most of its points. Raises InputError when no unit fits."""
+    """Possible readings of one scan's times, judged by most of its points. Raises InputError when no unit fits."""
     usable = is_usable(sample.cloud, clock.values)
     values, points = clock.values[usable], sample.cloud.points[usable]
     period_ns = 1e9 / rate_hz
@@ -167,7 +167,7 @@ def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, r
 
 
 def is_usable(cloud: PointCloud, values: NDArray[Any]) -> Bools:
-    """(N,) the points whose times count: measured ones, all where none is, whose time is a number."""
+    """(N,) whether a point's time counts: it is a number, and the point was measured (if any point of the scan was)."""
     measured = is_measured(cloud.points)
     if not measured.any():
         measured[:] = True
@@ -184,7 +184,7 @@ def _limits(values: NDArray[Any], width: float) -> tuple[float, float]:
 
 
 def densest(values: NDArray[Any], among: Bools, width: float) -> Bools:
-    """(N,) those of the values `among`, finite ones, that lie within the stretch of `width` that holds most of them."""
+    """(N,) mask of those of the finite values `among` that lie in the interval of length `width` that holds most of them."""
     if not among.any():
         return among
     ordered = np.sort(values[among])
@@ -196,7 +196,7 @@ def densest(values: NDArray[Any], among: Bools, width: float) -> Bools:
 
 
 def _is_swept(points: NDArray[np.float32], values: NDArray[Any], low: float, high: float) -> bool:
-    """Whether values (N,) from `low` to `high` are as times: some of each part of the sweep, alike in points side by side."""
+    """Whether values (N,) from `low` to `high` look like times: they cover the sweep, and neighbouring points are alike."""
     shares = np.histogram(values.astype(np.float64), _PARTS, (low, high))[0] / max(len(values), 1)
     around = np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable")
     apart = min(np.median(np.abs(np.diff(v.astype(np.float64)))) for v in (values, values[around]))
@@ -204,7 +204,7 @@ def _is_swept(points: NDArray[np.float32], values: NDArray[Any], low: float, hig
 
 
 def apply_rule(rule: TimeRule, values: NDArray[Any], stamp_ns: int) -> tuple[NDArray[np.float32], int]:
-    """Times (N,) float32 s of finite values (N > 0,), and what to add to the stamp (ns) so that they count from it.
+    """Times (N,) float32, s, from values (N > 0,), all finite, and the shift of the stamp, ns, so that they count from it.
 
     It becomes the scan's start, unless the offsets lie about it: then it stays in the middle.
     """

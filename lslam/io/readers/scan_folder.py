@@ -30,7 +30,7 @@ STAMP_NAMES = ("times.txt", "timestamps.txt", "stamps.txt", "times.csv", "timest
 
 
 def locate(folder: Path) -> tuple[Path, str] | None:
-    """`folder` when point files lie in it or in a subfolder of a usual name, and why; None otherwise."""
+    """`folder` and the reason, when point files lie in it or in a subfolder of a usual name; None otherwise."""
     files, _ = _scans_in(folder)
     # `NN/velodyne` or `drive/velodyne_points/data` themselves are plain folders too: that is how a user gets around a layout.
     return (folder, f"it holds *{files[0].suffix} files in {files[0].parent.name}/") if files else None
@@ -77,7 +77,7 @@ def _scans_in(folder: Path) -> tuple[list[Path], list[str]]:
 def _stamps_and_truth(
     folder: Folder, beside: list[Longs], calibration: Calibration
 ) -> tuple[StampedScans, Trajectory | None]:
-    """Stamps from their file, the file names, or the ground truth that goes with the scans by index; else nominal."""
+    """Stamps from their file, the file names, or the ground truth matched by index; else nominal. And the ground truth."""
     info, files, voice = folder.info, folder.files, folder.voice
     own = stamp_scans(files, _stamps_file(folder), folder.read, info.rate_hz, beside, voice)
     rate = info.rate_hz or DEFAULT_RATE_HZ
@@ -115,7 +115,7 @@ def _stamps_and_truth(
 
 
 def _with_scans(stream: Stream | None, scans: StampedScans, what: str, folder: Folder) -> Stream | None:
-    """An IMU or GNSS stream, moved where it steps with the clock of the scans."""
+    """IMU or GNSS stream, corrected where it steps together with the clock of the scans."""
     if stream is None:
         return None
     return replace(stream, stamps_ns=follow(stream.stamps_ns, scans.raw_ns, scans.stamps_ns, what, folder.voice))

@@ -1,4 +1,4 @@
-"""Stamps of scan files: their own file, their names in whatever unit, and the times of their points, held against each other."""
+"""Stamps of scan files: from a file, from their names in any unit, or from their points' times, checked against each other."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _CLEARLY = 0.5
 
 
 class StampedScans(NamedTuple):
-    """Scan files in the order of their stamps (N,) ns, which increase, their rate, Hz, and the stamps before they were mended."""
+    """Scan files in the order of their increasing stamps (N,), ns, their rate, Hz, and the stamps before corrections."""
 
     files: list[Path]
     stamps_ns: Stamps
@@ -53,12 +53,12 @@ def stamp_scans(
     beside: Sequence[Stamps],
     voice: Voice,
 ) -> StampedScans | None:
-    """The scans with the stamps of the file `path`, else those in their names, else by their points; None without any.
+    """Stamp the scans by the file `path`, else by their names, else by their points; None if none of these has times.
 
     read : the points of a file; beside : stamps of other streams, with one of which the scans share time
 
-    A clock that goes back, stands still or steps gives way to the next one that contradicts it, which is said. Raises
-    InputError when the file has another number of rows than there are scans and nothing tells which belong together.
+    A clock that goes back, stands still or steps is replaced by the next one that contradicts it, with a note. Raises
+    InputError when the file's rows cannot be matched with the scans.
     """
     by_name, words = _stamps_by_name(files, voice)
     files = sorted(files, key=lambda file: by_name.get(file, 0))
@@ -96,7 +96,7 @@ def stamp_scans(
 
 
 def _stamps_by_name(files: list[Path], voice: Voice) -> tuple[dict[Path, int], str]:
-    """The stamps, ns, in the names of the files, none where they hold none, and what they are in words."""
+    """Stamps, ns, in the names of the files, empty where they hold none, and their format in words."""
     names = stamps_in_names(files)
     if names is None:
         return {}, ""
@@ -108,7 +108,7 @@ def _stamps_by_name(files: list[Path], voice: Voice) -> tuple[dict[Path, int], s
 
 
 def _agreed(clocks: list[Clock], voice: Voice) -> Stamps:
-    """The first clock with its faults mended by the others; the next that increases where it cannot be."""
+    """First clock with its faults corrected by the others; if that fails, the next one that increases."""
     first, *others = clocks
     stamps = first.stamps_ns
     for other in others:
@@ -130,10 +130,10 @@ def _is_suspicious(stamps: Stamps) -> bool:
 
 
 def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -> tuple[list[Path], Stamps]:
-    """The scans that have a stamp in the file `path`, and these: by a column of names or numbers, by the numbers in the file
-    names, or by the gaps that lost rows leave.
+    """Scans that have a stamp in the file `path`, and these stamps.
 
-    Raises InputError when the counts differ and nothing tells.
+    Rows are matched by a column of names or numbers, by the numbers in the file names, or by the gaps that lost rows leave.
+    Raises InputError when the counts differ and no match is found.
     """
     count = len(files)
     counts = f"{path} has {len(stamps)} {'times' if path.stem == 'times' else 'stamps'} for {count} scans"
@@ -165,7 +165,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
 
 
 def _labelled(path: Path, files: list[Path], count: int) -> Longs | None:
-    """(N,) row of each file, -1 for none, by a column that names the files or their numbers; None when there is no such one."""
+    """(N,) row of each file, -1 for none, by a column that holds file names or numbers; None when there is no such column."""
     cells = [row.text.replace(",", " ").replace(";", " ").split() for row in read_rows(path)[0]][-count:]
     if len(cells) != count or min(map(len, cells)) < 2:
         return None
@@ -185,7 +185,7 @@ def _labelled(path: Path, files: list[Path], count: int) -> Longs | None:
 
 
 def _filled_gaps(stamps: Stamps, count: int) -> Stamps | None:
-    """(count,) ns: `stamps`, in whose gaps just as many scans fit as have no row, evenly; else None."""
+    """(count,) ns: `stamps` with missing ones interpolated, if their gaps fit exactly the missing number of scans; else None."""
     steps = np.diff(stamps).astype(np.float64)
     if len(stamps) >= count or len(steps) < 2 or steps.min() <= 0:
         return None
@@ -197,7 +197,7 @@ def _filled_gaps(stamps: Stamps, count: int) -> Stamps | None:
 
 
 class NameStamps(NamedTuple):
-    """Stamps (N,) ns of the files in their order, and what the names hold, in words; None where stamps repeat."""
+    """Stamps (N,), ns, of the files in order, and the format of the names in words; `stamps` is None if they repeat."""
 
     stamps_ns: Stamps | None
     words: str
@@ -248,7 +248,7 @@ def _dates(stems: list[str]) -> Iterator[tuple[list[int], str]]:
 
 
 def _pairs(groups: list[list[str]], between: list[str]) -> Iterator[tuple[list[int], str]]:
-    """Seconds and the number behind them."""
+    """Seconds, and the fraction in the number after them."""
     for (whole, rest), separator in zip(pairwise(groups), between, strict=True):
         lengths = {len(text) for text in rest}
         if separator not in tuple("._-,") or max(lengths) > 9 or max(map(len, whole)) > 10 or _counts(rest):
@@ -300,12 +300,12 @@ def _is_time(texts: list[str], scale: int) -> bool:
 
 
 def _counts(texts: list[str]) -> bool:
-    """Whether numbers only count the files."""
+    """Whether numbers merely count the files."""
     return len(texts) > 2 and bool((np.diff([int(text) for text in texts]) == 1).all())
 
 
 def _step_ns(stamps: list[int]) -> float:
-    """The median interval, 0 of a single stamp."""
+    """Median interval, ns; 0 for a single stamp."""
     return float(np.median(np.diff(np.sort(np.array(stamps, np.int64))))) if len(stamps) > 1 else 0.0
 
 
@@ -314,7 +314,7 @@ def _is_rate(stamps: list[int]) -> bool:
 
 
 def _unevenness(stamps: list[int]) -> float:
-    """Mean deviation of the intervals from their median, in medians."""
+    """Mean deviation of the intervals from their median, relative to the median."""
     steps = np.diff(np.sort(np.array(stamps, np.int64))).astype(np.float64)
     middle = float(np.median(steps)) if len(steps) else 0.0
     return float(np.mean(np.abs(steps - middle))) / middle if middle > 0 else np.inf

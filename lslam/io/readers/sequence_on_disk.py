@@ -1,4 +1,4 @@
-"""What the sequences of all readers have in common, and the unit of their coordinates."""
+"""Base class of the sequences of all readers, and detection of the unit of their coordinates."""
 
 from __future__ import annotations
 
@@ -82,23 +82,23 @@ class SequenceOnDisk(Scans):
         return self._read(index)
 
     def streams_apart(self) -> list[str]:
-        """What is to be said of the IMU and of fixes that lie wholly before or after the scans."""
+        """Warnings about IMU data and fixes that lie entirely before or after the scans."""
         own, streams = self.stamps_ns, {"IMU": self.imu, "GNSS": self.gnss}
         stamps = {name: stream.stamps_ns for name, stream in streams.items() if stream is not None}
         return [no_shared_time(name) for name, its in stamps.items() if its[0] > own[-1] or its[-1] < own[0]]
 
     @abstractmethod
     def _read(self, index: int) -> Scan:
-        """Scan `index`, which there is."""
+        """Scan `index`, which exists."""
 
 
 def in_metres(cloud: PointCloud, unit_m: float | None) -> PointCloud:
-    """The cloud with its points in m."""
+    """Cloud with its points converted to m."""
     return cloud if unit_m in (None, 1.0) else replace(cloud, points=cloud.points * np.float32(unit_m))
 
 
 def settle_unit(sequence: T) -> T:
-    """The sequence, its unit found where nobody states it; the decision is a note, what stays unclear a problem."""
+    """Sequence with its unit detected if not stated. The decision is added to the notes, doubts to the problems."""
     if sequence.unit_m is not None:
         name = next(name for name, length in LENGTHS.items() if length == sequence.unit_m)
         sequence.notes.append(f"points in {name}, as stated")
@@ -118,7 +118,7 @@ def settle_unit(sequence: T) -> T:
 
 
 def find_unit(scans: list[Floats]) -> tuple[str | None, str]:
-    """The unit, one of `LENGTHS`, in which the scans (N, 3) are most usual, None where it is unclear; and a sentence."""
+    """Unit, one of `LENGTHS`, in which the scans (N, 3) look most usual, None if unclear; and a sentence."""
     reach = float(np.median([np.median(np.linalg.norm(points, axis=1)) for points in scans]))
     height = _median([_ground(points) for points in scans])
     noise = _median([_noise(points) for points in scans])
@@ -146,13 +146,13 @@ def find_unit(scans: list[Floats]) -> tuple[str | None, str]:
 
 
 def _median(values: list[float]) -> float:
-    """Without NaN; NaN where nothing is left."""
+    """Median without NaN; NaN if nothing is left."""
     numbers = [value for value in values if not isnan(value)]
     return float(np.median(numbers)) if numbers else nan
 
 
 def _ground(points: Floats) -> float:
-    """How far below the sensor most of the points are that lie below it; NaN where few do."""
+    """Height of the sensor above the most frequent level below it, in the cloud's unit; NaN if few points lie below."""
     level = np.hypot(points[:, 0], points[:, 1])
     below = -points[points[:, 2] < -0.05 * level, 2]
     if len(below) < _MIN_POINTS:
@@ -163,7 +163,7 @@ def _ground(points: Floats) -> float:
 
 
 def _noise(points: Floats) -> float:
-    """Thickness of surfaces: of the flattest patches of a tenth of their range; NaN where there are too few."""
+    """Noise of surfaces: thickness of the flattest patches, as large as a tenth of their range; NaN if there are too few."""
     from scipy.spatial import cKDTree
 
     points = points[:_MOST_POINTS]
@@ -180,7 +180,7 @@ def _noise(points: Floats) -> float:
 
 
 def _step(points: Floats) -> float:
-    """Step of which all coordinates are multiples, 0 where there is none above a thousandth."""
+    """Quantisation step of the coordinates, 0 if there is none above a thousandth."""
     for step in (1.0, 0.5, 0.1, 0.01, 0.001):
         if np.abs(points / step - np.round(points / step)).max() < 1e-3:
             return step

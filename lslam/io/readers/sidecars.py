@@ -1,4 +1,4 @@
-"""What lies beside the scans: `sequence.toml`, the IMU and GNSS files it names, and the HDL-64E's vertical correction."""
+"""Files beside the scans: `sequence.toml`, the IMU and GNSS files it names; and the HDL-64E's vertical correction."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _HDL64_TOP_DEG = 6.0
 
 
 def read_info(folder: Path, overrides: SequenceInfo) -> tuple[SequenceInfo, bool]:
-    """`overrides` over what `sequence.toml` in `folder` says, and whether there is such a file."""
+    """Settings of the user over those of `sequence.toml` in `folder`, and whether that file exists."""
     path = folder / FILE_NAME
     if not path.is_file():
         return overrides, False
@@ -37,7 +37,7 @@ def read_info(folder: Path, overrides: SequenceInfo) -> tuple[SequenceInfo, bool
 
 
 def compensation_note(info: SequenceInfo) -> list[str]:
-    """What `sequence.toml` or the user says about motion compensation, as a sentence; empty when nothing is said."""
+    """Sentence on motion compensation as `sequence.toml` or the user states it; empty when nothing is stated."""
     if info.motion_compensated is None:
         return []
     if not info.motion_compensated:
@@ -47,7 +47,7 @@ def compensation_note(info: SequenceInfo) -> list[str]:
 
 
 def stated_times(info: SequenceInfo) -> StatedTimes:
-    """What is stated about the times of points. Raises InputError where scans are stated to be compensated: they have none."""
+    """Stated rule of the points' times. Raises InputError if it contradicts a stated motion compensation."""
     if info.motion_compensated and info.point_times not in (None, "none"):
         raise InputError(
             f"point_times = {info.point_times!r} and motion_compensated = true contradict each other: state one of them"
@@ -56,7 +56,7 @@ def stated_times(info: SequenceInfo) -> StatedTimes:
 
 
 def vertical_correction(info: SequenceInfo, files: list[Path], record: PointRecord | None, notes: list[str]) -> float:
-    """Degrees by which real KITTI HDL-64E points are lifted, 0 where something says otherwise; the reason goes to `notes`."""
+    """Angle, deg, by which points of KITTI's HDL-64E are raised; 0 if not needed. The reason is added to `notes`."""
     if info.vertical_correction_deg is not None:
         degrees = info.vertical_correction_deg
         notes.append(
@@ -96,7 +96,7 @@ def load_streams(folder: Path, info: SequenceInfo, voice: Voice) -> tuple[ImuStr
 
 
 def calibration_over(info: SequenceInfo, found: Calibration) -> Calibration:
-    """Extrinsics that `sequence.toml` states, else those found."""
+    """Extrinsics that `sequence.toml` states, else those of the reader."""
     stated = {name: T for name in EXTRINSICS if (T := getattr(info, name)) is not None}
     return replace(found, frames={**found.frames, **(info.frames or {})}, **stated)
 
