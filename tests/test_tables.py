@@ -14,7 +14,7 @@ sys.path.insert(0, str(BENCHMARKS))
 
 import tables  # noqa: E402
 
-PAGES = ("README.md", "docs/results.md", "docs/notes.md")
+PAGES = ("README.md", "docs/results.md", "docs/theses.md", "docs/notes.md")
 DOCUMENTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in PAGES}
 BLOCK = re.compile(r"<!-- table (.+?) -->\n(.*?)<!-- end -->", re.DOTALL)
 BLOCKS = [(name, *match) for name, text in DOCUMENTS.items() for match in BLOCK.findall(text)]

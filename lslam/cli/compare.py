@@ -26,16 +26,21 @@ if TYPE_CHECKING:
     epilog="\b\nExamples: lslam compare sample_data --methods icp,kiss-icp\n"
     "          lslam compare street block --methods icp,kiss-icp --seeds 0,1,2 --count 100 --count block=50\n"
     "          lslam compare walk open --methods icp,loam --imu both --seeds 0,1,2\n"
-    "          lslam compare seq07 --data-root ~/kitti --methods icp,kiss-icp --count 300 --out runs/two --resume"
+    "          lslam compare seq07 --data-root ~/kitti --methods icp,kiss-icp --count 300 --out runs/two --resume\n"
+    "          lslam compare girolimetto --quick"
 )
-@click.argument("sequences", metavar="SEQUENCE...", nargs=-1, required=True)
+@click.argument("sequences", metavar="SEQUENCE...|NAME", nargs=-1)
+@click.option("--list", "show_list", is_flag=True, help="List the comparisons that ship with lslam.")
+@click.option("--quick", is_flag=True, help="Of a comparison of --list: few drives and seeds, in minutes.")
 @click.option(
-    "--methods", required=True, metavar="A,B,...",
+    "--methods", metavar="A,B,...",
     help="Names of `lslam methods`, presets or configuration files; the first is the reference.",
 )  # fmt: skip
 @options.preset
 @click.option(
-    "--seeds", default="0", show_default=True, metavar="N,N,...", help="Seeds of simulations and of random methods."
+    "--seeds",
+    metavar="N,N,...",
+    help="Seeds of simulations and of random methods, also 100-104 [default: 0, or those of NAME].",
 )
 @click.option(
     "--imu",
@@ -69,10 +74,21 @@ if TYPE_CHECKING:
 def command(sequences: tuple[str, ...], **given: Any) -> None:
     """Run methods on the same sequences and write one table and one page about all of them.
 
-    SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed.
+    SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed. NAME is one of
+    --list: what a thesis compared, beside what it prints, with a verdict; the same command again goes on.
     """
+    if given["show_list"]:
+        _print_list(given["as_json"])
+        return
     setup_logging(given["verbose"], given["quiet"])
-    plan = _plan(sequences, given)
+    if not sequences:
+        raise click.UsageError("Missing argument 'SEQUENCE...'.")
+    is_ready = len(sequences) == 1 and given["methods"] is None and _is_ready(sequences[0])
+    if given["quick"] and not is_ready:
+        raise click.UsageError("--quick is of the comparisons of --list")
+    if given["methods"] is None and not is_ready:
+        raise click.UsageError("Missing option '--methods'.")
+    plan = _ready_plan(sequences[0], given) if is_ready else _plan(sequences, given)
     from lslam.cli.console import bars
     from lslam.core.errors import GateError, RunFailedError
     from lslam.studies.compare import compare
@@ -94,7 +110,7 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
     from lslam.studies.output import COMPARISON, require_free
     from lslam.studies.plan import Plan, check_numbers
 
-    seeds, crop = options.seeds_of(given["seeds"]), _crop(given["crop"])
+    seeds, crop = options.seeds_of(given["seeds"] or "0"), _crop(given["crop"])
     check_numbers(seeds, given["jobs"], crop)
     out = given["out"] or Path("runs") / time.strftime("compare-%Y%m%d-%H%M%S")
     require_free(out, COMPARISON, "comparison", given["overwrite"], given["resume"])
@@ -119,6 +135,49 @@ def _plan(sequences: tuple[str, ...], given: dict[str, Any]) -> Plan:
         resume=given["resume"],
         data_root=given["data_root"],
         command=shlex.join(["lslam", *sys.argv[1:]]),
+    )
+
+
+def _is_ready(word: str) -> bool:
+    from lslam.studies.ready_comparison import comparison_names
+
+    return word in comparison_names()
+
+
+def _print_list(as_json: bool) -> None:
+    from lslam.studies.ready_comparison import comparison_names, find_comparison
+
+    found = {name: find_comparison(name).summary for name in comparison_names()}
+    if as_json:
+        show(json.dumps({"comparisons": found}) + "\n")
+        return
+    show("".join(f"{name:<14}  {summary}\n" for name, summary in found.items()))
+
+
+def _ready_plan(name: str, given: dict[str, Any]) -> Plan:
+    """A comparison that ships with lslam, in a folder of its name, in which it goes on."""
+    from lslam.studies.output import COMPARISON, require_free
+    from lslam.studies.plan import Plan, check_numbers
+    from lslam.studies.ready_comparison import find_comparison
+    from lslam.studies.subjects import find_subjects
+
+    ready, is_quick = find_comparison(name), given["quick"]
+    seeds = options.seeds_of(given["seeds"]) if given["seeds"] else ready.quick.seeds if is_quick else ready.seeds
+    check_numbers(seeds, given["jobs"], None)
+    out = given["out"] or Path("runs") / (f"{name}-quick" if is_quick else name)
+    require_free(out, COMPARISON, "comparison", given["overwrite"], not given["overwrite"])
+    common, ranges = options.ranges_of(given, ())
+    words = ready.quick.sequences if is_quick else ready.sequences
+    return Plan(
+        subjects=tuple(find_subjects(words, None, ranges)),
+        variants=tuple(ready.variants([*given["settings"], *common])),
+        seeds=seeds,
+        out=out,
+        jobs=given["jobs"],
+        overwrite=given["overwrite"],
+        resume=not given["overwrite"],
+        command=shlex.join(["lslam", *sys.argv[1:]]),
+        ready=ready,
     )
 
 

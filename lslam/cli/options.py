@@ -315,11 +315,15 @@ def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> 
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
-    """The numbers of --seeds; raises UsageError for other words."""
+    """The numbers of --seeds, also of `100-104`; raises UsageError for other words."""
+    seeds: list[int] = []
     try:
-        return tuple(int(part) for part in text.split(",") if part.strip())
+        for part in filter(str.strip, text.split(",")):
+            first, dash, last = part.strip().partition("-")
+            seeds += range(int(first), int(last) + 1) if dash and first else [int(part)]
     except ValueError:
-        raise UsageError(f"--seeds {text}: whole numbers with commas between them") from None
+        raise UsageError(f"--seeds {text}: whole numbers with commas between them, or 100-104") from None
+    return tuple(seeds)
 
 
 def require_there(*paths: Path | None) -> None:

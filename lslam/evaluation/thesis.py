@@ -188,6 +188,10 @@ class DelTufo(TrajectoryMetric[Planar]):
     """Planar errors."""
 
     key, name, word = "thesis2", "thesis2", "thesis"
+    columns = (
+        ("ate_mean", _more("planar_ate", "m")),
+        ("rpe_translation_mean", _more("planar_rpe", "m")),
+    )
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> Planar:
         if not poses.has_rotations:

@@ -61,7 +61,10 @@ def tables(comparison: Comparison, width: int | None = None) -> list[CompareTabl
         out = [_methods_table(comparison, groups, title) for groups, title in zip(split, titles, strict=True)]
         if width is None or all(table.width <= width for table in out):
             break
-    return out + [
+    return [
+        *(CompareTable(t.title, t.header, t.rows, 2) for t in comparison.beside if t.rows),
+        *out,
+    ] + [
         table
         for table in (_paired(comparison), _differences(comparison), _degraded(comparison), _failures(comparison))
         if table.rows
@@ -75,7 +78,7 @@ def recipes(comparison: Comparison) -> list[str]:
         for m in comparison.metrics
         if m.is_main and m.recipe and not m.key.startswith("time.") and m.key not in HEALTH
     ]
-    lines = [f"{m.label}: {m.recipe}" for m in shown]
+    lines = [*(t.recipe for t in comparison.beside), *(f"{m.label}: {m.recipe}" for m in shown)]
     lines.append("ms: mean over scans of each stage, then of all stages together (mean), and its 95th percentile (p95)")
     lines.append(
         f"{'/'.join(HEALTH.values())}: scans of a run, mean over the runs of all seeds that did not fail; recovered: posed by "
@@ -117,9 +120,13 @@ def as_text(shown: Sequence[CompareTable], style: str) -> list[str]:
 
 
 def write_files(out: Path, comparison: Comparison) -> None:
-    """compare.csv and compare.tex, atomically; raises OutputError."""
+    """compare.csv and compare.tex, and beside.csv and beside.md of a ready comparison, atomically; raises OutputError."""
     for style in ("csv", "tex"):
         write_text(out / f"compare.{style}", render(comparison, style) + "\n")
+    if comparison.beside:
+        shown = [CompareTable(t.title, t.header, t.rows, 2) for t in comparison.beside]
+        write_text(out / "beside.md", "\n\n".join(as_text(shown, "md")) + "\n")
+        write_text(out / "beside.csv", "\n\n".join(comma_separated(table.grid) for table in shown) + "\n")
 
 
 def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:
@@ -238,6 +245,7 @@ def to_document(comparison: Comparison) -> dict[str, Any]:
         "rows": [asdict(row) for row in c.rows],
         "paired": [asdict(pair) for pair in c.paired],
         "differences": [asdict(difference) for difference in c.differences],
+        "beside": [asdict(table) for table in c.beside],
     }
     plain = strict(document)
     assert isinstance(plain, dict)

@@ -166,10 +166,11 @@ def compare(plan: Plan, progress: StudyProgress | None = None) -> Comparison:
         compare_table.write_running(plan.out / COMPARISON, plan.command)
     jobs: list[Job] = []
     try:
-        jobs = expand(_cells(plan, progress), plan.variants, plan.seeds, plan.out, plan.command)
+        for cell in _cells(plan, progress):
+            jobs += expand([cell], plan.fitted(cell), plan.seeds, plan.out, plan.command)
         kept = set() if plan.overwrite else finished(jobs)
         left = [replace(job, goes_on=plan.resume) for job in jobs if job.folder not in kept]
-        run_jobs(left, pool_of(plan.jobs, len(left)), progress)
+        run_jobs(left, pool_of(plan.jobs, len(left), is_persistent=plan.ready is not None), progress)
     except KeyboardInterrupt:
         raise InterruptedRunError(
             f"interrupted; {len(finished(jobs))} of {len(jobs) or 'all'} runs are finished in {plan.out}: the same command with "
@@ -251,4 +252,5 @@ def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple
         notes=tuple(_notes(scores)),
         configs={v.name: v.config.model_dump(mode="json") for v in plan.variants},
         tie=TIE_M,
+        beside=() if plan.ready is None else plan.ready.beside(scores),
     ), drawings

@@ -11,6 +11,8 @@ from lslam.core.errors import UsageError
 
 if TYPE_CHECKING:
     from lslam.core.types.trajectory import Trajectory
+    from lslam.studies.grid import Cell
+    from lslam.studies.ready_comparison import ReadyComparison
     from lslam.studies.subjects import Subject
     from lslam.studies.variants import Variant
 
@@ -25,6 +27,7 @@ class Plan:
     crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs, go
         on with the others
     data_root : where the IMU of a KITTI odometry sequence is looked for
+    ready : that ships with lslam, which this is
     """
 
     subjects: tuple[Subject, ...]
@@ -38,6 +41,11 @@ class Plan:
     resume: bool = False
     data_root: Path | None = None
     command: str = ""
+    ready: ReadyComparison | None = None
+
+    def fitted(self, cell: Cell) -> Sequence[Variant]:
+        """The variants as they run on the recording of a cell."""
+        return self.variants if self.ready is None else self.ready.fitted(self.variants, cell, self.out)
 
 
 def check_plan(plan: Plan) -> None:

@@ -33,6 +33,8 @@ COUNTS = {
     "fallback": "scans of a run that a recovery policy or a fallback posed",
 }  # fmt: skip
 IMU = "imu_used"
+# The metric that is told of a run's odometry too, before the graph moved it.
+ONLY_BEFORE = next(metric for metric in METRICS if metric.key == "thesis1")
 NO_TRUTH = "no ground truth"
 RESULTS = "results.csv"
 PARQUET = "results.parquet"
@@ -111,6 +113,9 @@ def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) 
         return f"not scored: {manifest['unscored']}" if "unscored" in manifest else NO_TRUTH
     for metric in METRICS:
         values |= metric.values(score[metric.key])
+    # What no graph moved is its own odometry.
+    before = ONLY_BEFORE.values((score.get("odometry") or score)[ONLY_BEFORE.key])
+    values |= {f"odometry.{key}": value for key, value in before.items()}
     values["path"] = score["path_length_m"]
     for key in [key for key, value in values.items() if value is None]:
         del values[key]
@@ -130,6 +135,7 @@ def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[
         Metric("factor", "real time", "x", "time", "recorded time over processing time (mean)", "high"),
         *(Metric(key, HEALTH[key], "scans", "health", recipe, "") for key, recipe in COUNTS.items()),
         *(metric for metric in errors if not metric.is_main),
+        *(_more(f"odometry.{m.key}", m.unit, "error") for m in ONLY_BEFORE.compared(configs)),
         _more("path", "m", "error"),
         _more("map.entropy", "nats", "error"),
         _more("map.plane_variance", "m2", "error"),

@@ -1,6 +1,6 @@
 """What Girolimetto found of parameters, judged by its eight studies on fresh seeds.
 
-    python tests/benchmarks/findings.py [--runs FOLDER] [--studies share,skip-frames] [--seeds 100-104] [--write docs/results.md]
+    python tests/benchmarks/findings.py [--runs FOLDER] [--studies share,skip-frames] [--seeds 100-104] [--write docs/theses.md]
 
 Runs `lslam sweep STUDY --seeds ...` for each, two at once; an idle machine with two cores takes three quarters of an
 hour. Runs in FOLDER are kept and gone on with.

@@ -1,7 +1,7 @@
 """What OpenStreetMap brings, system by system and mode by mode, where everything is known: Del Tufo's tables 4.2 and 4.3.
 
     python tests/benchmarks/osm.py [--seeds 100-104] [--scans 150] [--map exact,perturbed] [--drift 3.0,2.0]
-        [--kinds constant,wandering,random-walk] [--write docs/results.md]
+        [--kinds constant,wandering,random-walk] [--write docs/theses.md]
         [--modes none,hdl,thesis-baseline,thesis-improved,prior,rigid,non-rigid,two-level]
     lslam simulate residential --path poses/07.txt --out drives/seq07
     python tests/benchmarks/osm.py drives/*/sequences/00           or drives of one's own, with map.osm in them

@@ -1,6 +1,6 @@
 """Each mode of the map on maps that are exact, off as a whole, or wrong house by house.
 
-    python tests/benchmarks/osm_modes.py [--drifts 100-104] [--write docs/results.md]
+    python tests/benchmarks/osm_modes.py [--drifts 100-104] [--write docs/theses.md]
 
 The runs of tests/osm/wrong_maps.py: sample_data under a random walk, without loops.
 """

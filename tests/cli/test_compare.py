@@ -108,6 +108,10 @@ def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: P
 @pytest.mark.parametrize(
     ("words", "error", "sentence"),
     [
+        ([], click.UsageError, "Missing argument"),
+        (["block"], click.UsageError, "Missing option '--methods'"),
+        (["block", "--methods", "icp", "--quick"], click.UsageError, "--quick is of the comparisons of --list"),
+        (["girolimetto", "--seeds", "4-2"], UsageError, "different whole numbers"),
         (["block", "--methods", "icp,kis-icp"], UsageError, "did you mean 'kiss-icp'"),
         (["block", "--methods", ","], UsageError, "--methods is empty"),
         (["block", "--methods", "icp,icp"], UsageError, "twice"),

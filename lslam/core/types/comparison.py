@@ -166,6 +166,7 @@ class Comparison:
 
     paired : also each method with the IMU against itself without, when both were asked for
     configs : the resolved configuration of each method; tie : m
+    beside : tables of what a thesis prints, beside these runs
     """
 
     command: str
@@ -179,6 +180,7 @@ class Comparison:
     notes: tuple[str, ...]
     configs: dict[str, dict[str, Any]]
     tie: float
+    beside: tuple[Table, ...] = ()
 
     @property
     def degraded(self) -> tuple[RunScore, ...]:

@@ -1,0 +1,113 @@
+"""The comparisons that ship: what they run, what they say of it, and that the same command goes on."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lslam.core.types.comparison import Comparison, RunScore
+from lslam.io.formats.osm_buildings import read_buildings
+from lslam.io.readers import open_sequence
+from lslam.simulation.scenario_files import scenario_names
+from lslam.studies.compare import compare
+from lslam.studies.grid import Cell
+from lslam.studies.plan import Plan
+from lslam.studies.ready_comparison import comparison_names, find_comparison
+from lslam.studies.subjects import Subject
+
+SAMPLE = Path(__file__).parents[2] / "sample_data" / "sequences" / "00"
+
+
+def runs_of(sequence: str, method: str, key: str, *values: float, angular: float = 1.0) -> list[RunScore]:
+    scores = [{key: value, "thesis_angular": angular} for value in values]
+    return [RunScore(sequence, method, seed, Path(), "done", values=score) for seed, score in enumerate(scores)]
+
+
+@pytest.mark.parametrize("name", comparison_names())
+def test_what_is_printed_and_stated_is_of_what_is_run(name: str) -> None:
+    """A number of a drive or a system that nobody runs would never be judged."""
+    ready = find_comparison(name)
+    systems = {variant.name.split("@")[0] for variant in ready.variants(())}
+    assert set(ready.sequences) <= set(scenario_names())
+    assert set(ready.quick.sequences) <= set(ready.sequences)
+    assert {printed.sequence for printed in ready.printed} <= set(ready.sequences)
+    assert {system for printed in ready.printed for system in printed.values} <= systems
+    assert {end for stated in ready.stated for end in (stated.left, stated.right)} <= systems
+
+
+def test_numbers_are_those_of_the_theses() -> None:
+    girolimetto, del_tufo = find_comparison("girolimetto"), find_comparison("del-tufo")
+    assert girolimetto._printed("closed", "thesis-icp", "before") == 2.046  # table 4.3
+    assert girolimetto._printed("closed-hard", "thesis-icp", "after") == 1.169  # table 4.3
+    assert girolimetto._printed("small-eight", "thesis-loam-map+imu", "after") == 0.360  # table 5.4
+    assert girolimetto._printed("open", "thesis-loam+imu", "before") is None
+    assert del_tufo._printed("residential", "thesis-improved@mild", "ate") == 1.223  # table 4.2
+
+
+def test_a_number_and_an_order_are_judged_by_runs() -> None:
+    ready, key = find_comparison("girolimetto"), "odometry.thesis_rmse"
+    runs = [*runs_of("open", "thesis-icp", key, *[0.1] * 5), *runs_of("open", "thesis-icp+imu", key, *[0.3] * 5)]
+    numbers, stated = ready.beside(runs)
+    rows = {(row[1], row[2]): row[3:] for row in numbers.rows}
+    assert rows["thesis-icp", "rmse before the graph, m"][:4] == ("0.843", "0.1 / 0.1", "easier", "undecided")
+    assert rows["thesis-icp+imu", "rmse before the graph, m"][:4] == ("0.418", "0.3 / 0.3", "as hard", "reproduced")
+    (row,) = stated.rows
+    assert row[:4] == ("the IMU makes ICP more accurate", "open", "0.50", "refuted")
+    assert row[4] == "so in 0 of 5 seeds; median ratio 3.00"
+
+
+def test_a_system_on_a_map_is_judged_against_one_without_and_one_on_the_same() -> None:
+    ready = find_comparison("del-tufo")
+    systems = {"hdl": 1.0, "thesis-baseline@mild": 2.0, "thesis-improved@mild": 0.5}
+    runs = [run for name, ate in systems.items() for run in runs_of("residential", name, "planar_ate", *[ate] * 5)]
+    _, stated = ready.beside(runs)
+    said = {row[0]: row[1:4] for row in stated.rows if "smoother" not in row[0]}
+    assert said == {
+        "the improved system is more accurate than hdl_graph_slam": ("residential@mild", "0.73", "reproduced"),
+        "the baseline is more accurate than hdl_graph_slam": ("residential@mild", "0.92", "refuted"),
+        "the improved system is more accurate than the baseline": ("residential@mild", "0.79", "reproduced"),
+    }
+
+
+def test_maps_are_wrong_as_it_is_said(tmp_path: Path) -> None:
+    ready = find_comparison("del-tufo")
+    cell = Cell("residential", SAMPLE, 3, "")
+    configs = {variant.name: variant.config for variant in ready.fitted(ready.variants(()), cell, tmp_path)}
+    assert {config.debug.drift_seed for config in configs.values()} == {3}
+    assert not configs["hdl"].osm.extract
+    extracts = {kind: Path(configs[f"thesis-improved@{kind}"].osm.extract) for kind in ready.maps}
+    assert (extracts["exact"], extracts["wrong"]) == (SAMPLE / "map.osm", SAMPLE / "map_perturbed.osm")
+    origin = np.array(configs["thesis-improved@exact"].osm.origin)
+    middles = []
+    for kind in ("exact", "mild"):
+        middles.append({b.osm_id: b.middle for b in read_buildings(extracts[kind], origin)[1].buildings})
+    assert middles[0].keys() == middles[1].keys()
+    away = np.array([np.linalg.norm(middles[1][name] - middles[0][name]) for name in middles[0]])
+    assert away.max() <= 0.3 + 0.6 + 0.05
+    assert np.median(away) > 0.1
+
+
+def made(out: Path) -> Comparison:
+    few = {"methods": ("thesis-loam",), "imu": "off", "settings": ("input.count=8",)}
+    ready = find_comparison("girolimetto").model_copy(update=few)
+    subjects = (Subject("open", scenario="open"),)
+    plan = Plan(subjects, tuple(ready.variants(())), (5,), out, resume=out.is_dir(), command="lslam", ready=ready)
+    return compare(plan)
+
+
+@pytest.mark.usefixtures("forked_runs")
+def test_it_runs_says_what_came_of_it_and_runs_nothing_twice(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first, again = made(out), made(out)
+    assert [run.is_reused for run in (*first.runs, *again.runs)] == [False, True]
+    assert again.beside == first.beside
+    (run,) = first.runs
+    assert 0 < run.values["odometry.thesis_rmse"] == run.values["thesis_rmse"]
+    assert len(open_sequence(out / "simulated" / "open-5-29" / "sequences" / "00")) == 29
+    assert "number by number" in (out / "compare.html").read_text()
+    assert "| open " in (out / "beside.md").read_text()
+    rows = list(csv.reader((out / "beside.csv").read_text().splitlines()))
+    assert rows[1][:4] == ["open", "thesis-loam", "rmse before the graph, m", "0.844"]
