@@ -14,7 +14,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.kernels import voxel
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan
-from lslam.core.types.scan_result import ScanResult
+from lslam.core.types.scan_result import FASTEST_M_S, FASTEST_RAD_S, ScanResult
 from lslam.registration.acceptance import Acceptance, failed
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
@@ -54,9 +54,8 @@ def judge(
     return recorded(scan, replace(result, stages=stages), None, None)
 
 
-# m/s and rad/s: trains and small aircraft are slower, and racing drones turn less. Over a shorter time than so many seconds a
-# registration may err by as much.
-FASTEST_M_S, FASTEST_RAD_S, LEAST_S = 150.0, 20.0, 0.1
+# s; over a shorter time a registration may err by as much as the fastest moves.
+LEAST_S = 0.1
 # Of R^T R: what float32 and rounding leave of a rotation is nearer.
 RIGID = 1e-3
 

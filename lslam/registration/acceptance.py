@@ -9,13 +9,14 @@ from typing import Literal
 import numpy as np
 
 from lslam.core.types.arrays import Floats
+from lslam.core.types.scan_result import OPEN_M, OPEN_RAD
 from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import UsualAgreement
 
 Test = Literal["solution", "directions", "rmse", "overlap", "inliers", "agreement", "jump"]
 
-# Of a pose from the motion prior alone: sigmas of half a metre and two degrees.
-PRIOR_COVARIANCE = np.diag([0.25] * 3 + [np.deg2rad(2.0) ** 2] * 3)
+# Of a pose from the motion prior alone.
+PRIOR_COVARIANCE = np.diag(np.repeat([OPEN_M, OPEN_RAD], 3) ** 2)
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
+from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
 from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
 
-# A plane must have been seen across its beams by twice the standard deviation that it is thick: below that, a plane
-# through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
-BREADTH = 4.0
+# A plane must have been seen across its beams by so many times the standard deviation that it is thick, squared: below that, a
+# plane through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
+BREADTH = SIGNIFICANT_SIGMAS**2
 # Times the coarse voxels. Beams of two degrees lie two metres apart on a wall 60 m away, and on the ground 10 m ahead.
 WIDE = (2, 4)
 

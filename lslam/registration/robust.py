@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from lslam.core.kernels.significance import OUTLIER_SIGMAS, SIGNIFICANT_SIGMAS
 from lslam.core.types.state import Stateful
 
 # Of what was lately, what stays from scan to scan: a memory of five.
@@ -34,12 +35,12 @@ class AdaptiveThreshold(Stateful):
 
     def __init__(self, low: float, high: float) -> None:
         self.low, self.high = low, high
-        self.mean_square = (high / 3) ** 2
+        self.mean_square = (high / OUTLIER_SIGMAS) ** 2
 
     @property
     def width(self) -> float:
         """Kernel width for the next scan, m."""
-        return min(max(3 * math.sqrt(self.mean_square), self.low), self.high)
+        return min(max(OUTLIER_SIGMAS * math.sqrt(self.mean_square), self.low), self.high)
 
     def observe(self, error: float) -> None:
         """Learn from one registered scan's prediction error, m."""
@@ -47,7 +48,7 @@ class AdaptiveThreshold(Stateful):
 
     def widen(self) -> None:
         """Reset to the widest after a failed scan."""
-        self.mean_square = (self.high / 3) ** 2
+        self.mean_square = (self.high / OUTLIER_SIGMAS) ** 2
 
 
 class UsualAgreement(Stateful):
@@ -57,7 +58,6 @@ class UsualAgreement(Stateful):
     separates that from a sparse sensor's good scan. The drop from one scan to the next does.
     """
 
-    RELAXING = 0.9
     # Scans in a row differ by an eighth at most, unless something has happened.
     LESS = 0.8
     STATE = ("usual",)
@@ -87,10 +87,10 @@ class UsualAgreement(Stateful):
         self.usual = max(share, FORGETTING * self.usual + (1 - FORGETTING) * share)
 
     def relax(self) -> None:
-        """Expect less after a bad scan, so that a place that has changed for good is accepted after a few."""
-        self.usual *= self.RELAXING
+        """Expect less after a bad scan, as if nothing had agreed: a place that has changed for good is accepted after a few."""
+        self.usual *= FORGETTING
 
 
 def is_more(count: int, other: int) -> bool:
-    """Whether one count is larger than another by more than two sigma of both, as those of independent events."""
-    return count - other > 2 * math.sqrt(count + other)
+    """Whether one count is larger than another by more than `SIGNIFICANT_SIGMAS` of both, as those of independent events."""
+    return count - other > SIGNIFICANT_SIGMAS * math.sqrt(count + other)

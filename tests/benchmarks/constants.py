@@ -38,7 +38,7 @@ PATH: dict[str, tuple[str, ...]] = {
         "odometry/uncertainty.py", "odometry/frontend/windows.py", "odometry/inertial/course.py", "odometry/icp.py",
         "registration/preprocessing/prepare.py", "registration/preprocessing/deskew.py", "registration/preprocessing/ground.py",
         "core/kernels/gauss_newton.py", "core/kernels/gaussians.py", "core/kernels/residuals.py", "core/kernels/ground.py",
-        "core/kernels/voxel.py",
+        "core/kernels/significance.py", "core/kernels/voxel.py",
     ),
     "features": (
         "odometry/feature_*.py", "odometry/loam.py", "registration/preprocessing/features.py",
@@ -61,7 +61,7 @@ NOT_OF_IT = {
     "registration/kernels/curvature.py LESS_EDGE", "registration/kernels/curvature.py NEITHER",
     "registration/kernels/curvature.py LESS_PLANE", "registration/kernels/curvature.py PLANE",
     "registration/preprocessing/features.py MAY_BE_EDGE", "registration/preprocessing/features.py MAY_BE_FLAT",
-    "registration/preprocessing/features.py MAY_BE_PLANE", "odometry/inertial/imu_estimate.py GRAVITY",
+    "registration/preprocessing/features.py MAY_BE_PLANE",
     "odometry/integrity/alerts.py AXES", "registration/preprocessing/ground.py Z",
     "odometry/inertial/integrate.py PERFECT", "odometry/inertial/gyroscope.py MOUNTING",
     "registration/optimiser.py EVERYWHERE", "odometry/feature_solver.py NONE",
@@ -88,8 +88,8 @@ KEYS = {
 CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odometry.py"}
 COSINES = {"UPRIGHT"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
-LACK = {"FORGETTING", "RELAXING", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
-EXCESS = {"CLEARLY", "MUCH", "MORE", "PILED"}
+LACK = {"FORGETTING", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
+EXCESS = {"CLEARLY", "MUCH", "PILED"}
 FACTORS = {"half": 0.5, "double": 2.0}
 
 

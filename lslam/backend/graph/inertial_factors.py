@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lslam.core.types.arrays import Floats
-from lslam.core.types.imu import InertialChain, InertialStep, SmootherNoise
+from lslam.core.types.imu import GRAVITY, InertialChain, InertialStep, SmootherNoise
 
 # m2 per s, of the integration itself: none but rounding.
 INTEGRATION = 1e-10
@@ -36,8 +36,6 @@ def preintegrated(
 
 
 SPEED_KEY, BIAS_KEY = 1 << 41, 1 << 42
-# m/s2, over the Earth.
-GRAVITY = 9.80665
 # m/s2 and rad/s, one sigma about the biases at the run's end, where a chain begins: a consumer device's wander in hours.
 FORCE_BIAS, RATE_BIAS = 0.1, 0.003
 

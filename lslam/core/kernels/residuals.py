@@ -11,13 +11,14 @@ from lslam.core.kernels.gaussians import BLOB, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen
 from lslam.core.kernels.linearisation import Floats, Ints, Longs, Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
 from lslam.core.kernels.voxel import index_of, pack
 
 # Rows of planes, keys and table, see `gaussians`.
 Voxels = tuple[Floats, Longs, Ints]
 
-# Factor on the variance of the normal, two sigma: the errors of neighbouring points of one ring are correlated.
-TILT = 4.0
+# Factor on the variance of the normal: the errors of neighbouring points of one ring are correlated.
+TILT = SIGNIFICANT_SIGMAS**2
 
 
 @inline

@@ -7,6 +7,9 @@ from dataclasses import dataclass, field, replace
 
 from lslam.core.types.arrays import Floats, Longs
 
+# m/s2, the standard gravity of Earth.
+GRAVITY = 9.80665
+
 
 @dataclass(frozen=True)
 class ImuStream:

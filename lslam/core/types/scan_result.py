@@ -67,12 +67,16 @@ class ScanEquations:
     g: Floats
 
 
+# m/s and rad/s: trains and small aircraft are slower, and racing drones turn less.
+FASTEST_M_S, FASTEST_RAD_S = 150.0, 20.0
 # What explains less than this part of what is usual, or less than a share of the points, is rejected.
 USUAL, FEWEST = 0.7, 0.15
-# m; a check with a larger sigma of the position confirms nothing.
-OPEN_M = 0.5
+# m and rad; what is known no better is open: a motion of which scans say no more, a pose that no scan supports.
+OPEN_M, OPEN_RAD = 0.5, float(np.deg2rad(2.0))
 # m, of a point at `LEVER_M`: two motions of a pair of scans that differ by less are one.
 SAME_M = 0.2
+# m, likewise: poses that move by less stand. Registration errs by no more, and all that drives moves more in half a second.
+STILL_M = 0.05
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,10 @@ from enum import StrEnum
 import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.odometry.inertial.saturation import with_hidden
 from lslam.odometry.kernels.strapdown import overlaps
 
-GRAVITY = 9.80665
 # Mean specific force over whole seconds, in g: bends and a poor accelerometer's bias included.
 PLAUSIBLE_G = (0.8, 1.2)
 # s over which a vehicle's heave (1 to 2 Hz) averages out and a straight stretch between bends does not.

@@ -12,18 +12,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.imu import ImuState, ImuStream
+from lslam.core.types.imu import GRAVITY, ImuState, ImuStream
 from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import vector_between
 
-GRAVITY = 9.80665
 # Registration from scan to scan, at the least: m and rad, one sigma.
 PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
 # Random walk of gravity in the world of a registration that drifts, m/s2 per sqrt(s).
 GRAVITY_WALK = 5e-3
 GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
+# Times that one account of the motion may miss the registered one by more than its alternative before it is refused.
+WORSE = 2.0
 
 # (3, 3) m2 and rad2, of a registration without covariance.
 PLACE_NOISE, TURN_NOISE = PLACE_SIGMA**2 * np.eye(3), TURN_SIGMA**2 * np.eye(3)

@@ -8,30 +8,26 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.core.config.odometry import ImuConfig
+from lslam.core.kernels.significance import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
+from lslam.core.types.scan_result import FASTEST_M_S, STILL_M
 from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
-from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
+from lslam.odometry.inertial.gyroscope import AXES_SIGMA, RATE_NOISE, Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
-from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, WORSE, ImuEstimate
 
-# Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
-ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = 50.0, 0.5, 0.1, 0.02
-# Given biases: axes up to 2 % askew (a consumer device's data sheet) show as much of gravity as one more: two sigma.
-# A bias that is given was measured over minutes; one second that looks like standing may be a slow turn.
-GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, STANDING_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-4, 2e-3, 0.3
-# A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
-MOST_BIAS_ERROR = 0.03
-# A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second, and how far registration moves it (m).
-STILL_RATE, STILL_FORCE, STILL_MOVE = 0.02, 0.3, 0.05
-# What gravity may be off beyond what a bias explains, m/s2.
-LEVEL_SIGMA = 0.3
+# Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn, to which misaligned axes add.
+ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = FASTEST_M_S / OUTLIER_SIGMAS, 0.5, 0.1, 0.02
+# A given bias of forces is known to what askew axes show of gravity, one of rates, measured over minutes, to the least noise
+# of a second. One second that looks like standing may be a slow turn.
+GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, STANDING_GYRO_BIAS, GIVEN_SPEED = AXES_SIGMA * GRAVITY, RATE_NOISE, 2e-3, 0.3
+# A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second. By as much swings leave gravity off.
+STILL_RATE, STILL_FORCE = 0.02, 0.3
 # The speed at the first scan is read off so many seconds: longer, and errors of the force add up.
 SPEED_S = 0.8
 # Gravity is read off so many seconds: shorter, and swings of the sensor take its place.
 GRAVITY_S = 3.0
-# Forces of the wrong sign miss the path so many times farther; of the right one, never farther where anything accelerates.
-WRONG_WAY = 2.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +146,7 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bia
 
     Where the sensor stood, the path is what registration errs by, and tells nothing of the IMU.
     """
-    if _farthest(part.poses) < STILL_MOVE:
+    if _farthest(part.poses) < STILL_M:
         return
     bias, none = np.zeros(3) if gyro_bias is None else gyro_bias, np.zeros(3)
     guess = ImuEstimate(none, none, none, Gyroscope.of_bias(bias, MEAN_GYRO_BIAS), np.eye(9))
@@ -160,7 +156,8 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bia
         )[2]
         for sign in (1.0, -1.0)
     )
-    if as_given > WRONG_WAY * reversed_:
+    # Forces of the right sign miss the path farther nowhere where anything accelerates.
+    if as_given > WORSE * reversed_:
         raise ImuRefusedError(
             "its specific forces fit the path of the scans when they point the other way",
             "at rest they must be +g up, change the sign of its accelerometer",
@@ -172,7 +169,7 @@ def _without_wrong_bias(config: ImuConfig, scan_bias: Floats | None, problems: l
     if config.gyro_bias is None or scan_bias is None:
         return config
     off = float(np.abs(np.array(config.gyro_bias) - scan_bias).max())
-    if off < MOST_BIAS_ERROR:
+    if off < OUTLIER_SIGMAS * MEAN_GYRO_BIAS:
         return config
     problems.append(
         f"imu.gyro_bias {config.gyro_bias} and imu.accel_bias are not used, they are estimated: the scans show a rate bias "
@@ -183,7 +180,7 @@ def _without_wrong_bias(config: ImuConfig, scan_bias: Floats | None, problems: l
 
 def _bias_sigma(bias: Floats, device: Gyroscope) -> float:
     """Sigma of a given bias (3,), rad/s: its difference from that of the `device`, estimated with a weak prior."""
-    beyond = np.abs(bias - device.bias) - 3 * np.sqrt(np.diag(device.covariance)[:3])
+    beyond = np.abs(bias - device.bias) - OUTLIER_SIGMAS * np.sqrt(np.diag(device.covariance)[:3])
     return max(float(beyond.max()), GIVEN_GYRO_BIAS)
 
 
@@ -198,13 +195,13 @@ def _first_guess(
         gyro_bias, gyro_sigma = rates, STANDING_GYRO_BIAS
     accel_bias, accel_sigma = np.zeros(3), ANY_ACCEL_BIAS
     if config.gyro_bias is not None:
-        gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR
+        gyro_bias, gyro_sigma = np.array(config.gyro_bias), MEAN_GYRO_BIAS
     if config.accel_bias is not None:
         accel_bias, accel_sigma = np.array(config.accel_bias), GIVEN_ACCEL_BIAS
     # At first only the difference of force and gravity is observable: a bias tilts the vertical.
     R, shared = T_lidar_imu[:3, :3], accel_sigma**2
     covariance = np.zeros((9, 9))
-    np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))
+    np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, STILL_FORCE**2 + shared, shared], 3))
     covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
     gyroscope = Gyroscope.of_bias(gyro_bias, gyro_sigma, ImuNoise.of(config))
     guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyroscope, covariance)
@@ -221,7 +218,7 @@ def _is_stationary(imu: ImuStream, stamps_ns: Longs, poses: Floats) -> tuple[boo
         return False, np.zeros(3)
     moved = _farthest(poses[within])
     varies = float(np.std(imu.gyro[i:j], axis=0).max()), float(np.std(imu.accel[i:j], axis=0).max())
-    return moved < STILL_MOVE and varies[0] < STILL_RATE and varies[1] < STILL_FORCE, imu.gyro[i:j].mean(axis=0)
+    return moved < STILL_M and varies[0] < STILL_RATE and varies[1] < STILL_FORCE, imu.gyro[i:j].mean(axis=0)
 
 
 def _farthest(poses: Floats) -> float:

@@ -12,8 +12,9 @@ import numpy as np
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
+from lslam.core.types.imu import GRAVITY
 from lslam.odometry.inertial.gyroscope import MOUNTING, OFFSET_WALK, OUTLIER, USUAL_NOISE, Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
 

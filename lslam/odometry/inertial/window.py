@@ -14,10 +14,10 @@ from lslam.core.geometry import se3, so3
 from lslam.core.geometry.normal_equations import Normal
 from lslam.core.kernels import linalg
 from lslam.core.types.arrays import Floats
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_estimate import GRAVITY, GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.integrate import integrate
 from lslam.odometry.inertial.navigation_state import (
     GYRO,

@@ -9,9 +9,10 @@ import numpy as np
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.imu import GRAVITY
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import MotionCheck, ScanResult
+from lslam.core.types.scan_result import STILL_M, MotionCheck, ScanResult
 from lslam.core.types.state import Stateful
 from lslam.odometry.integrity.directions import emptied, filled_directions
 from lslam.odometry.integrity.pair_registration import PairRegistration, best_of, is_near, is_within, median_range
@@ -22,16 +23,11 @@ from lslam.registration.robust import UsualAgreement
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
 LAG_S, REACH_SHARE = 0.45, 0.75
-# Points that make the planes of the first scan, and of the last scan those that are laid on them.
-PLANE_POINTS, LAID_POINTS = 5000, 1200
-# m, of a point at `LEVER_M`: poses that move by less state no motion, which is tested against a motion of metres.
-STILL_M = 0.05
-# Another motion than the one found from the claim must explain so many times more points.
-MORE = 1.1
-# m/s2; a vehicle comes to rest no faster, its tyres do not hold.
-MOST_BRAKING = 10.0
-# s; a longer pause between two scans is a break.
-PAUSE_S = 1.0
+# s; no motion is extrapolated over longer, and a longer pause between two scans is a break.
+MAX_EXTRAPOLATION_S = 3 * LAG_S
+# Points that make the planes of the first scan, as many as are registered, and of the last scan those that are laid on them.
+PLANE_POINTS = (PreprocessConfig().source_points_min + PreprocessConfig().source_points_max) // 2
+LAID_POINTS = 1200
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ class IntegrityMonitor(Stateful):
         stamp_ns, is_ok = result.stamp_ns, result.status == "ok"
         step_s = (stamp_ns - self._last_ns) * 1e-9
         self._last_ns = stamp_ns
-        self._is_broken |= (position > 0 and step_s > PAUSE_S) or not is_ok
+        self._is_broken |= (position > 0 and step_s > MAX_EXTRAPOLATION_S) or not is_ok
         if scan is None or not is_ok or not self._is_due(position, scan, result, step_s):
             return
         now = self._view(position, scan, prepared, result, sweep)
@@ -126,7 +122,7 @@ class IntegrityMonitor(Stateful):
 
     def _expected(self, seconds: float) -> Floats | None:
         """The motion (4, 4) over so many seconds if it goes on as before; None where nobody knows."""
-        if self._motion is None or seconds > 3 * LAG_S:
+        if self._motion is None or seconds > MAX_EXTRAPOLATION_S:
             return None
         motion, before = self._motion
         return np.asarray(se3.exp(seconds / before * se3.log(motion)))
@@ -155,17 +151,18 @@ class IntegrityMonitor(Stateful):
         near_claim = pair.near(claimed)
         hypotheses = [near_claim]
         is_odd = is_still(claimed) or self._usual.is_less(near_claim.agreement)
-        if not is_still(claimed) and (self._may_stand or self._speed < MOST_BRAKING * seconds):
-            hypotheses.append(pair.at_rest())
+        # No vehicle comes to rest faster than by gravity, or its tyres do not hold.
+        if not is_still(claimed) and (self._may_stand or self._speed < GRAVITY * seconds):
+            hypotheses.append(pair.at(np.eye(4)))
         if self._motion is None:
             hypotheses.append(pair.far(np.eye(4)))
         elif (expected := self._expected(seconds)) is not None:
             change = float(np.linalg.norm(expected[:3, 3] - claimed[:3, 3])) / seconds**2
-            if (is_odd or change > MOST_BRAKING) and not is_near(near_claim.motion, expected):
+            if (is_odd or change > GRAVITY) and not is_near(near_claim.motion, expected):
                 hypotheses.append(pair.near(expected))
         if is_odd and (is_still(claimed) or self._usual.is_less(max(h.agreement for h in hypotheses))):
             hypotheses.append(pair.far(claimed))
-        best, rival = best_of(hypotheses, MORE)
+        best, rival = best_of(hypotheses)
         if best.sigma is None:
             return
         usual = self._usual.usual

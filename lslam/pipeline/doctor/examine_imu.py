@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.core.types.arrays import Floats
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.sequence import Sequence, no_shared_time
-from lslam.odometry.inertial.imu_cleaning import GRAVITY, LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
+from lslam.odometry.inertial.imu_cleaning import LEAST_RATE_HZ, gravity_unit, is_slow, mean_forces, rate_of
 from lslam.odometry.inertial.initialise import STILL_FORCE, STILL_RATE
 from lslam.pipeline.doctor import Facts, Finding, plural
 

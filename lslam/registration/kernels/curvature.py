@@ -14,8 +14,11 @@ from lslam.core.kernels.jit import kernel
 SIDE = 5  # neighbours on each side
 EDGE, LESS_EDGE, NEITHER, LESS_PLANE, PLANE = 2, 1, 0, -1, -2
 
-_BINS = 400
+# Coarser than any spinning LiDAR: neighbours farther apart do not lie on one surface.
+WIDEST_STEP = np.radians(2.0)
+# A histogram of steps reaches twice as far.
 _BIN = np.radians(0.01)
+_BINS = round(2 * WIDEST_STEP / _BIN)
 
 
 @kernel

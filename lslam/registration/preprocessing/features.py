@@ -13,17 +13,17 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import so3
+from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import curvature
+from lslam.registration.kernels.curvature import WIDEST_STEP
 from lslam.registration.preprocessing.ground import Z
 from lslam.registration.preprocessing.prepare import gate_points
 from lslam.registration.preprocessing.up import NEAR_Z
 
 # What a point is allowed to become: an edge, a less planar point, a planar one (which is less planar as well).
 MAY_BE_EDGE, MAY_BE_FLAT, MAY_BE_PLANE = 1, 2, 4
-# Coarser than any spinning LiDAR: neighbours farther apart do not lie on one surface.
-WIDEST_STEP = np.radians(2.0)
 # A beam that turns back more often than this is not given in the order it was fired.
 _MANY_TURNS = 0.1
 # A beam of which less of its way about the axis is progress does not spin: it sweeps to and fro.
@@ -31,9 +31,7 @@ _SPINS = 0.5
 # Neighbours farther apart than this many steps have missing returns between them: one lost return is bridged.
 _GAP_STEPS = 2.5
 # m; grid of the points that are no feature: they only tell what stands where.
-_NEITHER_GRID = 0.2
-# A plane's curvature is within this many standard deviations of noise.
-_PLANE_NOISE = 2.0
+_NEITHER_GRID = LoamConfig().grid_step
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def features_along(
         curved, bend, walk.ranges, breaks, both[walk.order], walk.starts, config.regions,
         (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
         config.edge_curvature * walk.step, config.planar_curvature * walk.step,
-        config.edge_noise * noise, _PLANE_NOISE * noise,
+        config.edge_noise * noise, SIGNIFICANT_SIGMAS * noise,
     )  # fmt: skip
     return gather_features(scan, walk, labels, config.grid_step)
 

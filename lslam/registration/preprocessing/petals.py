@@ -9,12 +9,13 @@ import numpy as np
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
+from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import curvature, petals
+from lslam.registration.kernels.curvature import WIDEST_STEP
 from lslam.registration.preprocessing.features import (
     MAY_BE_EDGE,
-    WIDEST_STEP,
     Features,
     RingWalk,
     curvature_noise,
@@ -36,8 +37,6 @@ _CONTRAST = 1.0 / 3.0
 _SHORTER = (petals.SIDE * (petals.SIDE + 1) / (2 * petals.SIDE + 1)) / (
     curvature.SIDE * (curvature.SIDE + 1) / (2 * curvature.SIDE + 1)
 )
-# A plane's curvature is within this many standard deviations of noise.
-_PLANE_NOISE = 2.0
 
 
 def petal_features(scan: Scan, config: LoamConfig | None = None, gate: PreprocessConfig | None = None) -> Features:
@@ -62,7 +61,7 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
     limits, usual = (config.max_edge_points, config.max_less_edge_points), _SHORTER * walk.step
     labels = curvature.pick(
         curved, bend, walk.ranges, breaks, allowed, walk.starts, 1, (*limits, config.max_planar_points),
-        config.edge_curvature * usual, config.planar_curvature * usual, config.edge_noise * noise, _PLANE_NOISE * noise,
+        config.edge_curvature * usual, config.planar_curvature * usual, config.edge_noise * noise, SIGNIFICANT_SIGMAS * noise,
     )  # fmt: skip
     if len(brightness):
         allowed.fill(MAY_BE_EDGE)

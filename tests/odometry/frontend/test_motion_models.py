@@ -12,13 +12,13 @@ import pytest
 from lslam.core.config import Config, load_config
 from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.core.geometry import so3
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.odometry import METHODS
 from lslam.odometry.frontend.inertial_start import mounting_problem
 from lslam.odometry.frontend.motion_models import motion_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import AXES_SIGMA, Gyroscope
-from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.pipeline.check import check_config
 

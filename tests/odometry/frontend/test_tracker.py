@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan, Span
 from lslam.core.types.scan_result import ScanResult
@@ -18,7 +18,7 @@ from lslam.odometry.base import Traits
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import Gyroscope
-from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.scan_outcome import recorded
 from lslam.registration.result import RegistrationResult
 

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.odometry.inertial.fusion import InertialMotion
-from lslam.odometry.inertial.imu_estimate import GRAVITY
 from lslam.odometry.inertial.initialise import FirstPoses, start
 from lslam.simulation.scenarios import SimulatedDrive
 
@@ -190,7 +189,7 @@ def test_wrong_extrinsics_are_refused_during_the_run() -> None:
 
 
 @pytest.mark.parametrize("velocity", ["registration", "along-x", "integrated"])
-def test_an_imu_is_refused_after_thirty_scans_by_prior_errors(velocity: str) -> None:
+def test_an_imu_is_refused_after_twenty_scans_by_prior_errors(velocity: str) -> None:
     """Not by fewer; constant velocity has something to say from the third on. Another rule is the user's wish."""
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
@@ -198,7 +197,7 @@ def test_an_imu_is_refused_after_thirty_scans_by_prior_errors(velocity: str) -> 
     for stamp, pose in zip(*truth_of(drive), strict=True):
         motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))
         refused.append(bool(motion.refusal))
-    assert (refused.index(True) if any(refused) else None) == (31 if velocity == "registration" else None)
+    assert (refused.index(True) if any(refused) else None) == (21 if velocity == "registration" else None)
 
 
 def test_one_scan_in_twenty_is_compared_with_constant_velocity_unless_in_a_gap() -> None:

@@ -9,10 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.config import load_config
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_cleaning import clean
-from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.navigation_state import PLACE, SPEED, TURN, NavigationState
 from lslam.odometry.inertial.saturation import with_hidden
 from lslam.pipeline.run import run

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from lslam.backend.graph.inertial_smoother import InertialSmoother
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
-from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.initialise import FirstPoses, start
 from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
 from lslam.registration.result import RegistrationResult

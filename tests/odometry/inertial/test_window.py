@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linalg
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
-from lslam.odometry.inertial.imu_estimate import GRAVITY, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA, SIZE, NavigationState
 from lslam.odometry.inertial.window import (
     EACH,
