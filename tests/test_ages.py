@@ -136,6 +136,21 @@ def test_a_mark_comes_and_goes_with_the_age_and_names_the_commit_and_the_modules
     assert page.read_text() == FILES["docs/results.md"]
 
 
+def test_a_table_of_which_nothing_is_kept_is_marked_and_one_made_by_hand_is_kept(house: Path) -> None:
+    page, kept = house / "docs" / "results.md", Ages(house)
+    kept.keep({})
+    subprocess.run(["git", "init", "-q"], cwd=house, check=True)
+    who = ("-c", "user.name=A", "-c", "user.email=a@b")
+    subprocess.run(["git", *who, "commit", "-q", "--allow-empty", "-m", "Begin"], cwd=house, check=True)
+    assert kept.mark() == ["a"]
+    ages.main(["--made", "a"], root=house)
+    assert Ages(house).mark() == ["a"]
+    assert page.read_text() == FILES["docs/results.md"]
+    assert Ages(house).entries()["a"].unused == []
+    with pytest.raises(SystemExit, match="no document has a table b"):
+        ages.main(["--made", "b"], root=house)
+
+
 def test_cheap_tables_are_renewed_first_and_none_that_costs_too_much(
     house: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

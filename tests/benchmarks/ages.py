@@ -3,10 +3,12 @@
     python tests/benchmarks/ages.py --stale [-v]
     python tests/benchmarks/ages.py --mark
     python tests/benchmarks/ages.py --rerun [TABLE ...] [--budget MINUTES] [--recordings FOLDER]
+    python tests/benchmarks/ages.py --made TABLE
 
 `--stale` lists the tables whose code has changed, and its modules (all of them with `-v`). `--mark` says so below their
 captions, and takes the mark away where code is again what was measured. `--rerun` makes them anew, cheapest first, as long as
 the next one fits into what is left of the budget of CPU time; one whose cost nobody knows is stopped where the budget ends.
+`--made` says that a table was now written by hand, as those of campaigns are.
 """
 
 from __future__ import annotations
@@ -95,17 +97,18 @@ class Ages:
         lines = [f"{json.dumps(name)}: {json.dumps(asdict(entry))}" for name, entry in sorted(entries.items())]
         self.file.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
-    def stamp(self, name: str, command: str, page: Path) -> None:
+    def stamp(self, name: str, command: str, page: Path, is_by_hand: bool = False) -> None:
         """Keep the digest of a table that was written now; code that changed since the start is none that was measured."""
         if page.resolve() not in [path.resolve() for path in self.pages()]:
             return
-        unused = self.code.unused(command, sys.modules)
+        unused = [] if is_by_hand else self.code.unused(command, sys.modules)
         reach = self.code.reach(command, unused)
         later = [name for name, path in reach.items() if path.stat().st_mtime > STARTED_S]
         if later:
             print(f"changed while the table was made: {', '.join(later)}", file=sys.stderr)
         digest = "unknown" if later else self.code.digest(command, unused)
-        cost_s = round(sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN)), 1)
+        spent_s = round(sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN)), 1)
+        cost_s = None if is_by_hand else spent_s
         self.keep(self.entries() | {name: Entry(digest, self.git("rev-parse", "--short=8", "HEAD"), cost_s, unused)})
 
     def stale(self) -> dict[str, Table]:
@@ -126,11 +129,13 @@ class Ages:
         done = subprocess.run(["git", "-C", str(self.root), *words], capture_output=True, text=True, check=False)
         return done.stdout.strip() if done.returncode == 0 else ""
 
-    def since(self, entry: Entry) -> str:
+    def since(self, entry: Entry | None) -> str:
         """The commit on which a table was measured; if no history has it, as after a rebase, the one that brought the digest."""
-        if self.git("merge-base", entry.commit, "HEAD").startswith(entry.commit or "-"):
-            return entry.commit
-        brought = self.git("log", "--format=%h", "--abbrev=8", f"-S{entry.digest}", "--", str(self.file))
+        brought = ""
+        if entry is not None:
+            if self.git("merge-base", entry.commit, "HEAD").startswith(entry.commit or "-"):
+                return entry.commit
+            brought = self.git("log", "--format=%h", "--abbrev=8", f"-S{entry.digest}", "--", str(self.file))
         return (brought or self.git("rev-parse", "--short=8", "HEAD")).splitlines()[-1][:8]
 
     def mark(self) -> list[str]:
@@ -144,7 +149,7 @@ class Ages:
                 changed.append(name)
                 caption = MARK.sub("", caption)
                 if name in stale:
-                    caption += f"\nMeasured before the changes since {self.since(entries[name])}."
+                    caption += f"\nMeasured before the changes since {self.since(entries.get(name))}."
             return f"{head}{caption}{rest}"
 
         for page in self.pages():
@@ -240,6 +245,7 @@ def main(arguments_given: list[str] | None = None, **given: Any) -> None:
     what.add_argument("--stale", action="store_true")
     what.add_argument("--mark", action="store_true")
     what.add_argument("--rerun", nargs="*", metavar="TABLE")
+    what.add_argument("--made", metavar="TABLE")
     parser.add_argument("-v", "--verbose", action="store_true")
     parser.add_argument("--budget", type=float, default=30.0, metavar="MINUTES", help="of CPU time; 30")
     parser.add_argument("--recordings", type=Path, metavar="FOLDER", help="of unpacked recordings")
@@ -247,6 +253,9 @@ def main(arguments_given: list[str] | None = None, **given: Any) -> None:
     ages = Ages(**given)
     if args.stale:
         show_stale(ages, args.verbose)
+    elif args.made:
+        table = ages.tables().get(args.made) or sys.exit(f"no document has a table {args.made}")
+        ages.stamp(table.name, table.command, table.page, is_by_hand=True)
     elif args.mark:
         print(*ages.mark(), sep="\n")
     else:

@@ -141,6 +141,16 @@ def test_extrinsics_a_reader_assumed_do_not_become_facts(distorted: Sequence, tm
     assert back.calibration.T_lidar_imu is None
 
 
+def test_frames_of_the_robot_go_with_a_recording(tmp_path: Path) -> None:
+    T_lidar_base = se3.exp(np.array([-1.0, 0.5, -1.7, 0.1, 0.0, 0.3]))
+    source = sample(2)
+    source.calibration = replace(source.calibration, frames={"base_link": T_lidar_base})
+    bag = open_sequence(convert_sequence(source, "mcap", tmp_path / "a.mcap").path)
+    for back in (bag, open_sequence(convert_sequence(bag, "kitti", tmp_path / "k").path)):
+        np.testing.assert_allclose(back.calibration.T_lidar("base_link"), T_lidar_base, atol=1e-12)
+        assert back.calibration.frames.keys() == {"base_link"}
+
+
 def exact_points(drive: SimulatedDrive, scan: Scan) -> np.ndarray:
     """Every point where the exact motion has it at the scan's stamp."""
     assert scan.times is not None
