@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import re
 import shlex
@@ -27,7 +28,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
+from resource import RLIMIT_CPU, RUSAGE_CHILDREN, RUSAGE_SELF, getrusage, setrlimit
 from typing import Any
 
 from code_digest import ROOT, Code, parse
@@ -195,18 +196,22 @@ def arguments(command: str, scratch: str, recordings: Path | None) -> list[str] 
     return words
 
 
-def run(words: list[str], root: Path, seconds: float | None) -> str:
-    """How a command ended that is not '': stopped, with all its children, after so many seconds, or failed."""
+def run(words: list[str], root: Path, most_s: float) -> str:
+    """How a command ended that is not '': with so many seconds of CPU in one process it is stopped."""
     # The package below root, whichever is installed.
     environment = {**os.environ, "PYTHONPATH": str(root)}
-    process = subprocess.Popen([sys.executable, *words], cwd=root, env=environment, start_new_session=True)
-    try:
-        code = process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        return f"stopped after {seconds:.0f} s"
-    return f"failed with {code}" if code else ""
+    limit = math.ceil(most_s)
+    code = subprocess.run(
+        [sys.executable, *words], cwd=root, env=environment, check=False,
+        preexec_fn=lambda: setrlimit(RLIMIT_CPU, (limit, limit)),
+    ).returncode  # fmt: skip
+    return (
+        f"stopped after {limit} s"
+        if code in (-signal.SIGXCPU, -signal.SIGKILL)
+        else f"failed with {code}"
+        if code
+        else ""
+    )
 
 
 def rerun(ages: Ages, names: list[str], budget_min: float, recordings: Path | None) -> None:
@@ -220,7 +225,7 @@ def rerun(ages: Ages, names: list[str], budget_min: float, recordings: Path | No
                 continue
             before = sum(getrusage(RUSAGE_CHILDREN)[:2])
             page = table.page.relative_to(ages.root)
-            ended = run([*words, "--write", str(page)], ages.root, left_s if cost_s is None else None)
+            ended = run([*words, "--write", str(page)], ages.root, left_s)
             spent_s = sum(getrusage(RUSAGE_CHILDREN)[:2]) - before
             left_s -= spent_s
             print(f"{table.name}: {ended or 'renewed'}, {spent_s:.0f} s of CPU", flush=True)

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import tables
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "osm"))
 
 from wrong_maps import DRAWN, MODES, OFF, SHIFT, on
