@@ -15,6 +15,7 @@ from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.odometry_constraints import fitness_covariance
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.submaps import submap_labels
 from lslam.backend.outcome import Given
 from lslam.core.config import Config
 from lslam.core.config.odometry import RegistrationConfig
@@ -25,6 +26,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.core.types.scan_result import KeyframeClocks, StageClock
 from lslam.io.formats.osm_buildings import BuildingExtract
+from lslam.osm.classes import classify
 from lslam.osm.corrections import place_buildings
 from lslam.osm.matcher import Laid, accepted_part
 from lslam.osm.walls import OsmMap
@@ -95,10 +97,11 @@ def _match(
     at = se2.of_se3(pose)
     tilt = se2.to_se3(np.array([0.0, 0.0, -at[2]]))[:3, :3] @ pose[:3, :3]
     with clock.stage("walls"):
-        points, labels = store.points(number), store.labels(number)
+        points = store.points(number) @ tilt.T.astype(np.float32)
         if config.osm.labels:
-            points = points[table_of(config.osm.labels)[np.zeros(len(points), np.uint16) if labels is None else labels]]
-        seen = flatten_scan(points @ tilt.T.astype(np.float32), config.osm.wall_range)
+            labels = submap_labels(store, number, 1) if config.osm.needs_labels else classify(points)
+            points = points[table_of(config.osm.labels)[labels]]
+        seen = flatten_scan(points, config.osm.wall_range)
     with clock.stage("map match"):
         whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose

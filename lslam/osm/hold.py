@@ -50,7 +50,7 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
             "the buildings"
         )
         return None
-    if config.osm.labels and all(store.labels(k) is None for k in range(len(store))):
+    if config.osm.needs_labels and all(store.labels(k) is None for k in range(len(store))):
         problems.append(
             "OSM: osm.labels needs labels of points, and the keyframes have none: run the recording again with it; the run goes "
             "on without the buildings"

@@ -28,6 +28,7 @@ from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.core.types.constraint import Verdict
 from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
+from lslam.osm.classes import classify
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildings, match_keyframe, shares
@@ -288,7 +289,10 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
     cloud = submap(store, poses, number, size, T_world_frame=T_world_level)
     near = neighbours(len(store), number, size)
     views = se2.apply(se2.inverse(at), poses[near.start : near.stop, :2, 3])
-    is_wall = table_of(config.labels)[submap_labels(store, number, size)] if config.labels else None
+    is_wall = None
+    if config.labels:
+        labels = submap_labels(store, number, size) if config.needs_labels else classify(cloud)
+        is_wall = table_of(config.labels)[labels]
     return WallView(find_walls(cloud, config, views, is_wall).segments, views)
 
 

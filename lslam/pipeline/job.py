@@ -144,7 +144,7 @@ def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequ
     times do not fit, and when labels are needed and there are none.
     """
     dropped = config.preprocess.drop_labels
-    if dropped or (config.osm.labels and config.osm.extract):
+    if dropped or (config.osm.extract and config.osm.needs_labels):
         sequence = with_labels(sequence, "preprocess.drop_labels" if dropped else "osm.labels")
     sequence = with_point_times(sequence, config.preprocess)
     if odometry.needs_rings:

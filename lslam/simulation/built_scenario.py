@@ -40,7 +40,7 @@ from lslam.simulation.terrain import Terrain, rolling
 from lslam.simulation.town import build_town
 
 CORRIDOR_SPARE = 130.0  # m, so that no LiDAR here sees an end of the corridor
-SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.ROOF)
+SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLASS, Surface.PANE, Surface.ROOF)
 NAMES = {Surface.ROAD: "the ground", Surface.PAVEMENT: "the ground", Surface.LAWN: "the ground"}
 HALF_WIDTH = 0.7  # m on both sides of the path that must be free as well
 LOWEST = 0.3  # m above the ground

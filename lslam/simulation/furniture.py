@@ -133,7 +133,7 @@ def parked_car(rng: np.random.Generator) -> SceneMesh:
     size = np.array([length, height])
     builder = MeshBuilder()
     _extrude(builder, (_BODY - [0.5, 0]) * size, width / 2, Surface.CAR)
-    panes = Surface.CAR if cabin is _VAN else Surface.GLASS
+    panes = Surface.CAR if cabin is _VAN else Surface.PANE
     _extrude(builder, (cabin - [0.5, 0]) * size, width / 2 - 0.12, panes)
     roof = (cabin[1:3] - [0.5, 0]) * size
     low, high = [roof[0, 0], 0.14 - width / 2, roof[:, 1].min() - 0.08], [roof[1, 0], width / 2 - 0.14, height + 0.01]

@@ -15,7 +15,7 @@ from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.scan import Scan
 from lslam.simulation.lidar_models import LidarModel
 from lslam.simulation.returns import Errors, Hits, Rays, Returns, errors, mirrored, penetrate, range_walk, reflect
-from lslam.simulation.scene_mesh import RayScene, Surface
+from lslam.simulation.scene_mesh import RayScene, Surface, is_glass
 
 # Share of the light of a 905 nm laser that comes back from each surface met squarely.
 REFLECTIVITY = np.zeros(len(Surface), np.float32)
@@ -25,6 +25,7 @@ for _surface, _share in {
     Surface.LAWN: 0.45,
     Surface.WALL: 0.45,
     Surface.GLASS: 0.03,
+    Surface.PANE: 0.03,
     Surface.ROOF: 0.25,
     Surface.FOLIAGE: 0.45,
     Surface.TRUNK: 0.30,
@@ -44,6 +45,7 @@ for _surface, _name in {
     Surface.LAWN: "terrain",
     Surface.WALL: "building",
     Surface.GLASS: "building",
+    Surface.PANE: "car",
     Surface.ROOF: "building",
     Surface.FOLIAGE: "vegetation",
     Surface.TRUNK: "trunk",
@@ -55,7 +57,7 @@ for _surface, _name in {
     Surface.HEDGE: "vegetation",
 }.items():
     LABELS[0, _surface] = CLASSES[_name]
-LABELS[1, [Surface.CAR, Surface.GLASS, Surface.PERSON]] = [
+LABELS[1, [Surface.CAR, Surface.PANE, Surface.PERSON]] = [
     CLASSES[f"moving-{_name}"] for _name in ("car", "car", "person")
 ]
 # Light that a rough surface, its facets tilted by 0.6 rad, sends back where it came from: A cos + B sin^2 of the incidence
@@ -290,9 +292,7 @@ def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: Bools, return
         off = mirrored(returns, hits, meeting.scene.mesh.normals, meeting.rng)
     if len(lucky):
         lucky[off] = False
-    through = (
-        np.flatnonzero(lucky & (hits.surface == Surface.GLASS) & np.isfinite(hits.distance)) if len(lucky) else off[:0]
-    )
+    through = np.flatnonzero(lucky & is_glass(hits.surface) & np.isfinite(hits.distance)) if len(lucky) else off[:0]
     # A centimetre behind the pane or before it, so that it is not met again.
     start = np.concatenate([hits.distance[through] + np.float32(0.01), hits.distance[off] - np.float32(0.01)])
     onward = rays[through].after(start[: len(through)])

@@ -27,6 +27,7 @@ for _surface, _colour in {
     Surface.LAWN: (206, 220, 184),
     Surface.WALL: (182, 120, 96),
     Surface.GLASS: (120, 160, 176),
+    Surface.PANE: (124, 150, 170),
     Surface.ROOF: (168, 92, 74),
     Surface.FOLIAGE: (88, 136, 70),
     Surface.TRUNK: (104, 78, 54),

@@ -18,7 +18,7 @@ from lslam.core.config.section import Section
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Bools, Floats
 from lslam.simulation.lidar_models import LidarModel
-from lslam.simulation.scene_mesh import SceneMesh, Surface
+from lslam.simulation.scene_mesh import SceneMesh, Surface, is_glass
 
 Cast = Callable[[NDArray[np.float32], NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.int32]]]
 LAYERS = 8  # surfaces of volumes that a beam passes, at most
@@ -262,7 +262,7 @@ def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rn
 
 def mirrored(returns: Returns, hits: Hits, normals: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     """Which rays a pane of the static scene mirrors; `normals` (F, 3) of its faces."""
-    panes = np.flatnonzero((hits.surface == Surface.GLASS) & np.isfinite(hits.distance) & (hits.face >= 0))
+    panes = np.flatnonzero(is_glass(hits.surface) & np.isfinite(hits.distance) & (hits.face >= 0))
     share = returns.mirror + (1 - returns.mirror) * portable.power(1 - hits.cosine[panes], 5)
     lucky = rng.random(len(panes), np.float32) < share
     met = np.linalg.norm(normals[hits.face[panes]], axis=1) > 0
@@ -279,6 +279,6 @@ def reflect(rays: Rays, distance: Array, normals: Array) -> Rays:
 def _gain(returns: Returns, hits: Hits, distance: Array) -> Array:
     gain = portable.exp(np.float32(-2 * returns.attenuation) * distance)
     if returns.paint > 0:
-        shiny = np.flatnonzero((hits.surface == Surface.CAR) | (hits.surface == Surface.GLASS))
+        shiny = np.flatnonzero((hits.surface == Surface.CAR) | is_glass(hits.surface))
         gain[shiny] *= portable.power(hits.cosine[shiny], returns.paint)
     return np.asarray(gain, np.float32)

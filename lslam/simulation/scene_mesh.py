@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.geometry import portable
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Bools, Floats, Longs
 
 
 class Surface(IntEnum):
@@ -31,6 +31,12 @@ class Surface(IntEnum):
     PERSON = 11
     CROWN = 12  # of leaves that fill a volume; so is a hedge
     HEDGE = 13
+    PANE = 14  # glass of a vehicle
+
+
+def is_glass(surfaces: NDArray[np.uint8]) -> Bools:
+    """(N,) whether surfaces let light through, of houses or of vehicles."""
+    return np.asarray((surfaces == Surface.GLASS) | (surfaces == Surface.PANE))
 
 
 @dataclass(frozen=True)

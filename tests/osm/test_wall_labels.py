@@ -137,3 +137,13 @@ def test_classes_that_are_not_there_are_asked_for_in_vain(plain_run: RunOutcome,
     again = run(open_again(known), known.config, out=tmp_path / "again", earlier=known)
     assert again.record.osm is None
     assert "the keyframes have none" in manifest(tmp_path / "again")
+
+
+def test_geometry_tells_classes_where_there_are_no_labels(tmp_path: Path) -> None:
+    drive = sample_of(tmp_path / "drive", None)
+    settings = ("osm.labels=building", "osm.label_source=geometry")
+    found = lslam.run(drive, on_map(*settings), out=tmp_path / "run")
+    assert found.record.osm is not None
+    assert len(found.record.osm.accepted) >= 10
+    none = lslam.run(drive, on_map("osm.labels=car", "osm.label_source=geometry"), out=tmp_path / "cars")
+    assert none.record.osm is None or not none.record.osm.accepted

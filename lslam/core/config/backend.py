@@ -197,6 +197,11 @@ class OsmConfig(Section):
         description="classes of points of which walls are made, by name or number as preprocess.drop_labels; needs labels of "
         "points; empty: all that lies on vertical planes",
     )
+    label_source: Literal["recording", "geometry"] = Field(
+        "recording",
+        description="what tells the classes of `labels`: labels of the recording, or the geometry of submaps alone, which knows "
+        "other-ground, building, pole, vegetation and car",
+    )
     mode: Literal["prior", "rigid", "non-rigid", "two-level"] = Field(
         "two-level",
         description="prior: the map is true; rigid: it is off as a whole, as far as the start tells; non-rigid: each building is "
@@ -268,6 +273,11 @@ class OsmConfig(Section):
         if self.building_max_distance is not None:
             own["max_distance"] = self.building_max_distance
         return self.model_copy(update=own)
+
+    @property
+    def needs_labels(self) -> bool:
+        """Whether the recording has to have labels."""
+        return bool(self.labels) and self.label_source == "recording"
 
     @model_validator(mode="after")
     def _check(self) -> OsmConfig:
