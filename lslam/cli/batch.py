@@ -51,7 +51,7 @@ def command(jobs_file: Path, **given: Any) -> None:
     output = options.output_of(given, "batch")
     if not given["dry_run"]:
         require_free(output.out, BATCH, "batch", output.overwrite, output.resume)
-    expanded = _expanded(jobs_file, output, given)
+    expanded = _expand(jobs_file, output, given)
     if given["dry_run"]:
         _print_plan(expanded, given["as_json"])
         return
@@ -65,7 +65,7 @@ def command(jobs_file: Path, **given: Any) -> None:
     _judge(rows, given["strict"])
 
 
-def _expanded(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
+def _expand(path: Path, output: OutputOptions, given: dict[str, Any]) -> ExpandedStudy:
     if path != Path("-"):
         from lslam.core.config.config import check_settings
         from lslam.core.config.study import read_batch

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 
 class TimeLeft:
-    """Told when a step ends; `at_once` are made together, and one begins when another ends.
+    """Estimate of the remaining time; `at_once` steps are made together, and one begins when another ends.
 
-    A step that is under way counts for what the mean of those done leaves of it. Steps are taken for done in the order they
-    began: of two that change places the sum of their times is the same.
+    A running step counts with the mean duration less its elapsed time. Steps are taken to end in the order they began, since
+    a swap leaves the sum of their times unchanged.
     """
 
     def __init__(self, total: int, at_once: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
@@ -36,7 +36,7 @@ class TimeLeft:
         self._begun = [clock()] * self.at_once
 
     def step(self) -> None:
-        """One is done, and the next begins, where there is one."""
+        """Record the end of a step and the start of the next, if there is one."""
         now = self._clock()
         self._done += 1
         if self._begun:
@@ -46,12 +46,12 @@ class TimeLeft:
 
     @property
     def mean(self) -> float:
-        """s that one takes; nan before the first is done."""
+        """Mean duration of a step, s; nan before the first is done."""
         return self._took / self._done if self._done else float("nan")
 
     @property
     def seconds(self) -> float:
-        """s until all are done, when each of the others takes the mean; nan before the first is done.
+        """Remaining time of all steps, s, if the others take the mean; nan before the first is done.
 
         >>> now = [0.0]
         >>> left = TimeLeft(5, 2, lambda: now[0])
@@ -69,12 +69,12 @@ class TimeLeft:
 
     @property
     def pace(self) -> str:
-        """For people: how long one takes, and how many are made at once."""
+        """Text of the time per step, and of the number at once."""
         return f"{self.mean:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
 
     @property
     def text(self) -> str:
-        """For people; empty before the first is done."""
+        """Text of the remaining time; empty before the first step is done."""
         return f"about {lasting(self.seconds)} left" if self._done else ""
 
 
@@ -109,7 +109,7 @@ def terminal() -> Console:
 
 
 def show(text: str) -> None:
-    """Write results to stdout. When its reader has closed the pipe (`lslam ... | head`), the rest is discarded."""
+    """Write results to stdout. If its reader has closed the pipe (`lslam ... head`), discard the rest."""
     import click
 
     try:
@@ -127,7 +127,7 @@ class Advance(Protocol):
     """Callback after each unit of work; `note` is shown beside the bar."""
 
     def __call__(self, note: str = "") -> None:
-        """One unit is done."""
+        """Report that one unit is done."""
         ...
 
 
@@ -135,7 +135,7 @@ class Advance(Protocol):
 def progress(title: str, total: int, unit: str = "scans", left: TimeLeft | None = None) -> Iterator[Advance]:
     """A progress bar with rate and time left on a terminal; elsewhere a plain line at most every 10 s and one at the end.
 
-    left : tells the time of steps that are long or several at once, where rates of the last seconds say nothing
+    left : estimate for steps that are long or several at once, where recent rates are useless
     """
     # The first handler is that of stderr; that of log.txt follows.
     if log.handlers and log.handlers[0].level > logging.INFO:
@@ -186,17 +186,17 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[A
     from rich.text import Text
 
     class LeftColumn(ProgressColumn):
-        """Counts down between steps."""
+        """Column of the remaining time, which counts down between steps."""
 
         def render(self, task: Task) -> Text:
-            """What is left now."""
+            """Text of the remaining time."""
             return Text(left.text if left is not None else "", style="progress.remaining")
 
     class PaceColumn(ProgressColumn):
-        """Is cut where the terminal is narrow."""
+        """Column of the pace, cut off on a narrow terminal."""
 
         def render(self, task: Task) -> Text:
-            """The pace and what was done last."""
+            """Text of the pace and of the last step."""
             return Text(task.fields["rate"], no_wrap=True, overflow="ellipsis")
 
     whole = Column(no_wrap=True)
@@ -221,7 +221,7 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[A
 
 
 def bars(stack: ExitStack) -> StudyProgress:
-    """One progress bar after the other."""
+    """Progress bars of several stages, one after the other."""
     from lslam.studies.runner import StudyProgress
 
     bar = stack.enter_context(ExitStack())
@@ -259,7 +259,7 @@ class BestTable:
 
 @contextmanager
 def best_so_far() -> Iterator[BestTable]:
-    """A live table on a terminal; elsewhere it is not shown."""
+    """Live table of the best results on a terminal; nothing elsewhere."""
     table = BestTable()
     is_quiet = bool(log.handlers) and log.handlers[0].level > log.getEffectiveLevel()
     if is_quiet or not sys.stderr.isatty():

@@ -191,7 +191,7 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
 
 
 def _print(text: str, path: Path, kind: str, values: dict[str, Any], given: dict[str, Any]) -> None:
-    """What was written, as a line or with --json as one object."""
+    """Print the result, as a line or with --json as one object."""
     from lslam.cli.console import show
 
     show((json.dumps({"path": str(path), "format": kind, **values}) if given["as_json"] else text) + "\n")

@@ -14,7 +14,7 @@ _SHOWN = 8  # names of files
 
 
 def bag_lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Label and value of the bag as a whole."""
+    """Labels and values about the bag as a whole."""
     files = len(bag["files"])
     parts = [f"{files} file{'s' if files > 1 else ''}", _size(bag["size_bytes"]), f"{bag['messages']} messages"]
     if bag["duration_s"] is not None:
@@ -27,7 +27,7 @@ def bag_lines(bag: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def topic_lines(bag: dict[str, Any]) -> Iterator[str]:
-    """A line per topic: name, type, messages, rate, and what it is used for."""
+    """A line per topic: name, type, messages, rate, and purpose."""
     topics = bag["topics"]
     if not topics:
         yield "none"
@@ -44,7 +44,7 @@ def topic_lines(bag: dict[str, Any]) -> Iterator[str]:
 
 
 def _size(count: int) -> str:
-    """Bytes for people.
+    """Size in bytes as text.
 
     >>> _size(999), _size(1_250_000)
     ('999 bytes', '1.2 MB')
@@ -130,7 +130,7 @@ def _show_topics(bag: dict[str, Any]) -> None:
 
 
 def _show_bag(name: str, data_root: Path | None, error: str | None) -> None:
-    """What is in a bag that is no sequence: as JSON with the `error`, as a page without one; nothing where there is no bag."""
+    """Show the content of a bag that is no sequence, as JSON with the `error` or as a page; nothing if there is no bag."""
     from lslam.core.errors import LslamError
     from lslam.io.readers.lookup import find_folder
 
@@ -198,6 +198,7 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _looked_at(points: dict[str, Any]) -> str:
+    """Number of scans read, with those unreadable or empty."""
     extra = [f"{points[key]} {word}" for key, word in (("scans_unreadable", "unreadable"), ("scans_empty", "empty"))
              if points[key]]  # fmt: skip
     return f"{points['scans_read'] + points['scans_unreadable']}" + (f" ({', '.join(extra)})" if extra else "")

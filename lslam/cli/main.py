@@ -56,7 +56,7 @@ class PipeContext(click.Context):
     """A context for which a closed pipe behind stdout (`lslam ... | head`) is no error; click exits with 1."""
 
     def __exit__(self, *error: Any) -> bool | None:
-        """As click does, but what a closed pipe ends has ended well."""
+        """Exit as click does, but treat a closed pipe as success."""
         super().__exit__(*error)
         if not isinstance(error[1], BrokenPipeError):
             return None
@@ -72,7 +72,7 @@ class LazyGroup(click.Group):
     context_class = PipeContext
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Names in the order of the table."""
+        """Names of the commands in the order of the table."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -137,7 +137,7 @@ def main() -> NoReturn:
 
 @contextmanager
 def _exit_codes() -> Iterator[None]:
-    """An error in the block ends the process, with one sentence and its exit code."""
+    """Turn an error of the block into one sentence on stderr and an exit code."""
     try:
         yield
     except LslamError as error:

@@ -59,7 +59,7 @@ def compare_drives(target: Path, given: dict[str, Any]) -> None:
 
 
 def of_the_map(settings: Iterable[str]) -> list[str]:
-    """The settings of --set; raises UsageError for one that is none of the map, nor says which points it has."""
+    """Settings of --set. Raises UsageError for a key that neither belongs to the map nor selects points."""
     for setting in settings:
         if not setting.startswith(("map.", "preprocess.drop_labels=")):
             raise UsageError(f"--set {setting}: only keys of the map can be changed after the run")
@@ -281,7 +281,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
 
 
 def crispness_rows(score: Crispness) -> list[tuple[str, str]]:
-    """Rows of the table about a map's crispness."""
+    """Table rows of a map's entropy scores."""
     if score.entropy is None or score.plane_variance is None:
         return [("crispness", f"n/a: {score.recipe}")]
     return [

@@ -26,10 +26,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Place(click.Path):
-    """A path, or a URL of storage."""
+    """Parameter type: a path, or a URL of storage."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """As `as_path`."""
+        """Path of the value, as by `as_path`."""
         if isinstance(value, str) and "://" in value:
             return as_path(value)
         return super().convert(value, param, ctx)
@@ -82,13 +82,13 @@ dry_run = click.option("--dry-run", is_flag=True, help="Resolve everything, writ
 
 
 def verbosity(function: F) -> F:
-    """--verbose and --quiet."""
+    """Decorator that adds --verbose and --quiet."""
     function = click.option("-v", "--verbose", is_flag=True, help="Log debugging messages on stderr.")(function)
     return click.option("-q", "--quiet", is_flag=True, help="Only warnings and errors on stderr.")(function)
 
 
 def scan_range(function: F) -> F:
-    """--start, --count and --skip-frames."""
+    """Decorator that adds --start, --count and --skip-frames."""
     for name, text in (
         ("--skip-frames", "Use every N-th scan."),
         ("--count", "Number of scans used."),
@@ -99,7 +99,7 @@ def scan_range(function: F) -> F:
 
 
 def scan_ranges(function: F) -> F:
-    """--start, --count and --skip-frames, of all sequences or of one."""
+    """Decorator that adds --start, --count and --skip-frames, of all sequences or of one."""
     for name, text in (
         ("--skip-frames", "Use every N-th scan"),
         ("--count", "Number of scans used"),
@@ -112,7 +112,7 @@ def scan_ranges(function: F) -> F:
 
 
 def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], dict[str, ScanRange]]:
-    """The ranges that the options of `scan_ranges` set for all sequences, as --set takes them, and for single `words`.
+    """Ranges of scans set by the options of `scan_ranges`: settings for all sequences, and for single `words`.
 
     Raises UsageError for words that are no numbers or name no sequence, ConfigError for a number out of range.
     """
@@ -143,7 +143,7 @@ def ranges_of(given: dict[str, Any], words: Iterable[str]) -> tuple[list[str], d
 
 
 def reading(function: F) -> F:
-    """--lidar-topic, --lidar-frame, --imu-topic, --gnss-topic, --point-times and --extrinsics."""
+    """Decorator that adds --lidar-topic, --lidar-frame, --imu-topic, --gnss-topic, --point-times and --extrinsics."""
     function = click.option(
         "--extrinsics", metavar="T|FILE", help="The IMU in the LiDAR's frame: 12, 16 or 7 numbers, or a file with them."
     )(function)
@@ -172,7 +172,7 @@ def reading_of(given: dict[str, Any]) -> dict[str, Any]:
 
 
 def manual(function: F) -> F:
-    """--loops-file and --control."""
+    """Decorator that adds --loops-file and --control."""
     for name, text in (
         ("--control", "CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs."),
         (
@@ -185,7 +185,7 @@ def manual(function: F) -> F:
 
 
 def manual_settings(loops: Path | None, control: Path | None) -> dict[str, str | None]:
-    """Configuration keys of these files; absolute, so that the run's copy of them is found from anywhere."""
+    """Configuration keys of these files, as absolute paths, so that the run's copy of the configuration is valid anywhere."""
     return {
         key: None if path is None else json.dumps(str(path.absolute()), ensure_ascii=False)
         for key, path in (("loops.file", loops), ("graph.control", control))
@@ -193,7 +193,7 @@ def manual_settings(loops: Path | None, control: Path | None) -> dict[str, str |
 
 
 def configuration(function: F) -> F:
-    """--config and --set."""
+    """Decorator that adds --config and --set."""
     function = click.option(
         "--set",
         "settings",
@@ -211,12 +211,12 @@ def configuration(function: F) -> F:
 
 
 def with_preset(settings: Iterable[str], preset: str | None) -> list[str]:
-    """The settings of --set and of the flag --preset, which beats them."""
+    """Settings of --set, overridden by the flag --preset."""
     return [*settings, *([] if preset is None else [f"odometry.preset={json.dumps(preset)}"])]
 
 
 def coordinates(function: F) -> F:
-    """--crs and --geoid."""
+    """Decorator that adds --crs and --geoid."""
     for name, metavar, text in (
         ("--geoid", "GRID", "Heights above this geoid (.gtx, .tif) in place of the ellipsoid."),
         ("--crs", "EPSG:N[+M]", "Coordinates of georeferenced maps, +M of heights [default: control points', UTM]."),
@@ -226,7 +226,7 @@ def coordinates(function: F) -> F:
 
 
 def crs_settings(crs: str | None, geoid: str | None) -> dict[str, str | None]:
-    """Configuration keys of these flags; raises UsageError for what is no code."""
+    """Configuration keys of these flags. Raises UsageError for an invalid code."""
     from lslam.core.geometry.crs_names import parse_crs
 
     epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
@@ -239,13 +239,13 @@ def crs_settings(crs: str | None, geoid: str | None) -> dict[str, str | None]:
 
 
 def grid_file(geoid: str) -> str:
-    """A file by its absolute path; other names are those of PROJ's own grids."""
+    """Absolute path of an existing grid file; other names are those of PROJ's own grids."""
     path = Path(geoid).expanduser()
     return str(path.absolute()) if path.exists() else geoid
 
 
 def studied(function: F) -> F:
-    """--out, --resume, --overwrite and --scenes."""
+    """Decorator that adds --out, --resume, --overwrite and --scenes."""
     for name, metavar, text in (
         ("--scenes", "DIR", "Keep simulations here, for others of the same scenarios [default: simulated/ in --out]."),
         ("--out", "DIR", "Folder of all runs and results [default: runs/NAME-TIME]."),
@@ -260,7 +260,7 @@ def studied(function: F) -> F:
 
 
 def output_of(given: dict[str, Any], name: str) -> OutputOptions:
-    """Where runs go, as the options of `studied` say."""
+    """Output options of a study, from the options of `studied`."""
     from lslam.studies.output import OutputOptions
 
     out = given["out"] or Path("runs") / time.strftime(f"{name}-%Y%m%d-%H%M%S")
@@ -273,7 +273,7 @@ def output_of(given: dict[str, Any], name: str) -> OutputOptions:
 
 
 def engine(function: F) -> F:
-    """--jobs, --scheduler and --cluster."""
+    """Decorator that adds --jobs, --scheduler and --cluster."""
     for name, kind, metavar, text in (
         ("--cluster", str, "local:N", "Make the runs with N workers of Dask on this machine."),
         (
@@ -298,7 +298,7 @@ def check_engine(given: dict[str, Any]) -> None:
 
 @contextmanager
 def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> Iterator[Engine]:
-    """The engine that the options of `engine` choose, after `check_engine`.
+    """Engine chosen by the options of `engine`, after `check_engine`.
 
     is_persistent : whether workers keep sequences from one run to the next, and delete keyframes
     """
@@ -315,7 +315,7 @@ def engine_of(given: dict[str, Any], title: str, is_persistent: bool = True) -> 
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
-    """The numbers of --seeds, also of `100-104`; raises UsageError for other words."""
+    """Seeds in --seeds, also of a range `100-104`. Raises UsageError for anything but numbers."""
     seeds: list[int] = []
     try:
         for part in filter(str.strip, text.split(",")):
@@ -334,7 +334,7 @@ def require_there(*paths: Path | None) -> None:
 
 
 def metrics_of(texts: Iterable[str]) -> list[str]:
-    """The words of --metrics, separated by commas or in several options."""
+    """Words of --metrics, separated by commas or in several options."""
     return [word for text in texts for word in text.split(",") if word]
 
 

@@ -1,4 +1,4 @@
-"""Where the time of a run goes: the stacks of all threads, looked at every few milliseconds, as a file for speedscope."""
+"""Profile of a run: the stacks of all threads, sampled every few milliseconds, as a file for speedscope."""
 
 from __future__ import annotations
 
@@ -25,10 +25,9 @@ Frame = tuple[str, str, int]
 
 @contextmanager
 def profiled(path: Path | None) -> Iterator[None]:
-    """Write a profile of the block to `path`, however it ends; nothing when it is None.
+    """Write a profile of the block to `path`, also after an error; do nothing when it is None.
 
-    A kernel has no frame of its own: it is the line of Python that calls it. Raises OutputError when `path` cannot be
-    written.
+    Time in a kernel counts for the line of Python that calls it. Raises OutputError when `path` cannot be written.
     """
     if path is None:
         yield
@@ -44,7 +43,7 @@ def profiled(path: Path | None) -> Iterator[None]:
 
 
 class StackProfile:
-    """Stacks of every thread but its own, with the seconds spent in each."""
+    """Stacks of all other threads, with the seconds spent in each."""
 
     def __init__(self) -> None:
         self._thread = threading.Thread(target=copy_context().run, args=(self._look,), name="profile", daemon=True)
@@ -57,12 +56,12 @@ class StackProfile:
         self._seen: dict[int, list[list[Any]]] = {}
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start sampling."""
         self._began = time.perf_counter()
         self._thread.start()
 
     def stop(self) -> None:
-        """Look no more."""
+        """Stop sampling."""
         self._is_over.set()
         self._thread.join()
         self._ended = time.perf_counter()
@@ -90,7 +89,7 @@ class StackProfile:
         seen.append([number, before, now])
 
     def speedscope(self, name: str) -> dict[str, Any]:
-        """The content of a file that https://www.speedscope.app opens, a profile for each thread, the busiest first."""
+        """Content of a file for https://www.speedscope.app, a profile for each thread, the busiest first."""
         frames: dict[Frame, int] = {}
         stacks = [[frames.setdefault(f, len(frames)) for f in stack] for stack in self._stacks]
         length = self._ended - self._began
@@ -109,7 +108,7 @@ class StackProfile:
         }  # fmt: skip
 
     def _samples(self, seen: list[list[Any]], stacks: list[list[int]]) -> dict[str, Any]:
-        """Stacks and weights; where a thread was not, an empty stack."""
+        """Stacks and weights of a thread; an empty stack while it did not exist."""
         samples: list[list[int]] = []
         weights: list[float] = []
         at = self._began
@@ -125,7 +124,7 @@ class StackProfile:
 
 
 def stack_of(frame: FrameType | None) -> tuple[Frame, ...]:
-    """(name, file, line) of each frame, the outermost first; below the innermost, the line of source that it is at."""
+    """(name, file, line) of each frame, the outermost first; last comes the source line of the innermost."""
     stack: list[Frame] = []
     if frame is not None:
         # Between two lines a frame has no number.

@@ -107,7 +107,7 @@ def command(sequence: str, **given: Any) -> None:
 
 @contextmanager
 def arguments_of(out: Path, given: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The arguments of `lslam.pipeline.run.run` that the options describe, and the result printed, of a finished run too."""
+    """Context with the arguments of `lslam.pipeline.run.run`; prints the result of a run that is finished already."""
     from lslam.cli.profiling import profiled
 
     try:
@@ -123,7 +123,7 @@ def arguments_of(out: Path, given: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
-    """The sequence and the configuration that the options describe; raises the errors in them.
+    """Sequence and configuration that the options describe. Raises the errors in them.
 
     Cheap checks come first: words, then the configuration, then the sequence.
     """
@@ -145,12 +145,12 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
 
 
 def resolved(given: dict[str, Any]) -> Config:
-    """The configuration alone; raises the errors in it."""
+    """Configuration that the options describe. Raises the errors in it."""
     return _resolve(given, _flags(given))
 
 
 def _variant(config: Config) -> str:
-    """Method and sensors, for the name of the default folder."""
+    """Method and sensors as text, for the name of the default folder."""
     parts = {"-imu": config.imu.use, "-osm": config.osm.extract, "-in-map": config.localize.map}
     return config.odometry.method + "".join(word for word, is_used in parts.items() if is_used)
 
@@ -236,7 +236,7 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
 
 
 def watch_of(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
-    """Progress bars, and a stop after the current scan on a signal."""
+    """Watch with progress bars that stops the run after the current scan on a signal."""
     from lslam.pipeline.watch import Watch
 
     bar = stack.enter_context(ExitStack())

@@ -123,7 +123,7 @@ def _print(rows: list[StudyRow]) -> None:
 
 
 def _report(folder: Path) -> list[str]:
-    """Write the report; the sentences of its verdicts."""
+    """Write the report. Returns the sentences of its verdicts."""
     options.require_there(folder / "results.csv")
     from lslam.studies.sweep import report_folder
 

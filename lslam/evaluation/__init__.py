@@ -1,4 +1,4 @@
-"""How good a trajectory is; here, the words by which metrics are asked for, checked before anything heavy is imported."""
+"""Accuracy of trajectories; here, the names of metrics, checked before heavy imports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ UNIT_NAMES = {"scan": "scan", "scans": "scan", "m": "m", "s": "s", "": "scan"}
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Raise UsageError for a word of `eval.metrics` that shows no metric."""
+    """Raise UsageError for a word of `eval.metrics` that names no metric."""
     for word in words:
         if word not in WORDS:
             raise UsageError(f"no metrics {word!r}; {nearest(word, WORDS)}")

@@ -1,4 +1,4 @@
-"""ATE: how far the aligned estimate lies from the truth."""
+"""ATE: position and rotation errors of the aligned estimate against ground truth."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def absolute_error(estimate: Floats, truth: Floats, alignment: str, has_rotation
 
 
 def align(estimate: Floats, truth: Floats, alignment: str) -> tuple[Floats, float, str]:
-    """Transform (4, 4), scale, and a note that is not empty when the alignment is not determined."""
+    """Alignment as transform (4, 4) and scale, and a note that is not empty when the alignment is not determined."""
     if alignment not in ALIGNMENTS:
         raise UsageError(f"no alignment {alignment!r}; {nearest(alignment, ALIGNMENTS)}")
     p, q = estimate[:, :3, 3], truth[:, :3, 3]
@@ -84,7 +84,7 @@ def align(estimate: Floats, truth: Floats, alignment: str) -> tuple[Floats, floa
 
 
 def _position_and_yaw(p: Floats, q: Floats) -> tuple[Floats, float, str]:
-    """The four unknowns that gravity leaves open (Zhang and Scaramuzza 2018, section IV)."""
+    """Alignment by position and yaw, the four unknowns that gravity leaves open (Zhang and Scaramuzza 2018, section IV)."""
     a, b = p - p.mean(0), q - q.mean(0)
     sine = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
     cosine = float(np.sum(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))

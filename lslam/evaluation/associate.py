@@ -1,4 +1,4 @@
-"""Which pose of the estimate belongs to which pose of the ground truth."""
+"""Association: pairs of poses of the estimate and of the ground truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ AMBIGUOUS = 1.2
 
 @dataclass(frozen=True)
 class Matches:
-    """Matched poses: estimate (N, 4, 4), truth (N, 4, 4), stamps_ns (N,) on the truth's clock or the one that is known.
+    """Matched poses: estimate (N, 4, 4), truth (N, 4, 4), stamps_ns (N,) on the truth's clock, or on the only known one.
 
     seconds : (N,) s since the first match, None when neither file knows time; recipe : the rule, for people
     """
@@ -60,12 +60,12 @@ def associate(estimate: Trajectory, truth: Trajectory, max_diff: float = 0.01, o
     limit = round(max_diff * 1e9)
     stamps = estimate.stamps_ns + offset_ns
     if _is_denser(truth.stamps_ns, stamps):
-        matches = _interpolated(estimate, stamps, truth, limit)
+        matches = _interpolate(estimate, stamps, truth, limit)
     else:
         matches = _nearest(estimate, stamps, truth, limit)
         # Moved by part of a sweep, no stamp meets one of the truth.
         if offset_ns and len(matches.stamps_ns) < LEAST_OVERLAP * matches.possible:
-            between = _interpolated(estimate, stamps, truth, limit, "ground truth interpolated at the moved stamps")
+            between = _interpolate(estimate, stamps, truth, limit, "ground truth interpolated at the moved stamps")
             matches = max(between, matches, key=lambda m: len(m.stamps_ns))
     if len(matches.stamps_ns) < LEAST:
         raise InputError(_no_overlap(estimate, stamps, truth, len(matches.stamps_ns), max_diff))
@@ -132,7 +132,7 @@ def _nearest(estimate: Trajectory, stamps: Stamps, truth: Trajectory, limit: int
     )
 
 
-def _interpolated(
+def _interpolate(
     estimate: Trajectory,
     stamps: Stamps,
     truth: Trajectory,
@@ -158,7 +158,7 @@ def _interpolated(
 
 
 def _is_denser(truth: Stamps, estimate: Stamps) -> bool:
-    """Whether truth has clearly more poses per second than the estimate, and its stamps are not simply the same ones."""
+    """Whether truth has clearly more poses per second than the estimate, and other stamps."""
     if float(np.median(np.diff(truth))) >= DENSER * float(np.median(np.diff(estimate))):
         return False
     return not bool(np.isin(estimate, truth).all())
@@ -222,7 +222,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
 
 
 def _peaks(scores: Floats, lags: Longs) -> list[int]:
-    """Indices of the best scores that are neither poor nor neighbours of a better one, at most 20."""
+    """Indices of the at most 20 best scores that are not poor and not neighbours of a better one."""
     chosen: list[int] = []
     for k in np.argsort(-scores, kind="stable")[:2000].tolist():
         if scores[k] < LEAST_SCORE or len(chosen) == 20:
@@ -233,7 +233,7 @@ def _peaks(scores: Floats, lags: Longs) -> list[int]:
 
 
 def _step(estimate: Trajectory, truth: Trajectory) -> int:
-    """Sample distance, ns: the coarser of both, so that noise between dense poses averages out."""
+    """Sample distance, ns: the coarser of both, which averages out noise between dense poses."""
     slow = max(float(np.median(np.diff(t.stamps_ns))) for t in (estimate, truth))
     return int(np.clip(slow, 50_000_000, 1_000_000_000))
 
@@ -303,7 +303,7 @@ def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> t
 
 
 def _snap(estimate: Trajectory, truth: Trajectory, offset: int, step: int) -> int:
-    """The exact constant when both files carry the same stamps on two clocks."""
+    """Exact constant, ns, when both files have the same stamps on two clocks; else the offset as it is."""
     stamps = estimate.stamps_ns + offset
     i, j = nearest_one_to_one(stamps, truth.stamps_ns, step // 2)
     if len(i) < LEAST:

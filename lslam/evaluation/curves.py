@@ -1,4 +1,4 @@
-"""Rows of a study as curves, one per sequence, method, IMU and value of the second parameter; and laws over a parameter."""
+"""Curves of a study, one per sequence, method, IMU and value of the second parameter; and laws over a parameter."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ROUNDS = 5
 
 
 def two_sided(level: float, freedom: ArrayLike) -> Floats:
-    """Standard errors either way that hold the truth with confidence `level`, by Student's t of `freedom` degrees.
+    """Half width of the two-sided interval of confidence `level`, in standard errors, by Student's t of `freedom` degrees.
 
     As `scipy.stats.t.ppf`, whose import takes longer than the rest of a study's evaluation.
 
@@ -42,7 +42,7 @@ def two_sided(level: float, freedom: ArrayLike) -> Floats:
 
 
 def lost_above(rows: Sequence[StudyRow]) -> float:
-    """The error in m above which a run counts as lost: 10 times the best of all rows, and not below 2.2 m."""
+    """Error, m, above which a run counts as lost: 10 times the best of all rows, at least 2.2 m."""
     errors = [row.error for row in rows if row.is_usable and np.isfinite(row.error)]
     return max(LOST_FLOOR_M, LOST_FACTOR * min(errors, default=0.0))
 
@@ -164,10 +164,10 @@ def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
 
 
 def divergence(curve: Curve) -> Divergence:
-    """From which value on the curve is lost.
+    """Value from which on the curve is lost.
 
-    A value is lost when more than half of its runs are; the curve is lost from the first lost value above which, itself
-    counted, more than half of the values are. What is lost below stands alone: one unlucky value is not a divergence.
+    A value is lost when more than half of its runs are. The curve is lost from the first lost value from which on more than
+    half of the values are lost. So one unlucky value is not a divergence.
     """
     scored = curve.scored.any(1)
     values, bad = curve.values[scored], curve.is_lost[scored]
@@ -179,7 +179,7 @@ def divergence(curve: Curve) -> Divergence:
 
 
 def optimum(values: Floats, means: Floats, *, is_highest_best: bool = True) -> Optimum | None:
-    """The best value and its flat surroundings: all values next to it, without a gap, that are at most a tenth worse.
+    """Best value and its flat surroundings: the adjacent values whose mean is at most a tenth worse.
 
     means : (V,) above 0, nan or 0 where there is nothing; None when there is nothing at all
     """
@@ -198,9 +198,10 @@ def optimum(values: Floats, means: Floats, *, is_highest_best: bool = True) -> O
 
 
 def elbow(values: Floats, errors: Floats, is_lost: Bools) -> float | None:
-    """The value from which on the error lies on its plateau, None when it does not at the largest value.
+    """Value from which on the error is on its plateau, None when it is not even at the largest value.
 
-    The plateau is the median error of the upper half of the values, and reaches 1.5 times that high.
+    The plateau is the median error of the upper half of the values; errors up to 1.5 times that belong to it.
+
     errors : (V,) nan where unknown
     """
     known = np.isfinite(errors) | is_lost
@@ -216,9 +217,9 @@ def elbow(values: Floats, errors: Floats, is_lost: Bools) -> float | None:
 
 @dataclass(frozen=True)
 class Contrast:
-    """A ratio seed by seed: mean and standard deviation of its natural logarithm over `n` seeds that have both numbers.
+    """Ratio seed by seed: mean and standard deviation of its natural logarithm over `n` seeds that have both numbers.
 
-    With fewer than two seeds nothing is known of the scatter, so none of the questions is answered with yes.
+    With fewer than two seeds the scatter is unknown, so every test returns False.
     """
 
     mean: float
@@ -226,26 +227,26 @@ class Contrast:
     n: int
 
     def exceeds(self, ratio: float) -> bool:
-        """Whether it lies above `ratio` by more than the seeds scatter."""
+        """Whether the ratio is above `ratio` by more than the scatter over seeds."""
         return self.n > 1 and self.mean - self.std > log(ratio)
 
     def stays_below(self, ratio: float) -> bool:
-        """Whether it lies below `ratio` by more than the seeds scatter."""
+        """Whether the ratio is below `ratio` by more than the scatter over seeds."""
         return self.n > 1 and self.mean + self.std < log(ratio)
 
     @property
     def is_more(self) -> bool:
-        """Whether it is more by a tenth, and by more than the seeds scatter."""
+        """Whether the first is larger by a tenth, and by more than the scatter over seeds."""
         return self.exceeds(1) and self.mean > log(1 + FLAT)
 
     @property
     def is_no_more(self) -> bool:
-        """Whether it is less than a tenth more, scatter included."""
+        """Whether the first is larger by less than a tenth, scatter included."""
         return self.stays_below(1 + FLAT)
 
 
 def contrast(first: Floats, second: Floats) -> Contrast:
-    """`first` over `second`, (S,) each and above 0, nan where a seed has none.
+    """Contrast of `first` over `second`, (S,) each, positive, nan where a seed has none.
 
     >>> contrast(np.array([2.0, 2.2, 1.9]), np.ones(3)).is_more
     True
@@ -261,12 +262,12 @@ def contrast(first: Floats, second: Floats) -> Contrast:
 
 
 def errors_of(curve: Curve) -> Floats:
-    """(V, S) m, translation rmse of the runs that were not lost."""
+    """(V, S) translation rmse of the runs that were not lost, m; nan for the others."""
     return np.where(curve.lost, np.nan, curve.quantities["translation"])
 
 
 def plateau(curve: Curve, value: float) -> Floats:
-    """(S,) m, median error of each seed from a value on; nan where it has none."""
+    """(S,) median error of each seed from a value on, m; nan where it has none."""
     errors = errors_of(curve)[curve.values >= value]
     known = np.isfinite(errors).any(0)
     out = np.full(errors.shape[1], np.nan)
@@ -275,7 +276,7 @@ def plateau(curve: Curve, value: float) -> Floats:
 
 
 def rise_at(curve: Curve, index: int, level: Floats) -> Rise:
-    """Whether the error at a value is worse than a level (S,); a value at which most runs are lost is."""
+    """Whether the error at a value is worse than a level (S,), m; a value at which most runs are lost is worse."""
     if curve.is_lost[index]:
         return "worse"
     ratio = contrast(errors_of(curve)[index], level)
@@ -283,7 +284,7 @@ def rise_at(curve: Curve, index: int, level: Floats) -> Rise:
 
 
 def rise_below(curve: Curve, value: float) -> Rise:
-    """Whether the error below a value is worse than from there on: it takes one that is, or all that are as good."""
+    """Whether the error below a value is worse than from there on: `worse` if any value is, `as good` if all are."""
     below = np.flatnonzero((curve.values < value) & curve.scored.any(1))
     rises = {rise_at(curve, int(index), plateau(curve, value)) for index in below}
     return "worse" if "worse" in rises else "as good" if rises == {"as good"} else "unknown"
@@ -318,7 +319,7 @@ def fit_law(
     if len(np.unique(x, axis=0)) < FEWEST:
         return None
     columns = design(kind, x)
-    coefficients, weights = _fitted(columns, t, n)
+    coefficients, weights = _fit(columns, t, n)
     expected = columns @ coefficients
     freedom = len(t) - columns.shape[1]
     weighted = columns * weights[:, None]
@@ -330,14 +331,14 @@ def fit_law(
 
 
 def law_over(kind: LawKind, curve: Curve, times: Interval) -> Law | None:
-    """As `fit_law`, of the total times of a curve over its own parameter."""
+    """Law, as by `fit_law`, of the total times of a curve over its own parameter."""
     return fit_law(kind, (curve.parameter,), curve.values, times.mean, times.n.astype(np.float64), scatter=times.std)
 
 
 def rival(law: Law) -> tuple[str, float]:
-    """What else the times may follow, in letters, and the R2 of that.
+    """Alternative law that the times may follow, as text, and its R2.
 
-    A line and a hyperbola are alike over a narrow range, and a product says nothing of a parameter that hardly varied.
+    Over a narrow range a line and a hyperbola are alike, and a product is not tested by a parameter that hardly varied.
     """
     x, t = law.points, law.observed
     inverse = [] if (x[:, 0] == 0).any() else [("a / x", design("inverse", x))]
@@ -346,11 +347,11 @@ def rival(law: Law) -> tuple[str, float]:
         "inverse": [("a x + b", design("linear", x))],
         "product": [*inverse, ("a y", x[:, 1:])],
     }[law.kind]
-    fits = {said: _r2(t, columns @ _fitted(columns, t, np.ones(len(t)))[0]) for said, columns in designs}
+    fits = {said: _r2(t, columns @ _fit(columns, t, np.ones(len(t)))[0]) for said, columns in designs}
     return max(fits.items(), key=lambda fit: fit[1], default=("", float("-inf")))
 
 
-def _fitted(columns: Floats, t: Floats, n: Floats) -> tuple[Floats, Floats]:
+def _fit(columns: Floats, t: Floats, n: Floats) -> tuple[Floats, Floats]:
     """(P,) coefficients of columns (N, P), and the (N,) weights they were found with; n : (N,) runs."""
     from scipy.linalg import lstsq
 
@@ -365,13 +366,13 @@ def _fitted(columns: Floats, t: Floats, n: Floats) -> tuple[Floats, Floats]:
 
 
 def _r2(observed: Floats, expected: Floats) -> float:
-    """nan where all are the same."""
+    """Coefficient of determination; nan where all observations are equal."""
     spread = float(np.sum((observed - observed.mean()) ** 2))
     return 1 - float(np.sum((observed - expected) ** 2)) / spread if spread > 0 else float("nan")
 
 
 def design(kind: LawKind, points: Floats) -> Floats:
-    """(N, P) what the coefficients of a law are multiplied with at points (N, K)."""
+    """(N, P) design matrix of a law at points (N, K)."""
     x = points[:, 0]
     if kind == "linear":
         return np.stack([x, np.ones(len(x))], 1)
@@ -379,7 +380,7 @@ def design(kind: LawKind, points: Floats) -> Floats:
 
 
 def band(law: Law, points: Floats) -> tuple[Floats, Floats]:
-    """The law at points (N,) or (N, K) and the half width of its confidence band there, s."""
+    """Value of the law at points (N,) or (N, K), and half width of its confidence band there, s."""
     columns = design(law.kind, _columns(points))
     deviation = np.sqrt(np.einsum("ni,ij,nj->n", columns, law.covariance, columns))
     return columns @ law.coefficients, float(two_sided(law.level, law.freedom)) * deviation

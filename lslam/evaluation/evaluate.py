@@ -1,4 +1,4 @@
-"""One estimate against one ground truth: associate, bring into one frame, measure."""
+"""Evaluation of one estimate against one ground truth: associate, transform to one frame, measure."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ UNLIKELY = 30.7
 
 
 def shown_metrics(evaluation: Evaluation) -> list[TrajectoryMetric[Any]]:
-    """Those that are always shown, and those of the words of `eval.metrics`."""
+    """Metrics that are always shown, and those named in `eval.metrics`."""
     return [metric for metric in METRICS if not metric.word or metric.word in evaluation.shown]
 
 
@@ -111,7 +111,7 @@ def evaluate(
     )
     units = _other_unit(same.estimate, same.truth)
     # Whose body it is shows in motions, which are wrong then.
-    frames = [] if units else same.faults or _turned(same.estimate, same.truth)
+    frames = [] if units else same.faults or _rotation_note(same.estimate, same.truth)
     if is_carried:
         if estimate.frame == ground_truth.frame == "imu":
             T_lidar_body = se3.inverse(calibration.T_lidar("imu")) @ T_lidar_body
@@ -136,9 +136,9 @@ def _evaluate_positions(
     time_offset: float,
     notes: list[str],
 ) -> Evaluation:
-    """What needs no rotation of two trajectories of which one has positions alone.
+    """Evaluation without rotations, for two trajectories of which one has positions alone.
 
-    A prism or an antenna lies off the LiDAR: the side that has rotations is carried to the other's place by `T_est_gt`.
+    A prism or an antenna is off the LiDAR, so the trajectory with rotations is moved to its place by `T_est_gt`.
     """
     bare = [name for name, t in (("estimate", estimate), ("ground truth", ground_truth)) if not t.has_rotations]
     have = "have" if len(bare) == 2 else "has"
@@ -192,7 +192,7 @@ def _measure(
 
 
 def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
-    """A note when positions of the truth spread so many times wider than the estimate's as metres do in another unit."""
+    """Notes, if the spreads of both trajectories differ by the ratio of two units of length."""
     own, real = (float(np.linalg.norm(poses[:, :3, 3].std(axis=0))) for poses in (estimate, truth))
     if max(own, real) < SPREAD or own <= 0:
         return []
@@ -204,8 +204,8 @@ def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
     ]
 
 
-def _turned(estimate: Floats, truth: Floats) -> list[str]:
-    """A note when the motions of both say that their bodies are turned against each other, beyond what drift explains."""
+def _rotation_note(estimate: Floats, truth: Floats) -> list[str]:
+    """Note when the motions show that the two body frames are rotated against each other, beyond what drift explains."""
     turn = body_turn(estimate, truth)
     if turn is None or turn.squared < UNLIKELY:
         return []
@@ -218,7 +218,7 @@ def _turned(estimate: Floats, truth: Floats) -> list[str]:
 
 
 def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
-    """A note when positions hardly hold the rotation about the path, which then spoils aligned rotation errors."""
+    """Note when positions hardly constrain the rotation about the path, so that aligned rotation errors are unreliable."""
     centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
     if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT * spread[0]:
@@ -260,7 +260,7 @@ def _offset(estimate: Trajectory, truth: Trajectory, config: EvalConfig) -> tupl
 
 
 def _better_offset(estimate: Trajectory, truth: Trajectory, matches: Matches, config: EvalConfig) -> list[str]:
-    """A note when the estimate clearly fits the truth at another instant of the sweep than the stamps say."""
+    """Note when the estimate clearly fits the truth better at another instant of the sweep than the stamps state."""
     fit = fit_offset(estimate, truth) if config.time_offset == 0 else None
     if fit is None or not fit.is_clearly_off():
         return []

@@ -1,7 +1,7 @@
-"""Whose poses are these? Telling camera from LiDAR poses by the motion, and bringing both into one body frame.
+"""Body frames of trajectories: tells camera from LiDAR poses by the motion, and transforms both into one frame.
 
-A vehicle's camera advances along its own +z, its LiDAR along +x. Scoring one against the other ruins every number but
-the aligned positions, so it is detected, said, and undone when the extrinsics are known.
+A vehicle's camera advances along its own +z, its LiDAR along +x. Scoring one against the other ruins every number but the
+aligned positions, so it is detected, reported, and undone when the extrinsics are known.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ ROUNDS, SCALE = 30, 1.345
 
 @dataclass
 class Reconciled:
-    """Both trajectories in one body frame, poses (N, 4, 4), and what was found out.
+    """Both trajectories in one body frame, poses (N, 4, 4), with notes.
 
-    notes : decisions; faults : why the frames of the two do not fit, notes too
+    notes : decisions and faults; faults : reasons why the two frames do not agree
     """
 
     estimate: Floats
@@ -41,7 +41,7 @@ class Reconciled:
 
 
 def carry(poses: Floats, T_lidar_body: Floats, is_world_of_body: bool = False) -> Floats:
-    """Poses (N, 4, 4) of a body that sits at `T_lidar_body`, from the LiDAR's: T_world_body = T_world_lidar T_lidar_body.
+    """Poses (N, 4, 4) of a body at `T_lidar_body` from those of the LiDAR: T_world_body = T_world_lidar T_lidar_body.
 
     is_world_of_body : the world is the body at the start, as in KITTI's files; it changes with the body (Del Tufo, 4.1)
     """
@@ -106,7 +106,7 @@ def reconcile(
 
 
 def main_axis(poses: Floats) -> str | None:
-    """The body axis along which poses (N, 4, 4) advance, `+x` .. `-z`, None when they advance along none in particular."""
+    """Body axis along which poses (N, 4, 4) advance, `+x` .. `-z`; None when there is no dominant one."""
     direction = _mean_direction(poses)
     if direction is None:
         return None
@@ -172,7 +172,7 @@ def _turns(poses: Floats, stride: int) -> Floats:
 
 
 def _say_difference(out: Reconciled, way_out: str = "give", explained: str = "") -> None:
-    """Find fault with a body frame that is turned against the other one, seen from the motion alone."""
+    """Add a fault if the motion shows that one body frame is rotated against the other."""
     R = body_rotation(out.estimate, out.truth)
     if R is None or np.rad2deg(so3.angle(R)) < SAME_DEG:
         return
@@ -190,8 +190,12 @@ def _turn(poses: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class BodyTurn:
-    """rotation (3,): rotation vector that takes directions of the truth's body into the estimate's, rad, 0 about what the
-    motion does not tell; covariance (3, 3) of it, rad2
+    """Rotation between two body frames, from their motions.
+
+    rotation : (3,) rotation vector that takes directions of the truth's body into the estimate's, rad; 0 about unobservable
+    axes
+
+    covariance : (3, 3) of it, rad2
     """
 
     rotation: Floats
@@ -199,7 +203,7 @@ class BodyTurn:
 
     @property
     def angle(self) -> float:
-        """rad."""
+        """Angle of the rotation, rad."""
         return float(np.linalg.norm(self.rotation))
 
     @property
@@ -210,16 +214,16 @@ class BodyTurn:
 
     @property
     def squared(self) -> float:
-        """Chi-square of three degrees of freedom where nothing is turned."""
+        """Squared Mahalanobis length of the rotation; without a rotation it is chi-square of three degrees of freedom."""
         return float(self.rotation @ np.linalg.solve(self.covariance, self.rotation))
 
 
 def body_turn(estimate: Floats, truth: Floats) -> BodyTurn | None:
-    """The turn between the bodies of matched poses (N, 4, 4), None where there is too little motion.
+    """Rotation between the bodies of matched poses (N, 4, 4), None where there is too little motion.
 
     Motions from one pose to a later one, A of the estimate and B of the truth, fulfil A X = X B for the transform X between
-    the bodies. Rotation and lever arm are fitted by robust least squares; what is left of the motions tells sigmas, to which
-    drift adds its own.
+    the bodies. Rotation and lever arm are fitted by robust least squares; their residuals give the sigmas, to which drift is
+    added.
     """
     pairs = _pairs(truth)
     if len(pairs) < FEWEST:
@@ -229,7 +233,7 @@ def body_turn(estimate: Floats, truth: Floats) -> BodyTurn | None:
     # A weak prior at no rotation and no lever arm, for unobservable directions.
     hold = np.diag(np.repeat([1.0, 1e-2], 3))
     for _ in range(ROUNDS):
-        r, J = _linearised(A, B, R, x[3:])
+        r, J = _linearise(A, B, R, x[3:])
         sizes = np.linalg.norm(r.reshape(len(r), 2, 3), axis=2)
         scales = np.maximum(1.4826 * np.median(sizes, axis=0) / 1.538, (1e-6, 1e-6))
         weights = np.minimum(SCALE * np.sqrt(3) * scales / np.maximum(sizes, 1e-12), 1.0) / scales**2
@@ -248,7 +252,7 @@ def _state(R: Floats, x: Floats) -> Floats:
 
 
 def _pairs(truth: Floats) -> NDArray[np.intp]:
-    """(K, 2) first and last pose of motions one after the other, each the shortest that is long enough."""
+    """(K, 2) first and last pose of consecutive motions, each the shortest that is long enough."""
     steps = se3.relative(truth[:-1], truth[1:])
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps[:, :3, 3], axis=1))])
     turn = np.concatenate([[0.0], np.cumsum(so3.angle(steps[:, :3, :3]))])
@@ -260,8 +264,8 @@ def _pairs(truth: Floats) -> NDArray[np.intp]:
     return np.array(found[:: 1 + len(found) // MOST], np.intp).reshape(-1, 2)
 
 
-def _linearised(A: Floats, B: Floats, R: Floats, t: Floats) -> tuple[Floats, Floats]:
-    """(K, 6) residuals of turns and ways, and (K, 6, 6) derivatives by a turn of R from the left and the lever arm `t`."""
+def _linearise(A: Floats, B: Floats, R: Floats, t: Floats) -> tuple[Floats, Floats]:
+    """(K, 6) residuals of rotations and translations, and (K, 6, 6) Jacobians by a left rotation of R and the lever arm `t`."""
     turn_a, turn_b = so3.log(A[:, :3, :3]), so3.log(B[:, :3, :3]) @ R.T
     way_b = B[:, :3, 3] @ R.T
     arm = A[:, :3, :3] - np.eye(3)

@@ -1,4 +1,4 @@
-"""What a trajectory metric is, how it is measured, written, shown and compared; and what it gives: values with their recipe."""
+"""Trajectory metrics: how they are measured, written, shown and compared; and their results with recipes."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class Evaluation:
     scores : by key of the metric (`evaluation.evaluate`), each with its recipe; shown : words of `eval.metrics`
     time_offset : s added to the estimate's stamps; association : recipe sentence; notes : decisions and warnings
     faults : those of the notes that say what makes the numbers wrong
-    odometry : of a run whose poses a graph moved, the same of the poses before
+    odometry : the evaluation before the pose graph, for a run with one
     """
 
     estimate: str
@@ -180,7 +180,7 @@ class MatchedPoses:
 
 @dataclass(frozen=True)
 class MetricRow:
-    """A row of the table of `lslam eval`: one cell per estimate. Rows with `under` belong to the number of that name."""
+    """Row of the table of `lslam eval`: one cell per estimate. A row with `under` belongs to the number of that name."""
 
     label: str
     unit: str
@@ -189,7 +189,7 @@ class MetricRow:
 
 
 class TrajectoryMetric(ABC, Generic[Score]):
-    """One way to score matched poses.
+    """Interface of a score of matched poses.
 
     A metric is a subclass in a module of its own and an entry of `evaluation.evaluate.METRICS`. `measure` makes its score: a
     frozen dataclass with a `recipe`. From `columns` follows all that is shown; a metric with a form of its own overrides
@@ -212,7 +212,7 @@ class TrajectoryMetric(ABC, Generic[Score]):
         """The score of matched poses."""
 
     def of(self, evaluation: Evaluation) -> Score:
-        """Its score in an evaluation."""
+        """Score of this metric in an evaluation."""
         score: Score = evaluation.scores[self.key]
         return score
 
@@ -235,7 +235,7 @@ class TrajectoryMetric(ABC, Generic[Score]):
         return rows
 
     def recipes(self, e: Evaluation) -> list[str]:
-        """How the numbers are made, one sentence each."""
+        """Definitions of the numbers, one sentence each."""
         return [f"{self.name}: {getattr(self.of(e), 'recipe', '')}"]
 
     def tables(self, e: Evaluation) -> list[Table]:
@@ -249,17 +249,17 @@ class TrajectoryMetric(ABC, Generic[Score]):
         return []
 
     def gated(self, e: Evaluation) -> tuple[str, float | None, str]:
-        """Name, value and unit of what `gate_option` limits: the first column unless said; None when it is not available."""
+        """Name, value and unit that `gate_option` limits, by default the first column; None when it is not available."""
         field, metric = self.columns[0]
         value = float(getattr(self.of(e), field))
         return self.name, None if np.isnan(value) else value, metric.unit
 
     def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
-        """The numbers that comparisons and studies read."""
+        """Numbers that comparisons and studies read."""
         return [metric for _, metric in self.columns]
 
     def values(self, document: Any) -> dict[str, float]:
-        """Those numbers by key, from the metric's part of evaluation.json; what is null is left out."""
+        """Numbers by key, from the metric's part of evaluation.json; null values are left out."""
         found = {metric.key: document[field] for field, metric in self.columns}
         return {key: value for key, value in found.items() if value is not None}
 
@@ -279,10 +279,10 @@ def statistics_document(values: Statistics | None) -> Document:
 
 
 def two(values: object, a: str, b: str) -> str:
-    """Two attributes of statistics, as text."""
+    """Two attributes of statistics as text."""
     return "n/a" if values is None else f"{significant(getattr(values, a))} / {significant(getattr(values, b))}"
 
 
 def cells_of(errors: Sequence[Any], is_known: Callable[[Any], bool], pick: Callable[[Any], str]) -> list[str]:
-    """One text per error; the note of one that is not known."""
+    """Texts of errors; the note of one that is not available."""
     return [pick(error) if is_known(error) else error.note for error in errors]

@@ -1,4 +1,4 @@
-"""RPE: how far the motion between two poses is from the true motion."""
+"""RPE: error of the motion between two poses against the true motion."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def by_time(seconds: Floats, delta: float, all_pairs: bool) -> Pairs:
 
 
 def _nearest(along: Floats, delta: float) -> Pairs:
-    """Every i with the first j > i whose `along[j] - along[i]` is nearest `delta`, dropped when off by over 10 %."""
+    """Pairs (i, j): every i with the first j > i whose `along[j] - along[i]` is nearest to `delta`; dropped if over 10 % off."""
     tolerance = delta * TOLERANCE
     slack = 1e-9 * max(abs(float(along[-1])), delta, 1.0)
     low = np.searchsorted(along, along + (delta - tolerance - slack), side="left")
@@ -116,7 +116,7 @@ def relative_error(estimate: Floats, truth: Floats, seconds: Floats | None, reci
 
 
 def _without_rotations(recipe: str) -> RelativeError:
-    """The error at one distance that positions alone do not have: it compares motions in the frame of the body."""
+    """Unavailable error at one distance, for positions alone: RPE compares motions in the body frame."""
     delta, unit, rule = parse_delta(recipe)
     sentence = RULES[unit, rule].replace("`delta`", f"{delta:g} {unit}")
     return RelativeError(delta, unit, rule, 0, None, None, NO_ROTATIONS, sentence)

@@ -1,4 +1,4 @@
-"""A sensitivity study evaluated: means over seeds, divergence, optimum, laws and verdicts (Girolimetto, section 5.3)."""
+"""Evaluation of a sensitivity study: means over seeds, divergence, optimum, laws and verdicts (Girolimetto, section 5.3)."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ EFFICIENCIES = ("efficiency", "total_efficiency")
 
 
 def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> FindingVerdict:
-    """The verdict over all curves that the finding speaks of: where they disagree it is undecided."""
+    """Verdict over all curves that the finding applies to; undecided if they disagree."""
     mine = [result for result in results if _speaks_of(finding, result)]
     if not mine:
         return FindingVerdict(finding.text, "undecided", "no run of that kind was made", finding.source)
@@ -102,7 +102,7 @@ def _judge_one(finding: ExpectedFinding, result: CurveResult) -> Judged:
 
 
 def _has_errors(curve: Curve) -> bool:
-    """Whether runs were scored; where none was, a run that is not lost says nothing either."""
+    """Whether runs were scored. Without scores it is unknown whether a run is lost."""
     are_scored = np.isfinite(curve.quantities["translation"]).any()
     return bool(are_scored or curve.lost[curve.ran].all())
 
@@ -121,7 +121,7 @@ def _speaks_of(finding: ExpectedFinding, result: CurveResult) -> bool:
 
 
 def evaluate_study(rows: Sequence[StudyRow], findings: Sequence[ExpectedFinding] = ()) -> list[StudyResult]:
-    """One result per study, sequence and studied parameter, in the order they appear in `rows`; runs beside belong to all."""
+    """One result per study, sequence and parameter, in the order of `rows`; reference runs beside the study belong to all."""
     groups: dict[tuple[str, str, str], list[StudyRow]] = {}
     for row in rows:
         if not row.is_beside:

@@ -1,7 +1,8 @@
-"""The time offset at which an estimate fits its truth best, within a sweep or two: whose instant does a stamp name?
+"""Time offset at which an estimate fits its truth best, within one or two sweeps.
 
-A LiDAR's stamp may be the start, the middle or the end of its sweep, the truth's another one. Over short windows the way
-and the turn of both are compared, which no frame changes: an offset shows where speed or turn rate change.
+A LiDAR's stamp may be the start, the middle or the end of its sweep, and the truth's another instant. Distance and rotation
+angle over short windows are compared, since they do not depend on frames. An offset is observable where speed or turn rate
+change.
 """
 
 from __future__ import annotations
@@ -31,20 +32,23 @@ HOLES = 5
 
 @dataclass(frozen=True)
 class OffsetFit:
-    """offset_ns : to add to the estimate's stamps; sigma_ns : one sigma of it; coherence : of the changes of both motions"""
+    """Result of `fit_offset`.
+
+    offset_ns : to add to the estimate's stamps; sigma_ns : one sigma of it; coherence : of the changes of both motions
+    """
 
     offset_ns: int
     sigma_ns: float
     coherence: float
 
     def is_clearly_off(self, other_ns: int = 0) -> bool:
-        """Whether `other_ns` is another offset: not by chance, and by enough to matter."""
+        """Whether `other_ns` differs significantly, and by enough to matter."""
         is_far = abs(self.offset_ns - other_ns) > max(CLEAR_SIGMAS * self.sigma_ns, CLEAR_S * 1e9)
         return is_far and self.coherence > MIN_COHERENCE
 
 
 def fit_offset(estimate: Trajectory, truth: Trajectory, start_ns: int = 0) -> OffsetFit | None:
-    """The offset near `start_ns` at which ways and turns over short windows agree best; None where motion does not tell."""
+    """Offset near `start_ns` at which distances and rotations over short windows agree best; None if it is unobservable."""
     if not (estimate.has_stamps and truth.has_stamps) or min(len(estimate), len(truth)) < 2 * MIN_BLOCKS:
         return None
     step = float(np.median(np.diff(estimate.stamps_ns)))
@@ -59,7 +63,7 @@ def fit_offset(estimate: Trajectory, truth: Trajectory, start_ns: int = 0) -> Of
     reach = int(max(float(np.median(np.diff(truth.stamps_ns))), step))
     offset, last, gain = float(start_ns), 0.0, 1.0
     for _ in range(ROUNDS):
-        fit = _linearised(estimate.stamps_ns + round(offset), truth, own, is_whole, count, reach, turns, blocks)
+        fit = _linearise(estimate.stamps_ns + round(offset), truth, own, is_whole, count, reach, turns, blocks)
         if fit is None:
             return None
         change, sigma, coherence = fit
@@ -74,7 +78,7 @@ def fit_offset(estimate: Trajectory, truth: Trajectory, start_ns: int = 0) -> Of
     return None
 
 
-def _linearised(
+def _linearise(
     stamps: Stamps,
     truth: Trajectory,
     own: Floats,
@@ -85,7 +89,7 @@ def _linearised(
     blocks: NDArray[np.int_],
 ) -> tuple[float, float, float] | None:
     """Change of the offset, ns, its sigma, and the coherence, by the truth's motions at `stamps`, before and after."""
-    inside = _known(truth.stamps_ns, stamps - reach) & _known(truth.stamps_ns, stamps + reach)
+    inside = _covers(truth.stamps_ns, stamps - reach) & _covers(truth.stamps_ns, stamps + reach)
     use = inside[count:] & inside[:-count] & is_whole
     many = len(np.unique(blocks[use]))
     if many < MIN_BLOCKS:
@@ -113,15 +117,15 @@ def _linearised(
     return change, max(sigma, information**-0.5 * 0.1), coherence
 
 
-def _known(known: Stamps, stamps: Stamps) -> Bools:
-    """Whether stamps lie among the truth's and in no hole of it."""
+def _covers(known: Stamps, stamps: Stamps) -> Bools:
+    """(N,) whether stamps lie within the truth's time range and in no gap of it."""
     after = np.clip(np.searchsorted(known, stamps, side="left"), 1, len(known) - 1)
     gaps = known[after] - known[after - 1]
     return np.asarray((stamps >= known[0]) & (stamps <= known[-1]) & (gaps <= HOLES * np.median(np.diff(known))))
 
 
 def _motions(poses: Floats, count: int, turns: bool) -> Floats:
-    """(N - count, 1 or 2) way, m, and turn, rad, from each pose to the one `count` later."""
+    """(N - count, 1 or 2) distance, m, and rotation angle, rad, between each pose and the one `count` later."""
     way = np.linalg.norm(poses[count:, :3, 3] - poses[:-count, :3, 3], axis=1)
     if not turns:
         return np.asarray(way[:, None])

@@ -81,7 +81,7 @@ def read_timing(path: str | Path) -> Timing:
 
 
 def summarise(seconds: Floats, whole: float) -> StageTime:
-    """One stage (N,), s, of scans that took `whole` s in all."""
+    """Statistics of one stage (N,), s, of scans that took `whole` s in all."""
     median, p95 = (float(v) for v in np.percentile(seconds, [50, 95]))
     share = float(seconds.sum()) / whole if whole > 0 else 0.0
     return StageTime(median, p95, float(seconds.max()), float(seconds.mean()), share)

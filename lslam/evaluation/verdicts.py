@@ -1,4 +1,4 @@
-"""Verdicts on the findings that a study is expected to confirm: of amounts and laws, and of places on a curve."""
+"""Verdicts on expected findings of a study: about effects and laws, and about places on a curve."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _EQUAL = 1e-9  # R2 of laws that fit alike
 
 
 def judge_matters_little(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Confirmed where the largest is less than so many times the smallest, refuted where it is more, scatter included.
+    """Verdict on a small effect: confirmed if largest over smallest is below a factor, refuted if above, scatter included.
 
     Refuted as well where most runs of some value are lost; a value without result, or numbers that do not vary at all,
     leave it undecided.
@@ -54,21 +54,21 @@ def judge_matters_little(finding: ExpectedFinding, result: CurveResult) -> Judge
     lost = curve.is_lost
     if lost.any():
         outcome: Outcome = "refuted" if (curve.lost.sum(1)[lost] > 1).any() else "undecided"
-        return outcome, f"{said}, and it diverges at {_listed(curve, lost)}"
+        return outcome, f"{said}, and it diverges at {_value_list(curve, lost)}"
     least, pairs = finding.values[0], permutations(table[known], 2)
     if contrast(table[top], table[bottom]).exceeds(least):
         return "refuted", said
     if not all(contrast(one, other).stays_below(least) for one, other in pairs):
         return "undecided", f"{said}, which seeds that are too few or too scattered do not tell from {least:g}"
     if not known.all():
-        return "undecided", f"{said}, but nothing is known at {_listed(curve, ~known)}"
+        return "undecided", f"{said}, but nothing is known at {_value_list(curve, ~known)}"
     if not np.ptp(np.nan_to_num(table), axis=0).any():
         return "undecided", f"{said}: it is the same to the last digit at every value, so the parameter was not in use"
     return "confirmed", said
 
 
 def judge_law(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """As `_law`, of the total time over the studied parameter."""
+    """Verdict, as by `_law`, on the total time over the studied parameter."""
     law = result.law
     if law is None or law.kind != finding.kind:
         assert finding.kind in ("linear", "inverse")
@@ -77,15 +77,15 @@ def judge_law(finding: ExpectedFinding, result: CurveResult) -> Judged:
 
 
 def judge_product(finding: ExpectedFinding, law: Law | None, result: CurveResult) -> Judged:
-    """As `_law`, of the total time over both studied parameters."""
+    """Verdict, as by `_law`, on the total time over both studied parameters."""
     if result.curve.words:
         return "undecided", f"{result.curve.parameter} is not a number"
     return _law(finding, law)
 
 
 def _law(finding: ExpectedFinding, law: Law | None) -> Judged:
-    """Confirmed where it explains enough and nothing else does better; refuted where something else explains enough, or it is
-    off by more than the seeds scatter.
+    """Verdict on a law: confirmed if it explains enough and no other law does better; refuted if another law explains
+    enough, or if it is off by more than the scatter over seeds.
     """
     if law is None:
         return "undecided", f"no law is fitted to fewer than {FEWEST} values"
@@ -109,14 +109,14 @@ def _law(finding: ExpectedFinding, law: Law | None) -> Judged:
 
 
 def _rms(values: Floats) -> float:
-    """Infinite where none is known: what scatters by an unknown amount may scatter by any."""
+    """Root mean square; infinite if no value is known, since unknown scatter may be of any size."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("inf")
 
 
 def judge_acts_only_on(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Confirmed when the named stages make up at least 80 % of the change, stage by stage, of registration, refuted when less;
-    in most seeds by themselves too.
+    """Verdict on stages: confirmed if the named ones make up at least 80 % of the change of registration time, else refuted;
+    most seeds by themselves must agree.
     """
     curve = result.curve
     change, level = _changes(curve)
@@ -139,9 +139,9 @@ def judge_acts_only_on(finding: ExpectedFinding, result: CurveResult) -> Judged:
 
 
 def _changes(curve: Curve) -> tuple[dict[str, float], float | None]:
-    """By how many ms the mean of each stage of registration changes over the values, and what all take together.
+    """Change of each registration stage's mean over the values, ms, and of their sum.
 
-    A stage that a timed run did not pass took no time. Nothing, and None, where fewer than 3 values were timed.
+    A stage that a timed run lacks counts as 0. Empty, and None, where fewer than 3 values were timed.
     """
     tables = {
         name: np.where(curve.lost, np.nan, table)
@@ -166,7 +166,7 @@ def _own_share(finding: ExpectedFinding, change: dict[str, float]) -> float:
     return sum(change.get(name, 0.0) for name in finding.stages) / sum(change.values())
 
 
-def _listed(curve: Curve, which: Bools) -> str:
+def _value_list(curve: Curve, which: Bools) -> str:
     return ", ".join(curve.name_of(value) for value in curve.values[which])
 
 
@@ -178,17 +178,17 @@ Ranking = Literal["worse", "as good", "better", "unknown"]
 
 
 def judge_diverges_beyond(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Confirmed where the last value that works is the expected one, undecided one value beside it, refuted elsewhere."""
+    """Verdict: confirmed if the last working value is the expected one, undecided one value beside it, else refuted."""
     return _as_most_seeds(lambda curve: _diverges_beyond(curve, finding.values[0]), result.curve)
 
 
 def judge_holds_up_to(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Confirmed where the expected value, or a larger one, works and none below is lost; refuted where it diverges before."""
+    """Verdict: confirmed if the expected or a larger value works and none below is lost; refuted if it diverges earlier."""
     return _as_most_seeds(lambda curve: _holds_up_to(curve, finding.values[0]), result.curve)
 
 
 def _as_most_seeds(says: Callable[[Curve], Judged], curve: Curve) -> Judged:
-    """What all runs say together, if most seeds say it by themselves."""
+    """Verdict on all runs, if most seeds by themselves give the same; else undecided."""
     outcome, said = says(curve)
     if outcome == "undecided":
         return outcome, said
@@ -237,17 +237,17 @@ def _holds_up_to(curve: Curve, expected: float) -> Judged:
 
 
 def judge_best_between(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """As `_between`, of the highest efficiency, the smallest error or the shortest time."""
+    """Verdict, as by `_between`, on the highest efficiency, the smallest error or the shortest time."""
     return _between(finding, result, is_highest=finding.of.endswith("efficiency"))
 
 
 def judge_largest_between(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """As `_between`, of the largest number whatever it is."""
+    """Verdict, as by `_between`, on the largest value of any number."""
     return _between(finding, result, is_highest=True)
 
 
 def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool) -> Judged:
-    """Confirmed when the extreme lies between, on each side some value is worse, and most seeds agree.
+    """Verdict: confirmed if the extreme lies between, some value is worse on each side, and most seeds agree.
 
     Refuted when the extreme lies outside and beats the best one between, or all values outside are as good as that.
     """
@@ -293,7 +293,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
 
 
 def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Ranking:
-    """How the value at index `other` stands against that at `base`."""
+    """Ranking of the value at index `other` against that at `base`."""
     if curve.is_lost[other]:
         if finding.kind == "best_between" or finding.of.endswith("efficiency"):
             return "worse"
@@ -310,16 +310,16 @@ def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_h
 
 
 def _best_by_seed(finding: ExpectedFinding, result: CurveResult, is_highest: bool) -> list[Optimum]:
-    """Where each seed alone is best, of seeds that have any result."""
+    """Best value of each seed alone, for seeds that have any result."""
     table = np.where(result.curve.lost, np.nan, result.curve.quantities[finding.of])
     found = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
     return [best for best in found if best is not None]
 
 
 def judge_elbow_at(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Confirmed where the error comes to its plateau at the expected value and is worse just below it.
+    """Verdict: confirmed if the error reaches its plateau at the expected value and is worse just below.
 
-    Undecided one value beside it; refuted where it comes there later, or is as good just below.
+    Undecided one value beside it; refuted if it reaches the plateau later, or is as good just below.
     """
     curve, expected = result.curve, finding.values[0]
     values = _scored_values(curve)
@@ -342,7 +342,7 @@ def judge_elbow_at(finding: ExpectedFinding, result: CurveResult) -> Judged:
 
 
 def judge_good_from(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Confirmed when the error has come to its plateau there and a value below is worse, refuted when these are as good."""
+    """Verdict: confirmed if the error is on its plateau there and some value below is worse, refuted if these are as good."""
     curve, expected = result.curve, finding.values[0]
     values = _scored_values(curve)
     if not values[0] <= expected <= values[-1]:
@@ -356,7 +356,7 @@ def judge_good_from(finding: ExpectedFinding, result: CurveResult) -> Judged:
 
 
 def _plateau_is_later(result: CurveResult, expected: float, found: float | None) -> Judged:
-    """Refuted, if a value from the expected one to the plateau is worse than it by more than the seeds scatter."""
+    """Refuted if a value from the expected one to the plateau is worse by more than the scatter over seeds, else undecided."""
     curve = result.curve
     values = _scored_values(curve)
     level = plateau(curve, float(values[len(values) // 2]))
@@ -383,17 +383,17 @@ def _elbow(result: CurveResult) -> float | None:
 
 
 def _scored_values(curve: Curve) -> Floats:
-    """Values at which some run says whether they work."""
+    """Values with at least one scored run."""
     return curve.values[curve.scored.any(1)]
 
 
 def _place(values: Floats, value: float) -> int:
-    """Index of a value that is there."""
+    """Index of a value that is among `values`."""
     return int(np.flatnonzero(values == value)[0])
 
 
 def _lost(curve: Curve, last: float) -> str:
-    """How many runs are lost at values up to `last`, which for most seeds work."""
+    """Remark on the number of lost runs at values up to `last`, which work for most seeds; empty if none is lost."""
     at = curve.lost.any(1) & (curve.values <= last)
     lost, ran = int(curve.lost[at].sum()), int(curve.scored[at].sum())
     listed = ", ".join(f"{value:g}" for value in curve.values[at])

@@ -106,7 +106,7 @@ class RemotePath(PosixPath):
         for entry in sorted(entries, key=lambda entry: str(entry["name"])):
             name = str(entry["name"]).rstrip("/").rpartition("/")[2]
             if name and str(entry["name"]).strip("/") != place.strip("/"):
-                yield self._told(name, entry)
+                yield self._with_info(name, entry)
 
     def glob(self, pattern: str, **_: Any) -> Generator[RemotePath, None, None]:
         """Entries of the folder that match a pattern of one level."""
@@ -174,7 +174,8 @@ class RemotePath(PosixPath):
             if not missing_ok:
                 raise
 
-    def _told(self, name: str, info: dict[str, Any]) -> RemotePath:
+    def _with_info(self, name: str, info: dict[str, Any]) -> RemotePath:
+        """Path of an entry, with the `info` of its listing cached."""
         path = self / name
         path.__dict__["_known"] = info
         return path

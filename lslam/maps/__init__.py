@@ -1,1 +1,1 @@
-"""The merged map."""
+"""Maps built from posed scans: the merged map, occupancy, surfaces, and scores of maps."""

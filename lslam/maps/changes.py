@@ -1,4 +1,4 @@
-"""What appeared and what vanished between two drives through one place: by their beams, since what nobody saw is not gone."""
+"""Changes between two drives through one place, by free and occupied cells: an unobserved cell is no change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOISE_CELLS = 8
 
 @dataclass(frozen=True)
 class MapChange:
-    """A thing that only one drive saw, where beams of the other passed: cells (K, 3) of edge `voxel`, m."""
+    """Object that only one drive observed while beams of the other passed: cells (K, 3) of edge `voxel`, m."""
 
     kind: Kind
     cells: Longs
@@ -35,17 +35,17 @@ class MapChange:
 
     @property
     def base(self) -> float:
-        """Lower edge, m."""
+        """Height of the lower edge, m."""
         return float(self.cells[:, 2].min() * self.voxel)
 
     @property
     def height(self) -> float:
-        """From the lower to the upper edge, m."""
+        """Height from the lower to the upper edge, m."""
         return float((np.ptp(self.cells[:, 2]) + 1) * self.voxel)
 
     @property
     def volume(self) -> float:
-        """Of the cells, m3: those of its surface, since no beam looks inside."""
+        """Volume of the cells, m3; these are on the surface only, since no beam sees the inside."""
         return float(len(self.cells) * self.voxel**3)
 
     @property
@@ -59,7 +59,7 @@ class MapChange:
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Length and width, m, of the smallest rectangle about the outline; one of its sides lies on a side of the hull."""
+        """Length and width, m, of the smallest rectangle around the outline, which has a side on a side of the hull."""
         hull = self.outline
         sides = np.roll(hull, -1, axis=0) - hull
         along = sides / np.linalg.norm(sides, axis=1, keepdims=True)
@@ -71,7 +71,7 @@ class MapChange:
 
 @dataclass(frozen=True)
 class ChangedCells:
-    """Two drives compared.
+    """Result of comparing two drives.
 
     changes : what appeared, then what vanished, the largest first; same : (S, 3) occupied cells of the new drive that the
         old one found occupied, too, there or in a cell beside it
@@ -87,13 +87,13 @@ class ChangedCells:
     unseen_old: int
 
     def of(self, kind: Kind) -> list[MapChange]:
-        """Those of one kind."""
+        """Changes of one kind."""
         return [change for change in self.changes if change.kind == kind]
 
 
 @dataclass(frozen=True)
 class _Drive:
-    """Keys of the cells that one drive saw, by what it says of them; each array rises.
+    """Cell keys of one drive by state; each array is sorted.
 
     seen : all; occupied : in the end, and in the sum; certain : those of them beyond doubt; free : beyond doubt; blocked : in
         the end or in the sum
@@ -107,7 +107,7 @@ class _Drive:
 
 
 def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
-    """What is occupied in one drive and free in the other, as things; what the other never saw is neither.
+    """Objects of cells occupied in one drive and free in the other; cells that the other never observed are neither.
 
     A cell is free when its log-odds lie at their lower clamp, where OctoMap calls it stable, with and without clamps: one in
     which something came or went during the drive is neither free nor occupied. A thing needs a cell that is occupied as
@@ -146,7 +146,7 @@ def _drive(found: Evidence) -> _Drive:
 
 
 def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[MapChange]:
-    """Connected cells that are occupied here and free there, the largest first."""
+    """Connected cells that are occupied here and free there, as objects, the largest first."""
     passed = here.occupied[_among(here.occupied, there.free)]
     alone = passed[~_beside(passed, there.blocked) & _open(passed, there.seen)]
     cells = passed[_beside(passed, alone)]
@@ -161,13 +161,13 @@ def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[Ma
 
 
 def _components(keys: Keys) -> Longs:
-    """Number of the part that each of the rising keys is of, parts being joined by faces, edges and corners of cells."""
+    """Component number of each of the sorted keys; cells are connected by faces, edges and corners."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     first, second = [], []
     for step in _steps()[14:]:  # those forward: backward are the same pairs
-        at = _found(keys + step, keys)
+        at = _indices_of(keys + step, keys)
         first.append(np.flatnonzero(at >= 0))
         second.append(at[at >= 0])
     rows, columns = np.concatenate(first), np.concatenate(second)
@@ -176,7 +176,7 @@ def _components(keys: Keys) -> Longs:
 
 
 def _beside(keys: Keys, others: Keys) -> Bools:
-    """Whether a cell or one of its 26 neighbours is among `others`, which rise."""
+    """Whether a cell or one of its 26 neighbours is among `others`, which are sorted."""
     near = np.zeros(len(keys), np.bool_)
     for step in _steps():
         check_stop()
@@ -185,24 +185,24 @@ def _beside(keys: Keys, others: Keys) -> Bools:
 
 
 def _open(keys: Keys, seen: Keys) -> Bools:
-    """Whether all six cells beyond the faces of a cell are among `seen`, which rise."""
+    """Whether all six face neighbours of a cell are among `seen`, which are sorted."""
     steps = _steps()
     return np.asarray(np.all([_among(keys + steps[k], seen) for k in (4, 10, 12, 14, 16, 22)], axis=0))
 
 
 def _steps() -> list[int]:
-    """Differences of keys to the 27 cells about one, rising; the cell itself is in the middle."""
+    """Differences of keys to the 27 cells around one, sorted; the cell itself is in the middle."""
     from lslam.maps.kernels.voxel_average import AXIS_BITS
 
     return [(x << 2 * AXIS_BITS) + (y << AXIS_BITS) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
 
 
 def _among(keys: Keys, others: Keys) -> Bools:
-    return np.asarray(_found(keys, others) >= 0)
+    return np.asarray(_indices_of(keys, others) >= 0)
 
 
-def _found(keys: Keys, others: Keys) -> Longs:
-    """Where each key stands in `others`, which rise; -1 where it does not."""
+def _indices_of(keys: Keys, others: Keys) -> Longs:
+    """Index of each key in `others`, which are sorted; -1 where it is missing."""
     if not len(others):
         return np.full(len(keys), -1, np.int64)
     at = np.minimum(np.searchsorted(others, keys), len(others) - 1)

@@ -1,4 +1,4 @@
-"""Moving objects taken out of a map: a point that other scans, a little earlier or later, look through, has moved."""
+"""Removal of moving objects from a map: a point moved if beams of earlier or later scans pass through its place."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Floor:
     lowest: NDArray[np.float32]
 
     def lower(self, image: NDArray[np.float32], first: Longs) -> None:
-        """Put what is lower than in `image`, whose corner is the square `first`, into it."""
+        """Update with the lower points of `image`, whose corner is the square `first`."""
         shift = np.clip(self.first - first, -_SIDE, _SIDE)
         (x, y), (u, v) = np.maximum(shift, 0), np.maximum(-shift, 0)
         there = image[x : _SIDE - u, y : _SIDE - v]
@@ -45,7 +45,7 @@ class Floor:
 
 
 def floor_of(points: NDArray[np.float32], sensor: Floats) -> Floor:
-    """Of points (N, 3) as seen from the sensor, but along the axes of a world whose z is up, m; sensor : (3,) where it is."""
+    """Floor of points (N, 3), m, relative to the sensor, in world axes with z up; sensor : (3,) its position, m."""
     near = points[_within_reach(points)]
     first, squares = _squares(near, sensor)
     lowest = np.full((_SIDE, _SIDE), np.inf, np.float32)
@@ -54,7 +54,7 @@ def floor_of(points: NDArray[np.float32], sensor: Floats) -> Floor:
 
 
 def standing(points: NDArray[np.float32], sensor: Floats, floors: Iterable[Floor]) -> Bools:
-    """(N,) whether a point is within reach and above the ground, as far as `floors` know it.
+    """(N,) whether a point is within reach and above the ground, as far as `floors` cover it.
 
     points, sensor : as for `floor_of`; floors : of this scan and of others around it
     """
@@ -74,7 +74,7 @@ def standing(points: NDArray[np.float32], sensor: Floats, floors: Iterable[Floor
 
 
 def things_of(points: NDArray[np.float32], chosen: Bools) -> Longs:
-    """Number of the thing that each point (N, 3) is of, from 1, were there only the `chosen`; 0 for the others.
+    """Object number of each of the `chosen` points (N, 3), from 1, by connected squares; 0 for the others.
 
     points : as for `floor_of`; chosen : (N,), within reach
     """
@@ -90,7 +90,7 @@ def things_of(points: NDArray[np.float32], chosen: Bools) -> Longs:
 
 
 def whole(moves: Bools, labels: Longs, share: float, least: int) -> Bools:
-    """The mask (N,), and all of the things of which `share`, and `least` points, are masked."""
+    """Mask (N,) extended to all points of objects of which at least the share `share` and `least` points are masked."""
     total, moving = np.bincount(labels), np.bincount(labels, moves)
     chosen = (moving >= least) & (moving >= share * total)
     chosen[:1] = False  # 0 is no thing
@@ -98,14 +98,14 @@ def whole(moves: Bools, labels: Longs, share: float, least: int) -> Bools:
 
 
 def _squares(near: NDArray[np.float32], sensor: Floats) -> tuple[Longs, Longs]:
-    """(2,) the square in the corner of what is in reach, and (N,) where points lie in an image of it, row after row."""
+    """(2,) corner square of the area within reach, and (N,) index of each point's square in its flattened image."""
     first = np.floor((sensor[:2] - REACH) / SQUARE).astype(np.int64)
     at = np.floor((near[:, :2] + sensor[:2]) / SQUARE).astype(np.int64) - first
     return first, at[:, 0] * _SIDE + at[:, 1]
 
 
 def _within_reach(points: NDArray[np.float32]) -> Bools:
-    """(N,) whether a point is; no NaN is."""
+    """(N,) whether a point is within reach; False for NaN."""
     x, y, z = np.abs(points).T
     return np.asarray((x < REACH) & (y < REACH) & (z < REACH))
 
@@ -152,7 +152,7 @@ class _Grid:
 
 @dataclass(frozen=True)
 class _Look:
-    """What is kept of a scan for the others: its pose, its range image and its floor."""
+    """Data of a scan for checking others: its pose, range image and floor."""
 
     T_world_lidar: Floats
     image: NDArray[np.float32]
@@ -160,7 +160,7 @@ class _Look:
 
 
 class Cleaner:
-    """Takes scans in and gives them back, `OFFSETS[-1]` scans later, without the points that moved.
+    """Removes moving points from a stream of scans; a scan comes out `OFFSETS[-1]` scans later.
 
     Visibility between scans, as in Pomerleau et al. (ICRA 2014) and Removert (Kim and Kim, IROS 2020), but scan against
     scan, so that neither the map nor its length has to fit into memory. The ground never moves: beams that graze it say
@@ -183,7 +183,7 @@ class Cleaner:
         self.removed = self.seen = 0
 
     def add(self, scan: PosedScan) -> list[PosedScan]:
-        """One more scan; those that can be decided now."""
+        """Add a scan. Returns the scans that can be decided now."""
         from lslam.maps.kernels.see_through import nearest_ranges
 
         points = np.ascontiguousarray(scan.points, np.float32)
@@ -203,18 +203,18 @@ class Cleaner:
         return self._decide() if self._count - self._decided > OFFSETS[-1] else []
 
     def finish(self) -> list[PosedScan]:
-        """The scans that are left."""
+        """Remaining scans, after the last one."""
         return [scan for _ in checking(range(self._count - self._decided)) for scan in self._decide()]
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; the scans themselves are to be added again."""
+        """State for `restore`; the scans themselves must be added again."""
         grid = None if self._grid is None else astuple(self._grid)
         return {"grid": grid, "decided": self._decided, "removed": self.removed, "seen": self.seen}
 
     def restore(self, state: State) -> int:
-        """Go on where `state` was taken, in an empty cleaner: with which scan, counted from 0, adding has to begin again.
+        """Restore `state` in an empty cleaner. Returns the number of the scan, from 0, from which to add again.
 
-        Scans that were given back already are not given back once more.
+        Scans that came out already do not come out again.
         """
         self._grid = None if state["grid"] is None else _Grid(*state["grid"])
         self._known, self.removed, self.seen = state["decided"], state["removed"], state["seen"]
@@ -222,7 +222,7 @@ class Cleaner:
         return self._count
 
     def _decide(self) -> list[PosedScan]:
-        """The oldest scan, without what moved; nothing when it was given back before."""
+        """Oldest scan without its moving points; empty when it came out before."""
         scan, number = self._scans.popleft(), self._decided
         moves = None if number < self._known else self._moves(scan, number)
         self._decided += 1
@@ -254,7 +254,7 @@ class Cleaner:
         return moves
 
     def _upright(self, scan: PosedScan) -> tuple[NDArray[np.float32], Floats]:
-        """Its points (N, 3) as seen from the sensor, and where that is, m, along the world's axes once z is up."""
+        """Points (N, 3) relative to the sensor, and the sensor's position, m, in world axes with z up."""
         T = self._R_level @ scan.T_world_lidar[:3]
         with np.errstate(invalid="ignore"):  # organised clouds mark what they did not see by infinity
             return scan.points @ T[:, :3].T.astype(np.float32), T[:, 3]
@@ -262,9 +262,9 @@ class Cleaner:
     def _votes(
         self, points: NDArray[np.float32], T_world_lidar: Floats, others: list[_Look]
     ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-        """Of how many of the `others` each point (N, 3) was looked through, and by how many something was seen there.
+        """For each point (N, 3), number of the `others` that looked through its place, and number that measured a surface there.
 
-        Where the latter are more, both are counted only until they are so for certain.
+        Counting of a point ends as soon as the majority for a surface is certain.
         """
         from lslam.maps.kernels.see_through import vote
 
@@ -278,7 +278,7 @@ class Cleaner:
 
 
 def spread(moves: Bools, points: NDArray[np.float32]) -> Bools:
-    """The mask (N,), and all points (N, 3), m, of cubes in which a good share is masked: wheels, and what hides behind."""
+    """Mask (N,) extended to all points (N, 3), m, of cubes with a good share of masked points, such as wheels."""
     if not moves.any():
         return moves
     # Only cubes with a masked point matter.
@@ -293,7 +293,7 @@ def spread(moves: Bools, points: NDArray[np.float32]) -> Bools:
 
 
 def _grid_of(points: NDArray[np.float32]) -> _Grid | None:
-    """The finest pixels that this scan nearly fills; None when it is empty.
+    """Finest range image grid that this scan nearly fills; None when the scan is empty.
 
     Rings are farther apart than the points on them: a row must be as high as the gap between two rings, a column need not
     be as wide.
@@ -307,13 +307,13 @@ def _grid_of(points: NDArray[np.float32]) -> _Grid | None:
     for width in COLUMNS_DEG:
         for size in np.radians(ROWS_DEG):
             grid = _Grid(float(low - size / 2), float(size), int((high - low) / size) + 2, int(360 / width))
-            if _filled(grid, elevation, azimuth) >= FILLED:
+            if _fill_share(grid, elevation, azimuth) >= FILLED:
                 return grid
     return grid
 
 
-def _filled(grid: _Grid, elevation: Floats, azimuth: Floats) -> float:
-    """Share of pixels with a point, in each column between its lowest and its highest."""
+def _fill_share(grid: _Grid, elevation: Floats, azimuth: Floats) -> float:
+    """Share of pixels with a point between the lowest and the highest of each column."""
     row = ((elevation - grid.low) / grid.size).astype(np.int64)
     column = np.minimum((azimuth / (2 * np.pi) * grid.columns).astype(np.int64), grid.columns - 1)
     inside = (row >= 0) & (row < grid.rows)

@@ -1,4 +1,4 @@
-"""Scores of a map: its crispness (mean map entropy, mean plane variance), and its distances to a reference cloud."""
+"""Scores of a map: mean map entropy, mean plane variance, and distances to a reference cloud."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ THRESHOLD = 0.2  # m
 
 
 def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples: int = SAMPLES) -> Crispness:
-    """Score a map; a merged one of any size in little memory, any other in memory.
+    """Score a map. A merged one may exceed memory, any other is read as a whole.
 
     Parameters
     ----------
     radius : of a neighbourhood, m; least : points it must have, at least 4
-    samples : about so many points, evenly spread over the cloud, are asked for their neighbourhoods
+    samples : approximate number of points, evenly spread, whose neighbourhoods are evaluated
 
     Raises
     ------
@@ -67,7 +67,7 @@ def plane_variances(points: Floats, queries: slice, radius: float = RADIUS, leas
 
 
 def _slabs(cloud: Cloud, radius: float, step: int) -> Iterator[tuple[Floats, Floats]]:
-    """Every `step`-th point of the cloud once, with all points of a slab of x that holds its neighbourhood."""
+    """Every `step`-th point of the cloud, once, each group with all points of a slab in x that covers its neighbourhoods."""
     if not isinstance(cloud, MergedMap):
         points = in_memory(cloud).points
         points = points[np.isfinite(points).all(1)]
@@ -98,7 +98,7 @@ def warm_up() -> None:
 
 
 def compare(cloud: ArrayCloud, reference: ArrayCloud, threshold: float = THRESHOLD) -> MapDifference:
-    """F1 and Chamfer distance of two clouds in one frame, m; points that are not finite are left out.
+    """F1 and Chamfer distance, m, of two clouds in one frame; points that are not finite are left out.
 
     A cloud that is denser in some places weighs these more: compare clouds of the same voxel size.
     Raises InputError when one of them has no points, UsageError for a threshold that is none.

@@ -1,4 +1,4 @@
-"""Plans of a map: the merged map seen from above, and what stands in the way on the ground, from an occupancy map."""
+"""Plans of a map: top view of the merged map, and a floor plan of obstacles from an occupancy map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Extent = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Seen from above: image (H, W) uint8, row 0 at the largest y, of `OCCUPIED`, `UNKNOWN` and `FREE`.
+    """Floor plan: image (H, W) uint8 of `OCCUPIED`, `UNKNOWN` and `FREE`, row 0 at the largest y.
 
     resolution : m per pixel; x, y : world coordinates of the lower left corner of the lower left pixel, m
     """
@@ -32,7 +32,7 @@ class FloorPlan:
     y: float
 
     def yaml(self, image_name: str) -> str:
-        """What ROS' map_server loads beside the image."""
+        """YAML file that ROS' map_server needs beside the image."""
         return (
             f"image: {image_name}\nresolution: {self.resolution:.6g}\norigin: [{self.x:.6g}, {self.y:.6g}, 0.0]\n"
             "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
@@ -40,10 +40,11 @@ class FloorPlan:
 
 
 def floor_plan(grid: OccupancyGrid) -> FloorPlan:
-    """Occupied: something stands `LOWEST` to `HIGHEST` above the floor; free: seen through there, or nothing but floor.
+    """Floor plan of an occupancy map.
 
-    The floor follows the ground, and what is narrower than some metres stands on it; one cell more or less is no step, so
-    cells should be half as high as what matters. One unknown pixel without cells.
+    Occupied: something `LOWEST` to `HIGHEST` m above the floor. Free: only floor, or beams passed there. The floor follows
+    the ground, and objects narrower than some metres stand on it. Steps of one cell are ignored, so cells should be half as
+    high as the lowest obstacle that matters. Without cells the plan is one unknown pixel.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -96,7 +97,7 @@ class TopView:
 
 
 def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 1600, trim: float = 0.001) -> TopView:
-    """How many points of a map lie in each column, and how high.
+    """Number of points of a map in each vertical column, and their mean height.
 
     On a voxel map the number is the occupied height, so walls stand out from the ground.
 
@@ -130,7 +131,7 @@ def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 160
 
 
 def _bounds(cloud: Cloud, trim: float) -> tuple[Floats, Floats]:
-    """Quantiles of a regular sample of some 100,000 points: cheap, deterministic, blind to stray points."""
+    """Quantiles of a regular sample of about 100,000 points, which is cheap, deterministic and robust to outliers."""
     step, seen = max(1, len(cloud) // 100_000), 0
     parts = [np.zeros((0, 2))]
     for block in cloud.blocks():

@@ -1,4 +1,4 @@
-"""From a run's world to coordinates every GIS knows."""
+"""Coordinates of a run's world on the Earth, in coordinate reference systems of GIS."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def utm_epsg(lat: float, lon: float) -> int:
 
 @dataclass(frozen=True)
 class Projection:
-    """Carries a run's world into a projected coordinate reference system: that of the georeference, else the UTM zone.
+    """Transforms a run's world into a projected coordinate reference system: that of the georeference, else the UTM zone.
 
     Heights are those of its vertical datum or of the geoid of the georeference, m; without both above the WGS84 ellipsoid.
     """
@@ -49,7 +49,7 @@ class Projection:
 
     @property
     def epsg(self) -> int:
-        """Code of the coordinate reference system, without that of its heights."""
+        """EPSG code of the horizontal coordinate reference system."""
         lat, lon, _ = (float(v) for v in self.georeference.origin)
         return self.georeference.epsg or utm_epsg(lat, lon)
 
@@ -60,7 +60,7 @@ class Projection:
 
     @property
     def frame(self) -> str:
-        """The coordinates in words."""
+        """Description of the coordinates."""
         geoid = self.georeference.geoid
         if geoid:
             return f"{self.name}, heights above the geoid of {Path(geoid).name}"
@@ -70,11 +70,11 @@ class Projection:
 
     @property
     def wkt(self) -> str:
-        """Its definition as WKT 1, what LAS asks for."""
+        """Definition of the coordinate reference system as WKT 1, which LAS needs."""
         return str(self._crs.to_wkt("WKT1_GDAL") or self._crs.to_wkt())
 
     def apply(self, points: NDArray[Any]) -> Floats:
-        """Points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m.
+        """Transform points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m.
 
         Raises UsageError where a grid of heights ends.
         """
@@ -107,7 +107,7 @@ class Projection:
         return se3.apply(T_world_enu, enu)
 
     def check(self) -> None:
-        """Raise UsageError unless the coordinate reference system is known, counts in metres and is reached exactly."""
+        """Raise UsageError unless the coordinate reference system is known, in metres and reached without loss of accuracy."""
         units = {axis.unit_name for axis in self._crs.axis_info}
         if not self._crs.is_projected or units != {"metre"} or self._crs.axis_info[-1].direction == "down":
             raise UsageError(
@@ -146,7 +146,7 @@ class ProjectedCloud:
 
     @property
     def has_intensity(self) -> bool:
-        """As the cloud."""
+        """Whether the cloud has intensities."""
         return self.cloud.has_intensity
 
     def __len__(self) -> int:
@@ -159,12 +159,12 @@ class ProjectedCloud:
 
 
 def to_lat_lon(points: NDArray[Any], georeference: Georeference) -> Floats:
-    """Points (N, 3) of the run's world, m, to (N, 3) lat, lon (deg), height (m), WGS84."""
+    """Transform points (N, 3) of the run's world, m, to (N, 3) lat, lon (deg), height (m), WGS84."""
     return from_local(se3.apply(georeference.T_enu_world, points), georeference.origin)
 
 
 def to_wgs84(points: NDArray[Any], epsg: int, height_epsg: int | None = None, geoid: str = "") -> Floats:
-    """Points (N, 3) in the coordinates `epsg`, x (or longitude, deg) first, to (N, 3) lat, lon (deg), height (m), WGS84.
+    """Transform points (N, 3) in `epsg`, x (or longitude, deg) first, to (N, 3) lat, lon (deg), height (m), WGS84.
 
     Heights are those above the grid `geoid` where there is one and the coordinates are not ellipsoidal by name, else of the
     coordinates where these have some, else above the ellipsoid. Raises UsageError for a code that PROJ does not know, for what
@@ -181,17 +181,17 @@ def to_wgs84(points: NDArray[Any], epsg: int, height_epsg: int | None = None, ge
     places, name = np.column_stack([lat, lon]), crs_name(epsg, height_epsg)
     if not is_compound or geoid:
         source = plane if not is_compound else plane.to_3d()
-        out = _transformed(exact_transformer(source, "EPSG:4979", places, name), there)
+        out = _transform(exact_transformer(source, "EPSG:4979", places, name), there)
         if geoid and not is_ellipsoidal:
             # The plane's own ellipsoid has no say in heights above a geoid.
             out[:, 2] = there[:, 2] + geoid_heights(geoid, out)
     else:
-        out = _transformed(exact_transformer(crs, "EPSG:4979", places, name), there)
+        out = _transform(exact_transformer(crs, "EPSG:4979", places, name), there)
     _require_places(there, out, crs, epsg)
     return out
 
 
-def _transformed(transformer: Any, points: Floats) -> Floats:
+def _transform(transformer: Any, points: Floats) -> Floats:
     lon, lat, height = transformer.transform(points[:, 0], points[:, 1], points[:, 2])
     return np.column_stack([lat, lon, height])
 

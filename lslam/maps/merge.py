@@ -187,7 +187,7 @@ class MapMerger:
         return MergedMap(rows, origin, self._voxel, bool(self._with_intensity))
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; the voxels go to `keep`, only those that changed since the last time."""
+        """State for `restore`; voxels that changed since the last time are written to `keep`."""
         if self._used:
             self._spill()
         counts = (self.scans, self.gated, self.outside, self.refused)
@@ -195,7 +195,7 @@ class MapMerger:
         return {"origin": self._origin, "with_intensity": self._with_intensity, "counts": counts, "runs": runs}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken, in an empty merger of the same kind; raises InputError when voxels are missing."""
+        """Restore `state` in an empty merger of the same kind. Raises InputError when voxels are missing."""
         if state["runs"] is not None:
             runs = SortedRuns(self._spool, self._keep)
             runs.restore(state["runs"])
@@ -207,14 +207,14 @@ class MapMerger:
             self._start(columns=6 if self._with_intensity else 5)
 
     def _take(self) -> Longs:
-        """The rows in memory, sorted; none are left."""
+        """Sorted rows in memory, which is emptied."""
         rows = self._rows[: self._used]
         rows = rows[np.argsort(rows[:, 0])]
         self._start(columns=self._rows.shape[1])
         return rows
 
     def _start(self, columns: int) -> None:
-        """Room for `most` rows: the system gives memory for those only that are written to."""
+        """Allocate room for `most` rows; the system provides memory only for rows that are written."""
         self._rows: Longs = np.empty((self._most, columns), np.int64)
         self._slots: NDArray[np.int32] = np.full(_slots_for(self._most), -1, np.int32)
         self._used = 0
@@ -233,7 +233,7 @@ class MapMerger:
             self._with_intensity, self._rows = False, np.ascontiguousarray(self._rows[:, :5])
 
     def _reserve(self, rows: int) -> None:
-        """Room for `rows` rows, of one scan with more than `most` of them."""
+        """Ensure room for `rows` rows, even for one scan with more than `most` of them."""
         from lslam.maps.kernels.voxel_average import enter
 
         if rows > len(self._rows):
@@ -244,12 +244,12 @@ class MapMerger:
 
 
 def _slots_for(rows: int) -> int:
-    """A power of two that keeps them half full at most."""
+    """Number of hash slots: a power of two, at most half full."""
     return 1 << int(np.ceil(np.log2(max(rows, 1) * 2)))
 
 
 def _add_up(rows: Longs) -> Longs:
-    """One row per key of sorted rows: the sums added."""
+    """Sum of the rows of each key, from sorted rows."""
     first = np.flatnonzero(np.diff(rows[:, 0], prepend=rows[0, 0] - 1))
     summed = np.add.reduceat(rows, first, axis=0)
     summed[:, 0] = rows[first, 0]

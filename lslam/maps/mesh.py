@@ -1,4 +1,4 @@
-"""What Open3D does for finished maps: stray points out, and a surface through the rest. The map has to fit into memory."""
+"""Open3D's filters for finished maps: outlier removal and surface reconstruction. The map must fit into memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Mesh:
 
 
 def require_open3d() -> Any:
-    """The module; raises InputError with the way out when it, or a library it needs, is missing."""
+    """The open3d module. Raises InputError with instructions when it, or a library it needs, is missing."""
     with importing_open3d():
         import open3d
     return open3d

@@ -1,4 +1,4 @@
-"""3D occupancy: where beams ended, where they passed, and what nobody has seen."""
+"""3D occupancy grid from beams: cells where they end, cells that they pass, and unobserved cells."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MOST_ROWS = 4_000_000
 
 @dataclass(frozen=True)
 class OccupancyGrid:
-    """Cells that were seen, sorted by x, then y, then z; all others are unknown.
+    """Observed cells, sorted by x, then y, then z; all others are unknown.
 
     cells : (M, 3) int32, cell i covers [i, i + 1) * voxel of the world, m; log_odds : (M,) int16, hundredths
     """
@@ -36,7 +36,7 @@ class OccupancyGrid:
 
     @property
     def is_occupied(self) -> Bools:
-        """(M,) more likely occupied than free."""
+        """(M,) whether a cell is more likely occupied than free."""
         return np.asarray(self.log_odds > 0)
 
     @property
@@ -47,7 +47,7 @@ class OccupancyGrid:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What scans say of cells, by keys that are comparable between mappers of one origin.
+    """Evidence of scans about cells, with keys comparable between mappers of one origin.
 
     keys : (M,) int64, rising; log_odds : (M,) int16, hundredths, clamped in the order of the scans; sums : (M,) int64, the
     same without clamps, which no order changes; origin : (3,) cell in the middle of the key range
@@ -64,7 +64,7 @@ class Evidence:
 
 
 class OccupancyMapper:
-    """Casts scans into cells; a scan says one thing about a cell, and a hit beats a miss.
+    """Updates cells by rays; a scan updates a cell once, and a hit overrides a miss.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ class OccupancyMapper:
         self._reserve(_START_ROWS)
 
     def add(self, points: NDArray[Any], T_world_lidar: Floats) -> None:
-        """One deskewed scan: points (N, 3) m in the LiDAR frame, its pose (4, 4); poses that are not finite are left out."""
+        """Add a deskewed scan: points (N, 3), m, in the LiDAR frame, and its pose (4, 4), which is skipped if not finite."""
         from lslam.maps.kernels.ray_cells import carve, mark_ends
 
         T = np.ascontiguousarray(T_world_lidar, np.float64)
@@ -133,14 +133,14 @@ class OccupancyMapper:
             )
 
     def result(self) -> OccupancyGrid:
-        """The cells seen so far; the mapper is empty then."""
+        """Grid of the observed cells; empties the mapper."""
         from lslam.maps.kernels.voxel_average import unpack_cells
 
         found = self.evidence()
         return OccupancyGrid(unpack_cells(found.keys, found.origin).astype(np.int32), found.log_odds, self._voxel)
 
     def evidence(self) -> Evidence:
-        """The cells seen so far, and all that was said of them; the mapper is empty then."""
+        """Observed cells with all their evidence; empties the mapper."""
         from lslam.maps.kernels.ray_cells import compose
 
         if self._runs is None:
@@ -155,7 +155,7 @@ class OccupancyMapper:
         return Evidence(rows[:, 0].copy(), log_odds, rows[:, 1].copy(), origin, self._voxel)
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; the cells go to `keep`, only those that changed since the last time."""
+        """State for `restore`; cells that changed since the last time are written to `keep`."""
         if self._used:
             self._spill()
         return {
@@ -163,7 +163,7 @@ class OccupancyMapper:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken, in an empty mapper of the same kind; raises InputError when cells are missing."""
+        """Restore `state` in an empty mapper of the same kind. Raises InputError when cells are missing."""
         if state["runs"] is not None:
             self._runs = SortedRuns(self._spool, self._keep)
             self._runs.restore(state["runs"])
@@ -182,7 +182,7 @@ class OccupancyMapper:
         self._runs.add(self._take())
 
     def _reserve(self, rows: int) -> None:
-        """Room for `rows` rows; the slots stay at most two thirds full."""
+        """Ensure room for `rows` rows; the slots stay at most two thirds full."""
         from lslam.maps.kernels.ray_cells import COLUMNS
         from lslam.maps.kernels.voxel_average import enter
 

@@ -1,4 +1,4 @@
-"""Tables of int64 rows that outgrow memory: sorted runs on disk, brought together key range by key range."""
+"""Tables of int64 rows larger than memory: sorted runs on disk, merged by ranges of keys."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ class SortedRuns:
         return len(self._runs)
 
     def add(self, rows: Rows) -> None:
-        """Store one more run."""
+        """Store a run."""
         stored = self._stored(f"run-{len(self._runs)}", rows.shape[1])
         stored.remove()  # what a process that was killed may have left
         stored.append(rows)
         self._runs.append(stored)
 
     def state(self) -> State:
-        """What `restore` needs to find the runs again."""
+        """State with which `restore` finds the runs again."""
         return {"runs": [(len(run), run.columns) for run in self._runs]}
 
     def restore(self, state: State) -> None:
-        """Hold the runs that lie in the folder; raises InputError when they do not."""
+        """Take over the runs in the folder. Raises InputError when they are missing."""
         self._runs = []
         for k, (count, columns) in enumerate(state["runs"]):
             stored = self._stored(f"run-{k}", columns)
@@ -77,7 +77,7 @@ class SortedRuns:
         return StoredRows(self._folder / name, columns, self._owner)
 
     def combined(self, combine: Combine) -> StoredRows:
-        """All runs as one table, sorted by key; the runs themselves are gone then, but in a folder that stays.
+        """Merge all runs into one table, sorted by key. The runs are deleted, unless their folder is kept.
 
         combine : given rows sorted by key, those of one key in the order of the runs, gives one row per key
         """
@@ -101,7 +101,7 @@ class SortedRuns:
         return whole
 
     def _cuts(self) -> list[int]:
-        """Keys that divide all rows into parts of about `PART`, from every 4096th key of each run."""
+        """Keys that split all rows into parts of about `PART` rows, from every 4096th key of each run."""
         keys = np.sort(np.concatenate([run.keys[::_SAMPLE] for run in self._runs]))
         step = max(PART // _SAMPLE, 1)
         return [int(key) for key in np.unique(keys[step::step])]
@@ -124,7 +124,7 @@ class StoredRows:
         return np.memmap(self._path.with_suffix(".keys"), np.int64, "r") if self._count else np.zeros(0, np.int64)
 
     def append(self, rows: Rows) -> None:
-        """Write rows behind those that are there."""
+        """Write rows behind the existing ones."""
         path = self._path
         with output_errors(path), path.open("ab") as stream, path.with_suffix(".keys").open("ab") as keys:
             stream.write(np.ascontiguousarray(rows).data)
@@ -142,11 +142,11 @@ class StoredRows:
         return flat.reshape(-1, self.columns)
 
     def first_not_below(self, key: int) -> int:
-        """Number of rows with a smaller key."""
+        """Number of rows with a smaller key: the index of the first row not below it."""
         return bisect_left(self.keys, key)
 
     def find(self, count: int) -> None:
-        """Take `count` rows that are there already; raises InputError when there are not so many."""
+        """Take over `count` existing rows. Raises InputError when there are fewer."""
         for path, columns in ((self._path, self.columns), (self._path.with_suffix(".keys"), 1)):
             if not path.is_file() or path.stat().st_size < 8 * columns * count:
                 raise InputError(f"{path} does not hold the {count} rows that it should")

@@ -1,1 +1,1 @@
-"""The recipe: readers to odometry to map to report, and the run folder."""
+"""Processing of one recording, from readers to odometry, map and report; and the run folder."""

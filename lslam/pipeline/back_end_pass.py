@@ -1,4 +1,4 @@
-"""Second pass, over keyframes: what odometry gave is made consistent, and the run's record says what was done."""
+"""Second pass, over keyframes: the pose graph makes the trajectory consistent, and the record states what changed."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ log = logging.getLogger("lslam")
 
 
 def optimise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
-    """Put the final poses into `record`, and what the graph did into the manifest.
+    """Put the final poses into `record`, and the results of the graph into the manifest.
 
-    A run that was interrupted, or whose odometry is lost, keeps what it has; whether to stop is asked between keyframes, before
-    the graph and wherever its loops turn.
+    A run that was interrupted, or whose odometry is lost, keeps its poses. `should_stop` is called between keyframes, before
+    the graph, and in the loops of the optimiser.
     """
     config, manifest, store, manual = job.config, job.manifest, job.store, job.manual
     if config.debug.drift:
@@ -97,10 +97,10 @@ def optimise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
 def _loops(
     job: PreparedRun, results: list[ScanResult], pairs: KeyframePairs, clocks: KeyframeClocks
 ) -> tuple[list[LoopCandidate], list[str]]:
-    """All candidates of the keyframes where they are now, by an earlier run where it found them for the same poses.
+    """Loop candidates of the keyframes at their present poses; those of an earlier run are reused if poses are equal.
 
-    The known pairs come first: the others are searched from where those and control points put the keyframes. Beside them what
-    is doubtful about the known ones.
+    Known pairs come first: the search for others starts from the poses after applying these and control points. The second
+    result lists doubts about the known pairs.
     """
     store, config, checkpoints, should_stop = job.store, job.config, job.kept("loops"), job.watch.should_stop
     poses = np.array([k.T_world_lidar for k in store.keyframes]).reshape(-1, 4, 4)
@@ -124,9 +124,9 @@ def _loops(
 
 
 def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest: Manifest) -> None:
-    """Make the world level, unless it is east, north, up already; the georeference is of the final world.
+    """Make the world level, unless it is east, north, up already; the georeference refers to the final world.
 
-    The last of all that moves poses, so keyframes on disk stay where odometry put them.
+    It is the last step that moves poses; keyframes on disk keep the poses of odometry.
     """
     place = record.georeference
     if place is not None and place.is_in_graph:
@@ -153,7 +153,7 @@ def level_world(record: RunRecord, sequence: Sequence, config: Config, manifest:
 
 
 def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: BackEnd) -> None:
-    """trajectory_odometry.tum, loops.csv and, where there are such, osm_matches.csv and graph.g2o."""
+    """Write trajectory_odometry.tum, loops.csv and, if there are any, osm_matches.csv and graph.g2o."""
     if record.odometry is None:
         return
     write_tum(
@@ -173,7 +173,7 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
 
 
 def describe(georeference: Georeference) -> dict[str, Any]:
-    """For the manifest: plain values, angles in deg, distances in m."""
+    """Plain values for the manifest, angles in deg, distances in m."""
     plain = asdict(georeference)
     plain["origin_lat_lon_height"] = [float(v) for v in plain.pop("origin")]
     plain["T_enu_world"] = georeference.T_enu_world.tolist()

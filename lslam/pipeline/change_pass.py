@@ -1,4 +1,4 @@
-"""What has changed between two runs through one place, from the raw scans and final poses of both."""
+"""Changes between two runs through one place, from the raw scans and final poses of both."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _COLOURS = np.array([[214, 69, 65], [150, 150, 150], [46, 134, 193]], np.uint8)
 
 
 def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
-    """(4, 4) T_old_new from the world of one run into that of the other.
+    """(4, 4) T_old_new from the world of the new run to that of the old one, m.
 
     Their worlds are one when one was located in the map of the other, or both in the same map; else their georeferences
     lead from one to the other. Raises UsageError when neither does.
@@ -60,7 +60,7 @@ def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
 
 
 def _frame_of(run: EarlierRun) -> Path:
-    """The run folder, or map file of another program, whose coordinates those of the run are."""
+    """Run folder, or map file of another program, whose coordinate frame the run uses."""
     here, manifest, seen = run.folder.resolve(), run.manifest, set[Path]()
     while here not in seen:
         seen.add(here)
@@ -78,11 +78,11 @@ def compare_runs(
     new: tuple[EarlierRun, Sequence], old: tuple[EarlierRun, Sequence], T_old_new: Floats, *, spool: Path | None = None,
     on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
 ) -> ChangedCells:  # fmt: skip
-    """What appeared and what vanished, in the world of the old run.
+    """Changes between both runs, in the world of the old one.
 
-    Moving objects are taken out of each drive by itself. Cells and their range are those of the new run's configuration.
-    What is too large for memory is kept in a temporary folder in `spool` meanwhile. Raises InterruptedRunError when
-    `should_stop` says so.
+    Moving objects are removed from each drive separately. Cells and their range are those of the new run's configuration.
+    Data too large for memory are kept in a temporary folder in `spool`. Raises InterruptedRunError when `should_stop` says
+    so.
     """
     section = new[0].config.map
     origin = np.floor(old[0].trajectory.positions[0] / section.occupancy_voxel).astype(np.int64)
@@ -111,9 +111,9 @@ def compare_runs(
 
 @contextmanager
 def output_folder(folder: Path, overwrite: bool) -> Iterator[None]:
-    """`folder`, made before any work is done; what was made is gone again when the block fails.
+    """Make `folder` before any work is done; remove it again when the block fails.
 
-    Raises OutputExistsError for what it may not replace, OutputError for a folder that cannot be made.
+    Raises OutputExistsError for a folder that may not be replaced, OutputError for a folder that cannot be made.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputExistsError(f"{folder} is no folder; name another one with --changes")
@@ -135,7 +135,7 @@ def output_folder(folder: Path, overwrite: bool) -> Iterator[None]:
 
 
 def write_changes(folder: Path, found: ChangedCells, new: EarlierRun, old: EarlierRun) -> None:
-    """changes.ply, cells that changed and those that did not, and changes.geojson, an outline of each thing.
+    """Write changes.ply, changed and unchanged cells, and changes.geojson, an outline of each object.
 
     The cloud, m, is in the world of the old run; outlines are in longitude and latitude when it is georeferenced, else in
     metres of that world, which the file says. Raises OutputError.
@@ -158,7 +158,7 @@ def write_changes(folder: Path, found: ChangedCells, new: EarlierRun, old: Earli
 
 
 def _outline(change: MapChange, place: Georeference | None) -> Floats:
-    """(C, 2) as GeoJSON has it: longitude and latitude, deg, or x and y, m."""
+    """Outline (C, 2) for GeoJSON: longitude and latitude, deg, or x and y, m."""
     if place is None:
         return change.outline
     corners = np.column_stack([change.outline, np.full(len(change.outline), change.base)])
@@ -166,7 +166,7 @@ def _outline(change: MapChange, place: Georeference | None) -> Floats:
 
 
 def properties(number: int, change: MapChange) -> dict[str, str | int | float]:
-    """What is said of a thing beside its outline; `thing` is its number in the cloud, `base_m` in the world of the old run."""
+    """Properties of a changed object for GeoJSON; `thing` is its number in the cloud, `base_m` in the world of the old run."""
     x, y, _ = change.centres.mean(axis=0)
     length, width = change.extent
     measures = {

@@ -1,4 +1,4 @@
-"""What a configuration can get wrong that its sections cannot see by themselves; nothing heavy is imported for it."""
+"""Checks of a configuration across its sections, without heavy imports."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HEEDED = {
 
 
 def check_config(config: Config) -> None:
-    """Raise UsageError for names that do not exist and keys that do nothing: before hours of work, not after.
+    """Raise UsageError for unknown names and keys without effect, before hours of work.
 
     Raises InputError when the map asks for Open3D and it is missing.
     """
@@ -62,7 +62,7 @@ def check_config(config: Config) -> None:
 
 
 def _check_places(config: Config) -> None:
-    """What tells a run where it lies."""
+    """Raise UsageError for keys of a place on the Earth that have no effect or contradict each other."""
     wanted = "--crs" if config.gnss.crs or config.gnss.height_crs else "--geoid" if config.gnss.geoid else ""
     if wanted and config.gnss.mode == "off" and not (config.osm.extract or config.graph.control):
         raise UsageError(
@@ -78,7 +78,7 @@ def _check_places(config: Config) -> None:
 
 
 def _check_imu(config: Config) -> None:
-    """What a tightly coupled method leaves of the keys of the IMU."""
+    """Raise UsageError for keys of the IMU that contradict a tightly coupled method."""
     method = config.odometry.method
     if method in TIGHTLY_COUPLED and (config.imu.velocity != "registration" or not config.imu.weigh):
         raise UsageError(
@@ -106,7 +106,7 @@ def _check_imu(config: Config) -> None:
 
 
 def _check_heeded(config: Config) -> None:
-    """Raise UsageError for a key that was changed and that the method would pass over in silence."""
+    """Raise UsageError for a changed key that the method would silently ignore."""
     method = config.odometry.method
     if method not in METHODS:
         return  # of another package: it knows what it takes
@@ -129,6 +129,6 @@ def _check_heeded(config: Config) -> None:
 
 
 def _own_key(config: Config, key: str) -> str:
-    """The way to the method's own key of this name, empty where it has none."""
+    """Full name of the method's own key of this name, empty where it has none."""
     part = config.odometry.method.replace("-", "_")
     return f"set {part}.{key}, " if hasattr(getattr(config, part, None), key) else ""

@@ -1,4 +1,4 @@
-"""Second pass in an existing map: where the drive began in it, then every scan on it, with odometry as the prior."""
+"""Second pass in an existing map: the start of the drive, then every scan on the map, with odometry as the prior."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ ANTENNA_M = 3.0
 
 
 def localise_poses(job: PreparedRun, record: RunRecord) -> None:
-    """Put the poses in the map's frame into `record`, and what became of each scan.
+    """Put the poses in the map's frame into `record`, and the result of each scan.
 
     A run that was interrupted, or whose odometry is lost, keeps what it has. Raises RunFailedError when the drive is not found in
     the map.
@@ -70,7 +70,7 @@ def localise_poses(job: PreparedRun, record: RunRecord) -> None:
 def _followed(
     job: PreparedRun, results: list[ScanResult], prior_map: PriorMap, search: PlaceFinder
 ) -> tuple[list[MapFix], dict[str, Any]]:
-    """Every scan against the map; poses are still in level axes. And how the start was found."""
+    """Register every scan on the map, from a start that is searched first; poses are still in level axes."""
     sequence, config, watch, checkpoints = job.sequence, job.config, job.watch, job.kept("localise")
     known = None if checkpoints is None else checkpoints.latest()
     poses = np.stack([r.T_world_lidar for r in results])
@@ -124,15 +124,16 @@ def _followed(
 
 
 class Reanchoring:
-    """Finds a keyframe in the map anew, by its submap, when odometry has carried it too far. It keeps no state."""
+    """Search for a keyframe in the map by its submap, after odometry has drifted too far. It keeps no state."""
 
     def __init__(self, search: PlaceFinder, results: list[ScanResult]) -> None:
         self._search, self._results = search, results
         self._keyframe_of = {k.scan: k.number for k in search.store.keyframes}
 
     def __call__(self, position: int, T: Floats, radius: float) -> Floats | None:
-        """Pose (4, 4), level axes, of the scan at that position, within `radius` m of T (4, 4); None of no keyframe, and far
-        from the map.
+        """Pose (4, 4), level axes, of the scan at `position`, searched within `radius` m of T (4, 4).
+
+        None if the scan is of no keyframe, or is far from the map.
         """
         b = self._keyframe_of.get(position)
         if b is None or not self._search.search.is_near(T[:2, 3], radius):
@@ -142,7 +143,7 @@ class Reanchoring:
 
 
 def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, config: Config, watch: Watch) -> Start:
-    """Raises RunFailedError when there is none, InterruptedRunError when the user asked to stop."""
+    """Find the start of the drive in the map. Raises RunFailedError when there is none, InterruptedRunError on a stop."""
     prior, said = _prior_of(sequence, prior_map, config)
     log.info("searching the drive in the map, %s", said)
     start = search.find(prior, watch.should_stop)
@@ -162,7 +163,7 @@ def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, co
 
 
 def _prior_of(sequence: Sequence, prior_map: PriorMap, config: Config) -> tuple[StartPrior | None, str]:
-    """What is known of the start, level axes of the map, and in words."""
+    """Prior knowledge of the start, in level axes of the map, and in words."""
     section = config.localize
     into_level = se3.inverse(prior_map.T_map_level)
     if section.start is not None:
@@ -186,7 +187,7 @@ def _prior_of(sequence: Sequence, prior_map: PriorMap, config: Config) -> tuple[
 def _at_first_scan(
     start: Start, store: KeyframeStore, results: list[ScanResult], config: Config
 ) -> tuple[Floats, Floats]:
-    """Pose (4, 4) of the first scan, level axes, and its covariance: odometry leads back from the keyframe that was found."""
+    """Pose (4, 4) of the first scan, level axes, and its covariance, from the found keyframe by odometry."""
     keyframe = store.keyframes[start.vote.keyframe]
     T = start.vote.T_level_odometry @ results[0].T_world_lidar
     at = start.vote.T_level_odometry @ keyframe.T_world_lidar
@@ -201,7 +202,7 @@ def _at_first_scan(
 
 
 def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config: Config) -> None:
-    """The trajectory in the map's frame: scans that it holds are where it has them, odometry is bent to pass between them."""
+    """Trajectory in the map's frame. Registered scans keep their poses; odometry is bent to pass between them."""
     T = prior_map.T_map_level
     results = record.results[: len(fixes)]
     into_map = [
@@ -227,7 +228,7 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
 
 
 def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config: Config, manifest: Manifest) -> None:
-    """What became of the scans, into manifest and problems."""
+    """Write the results of the scans into manifest and problems."""
     fixes = record.map_fixes
     counts = Counter[str](fix.status for fix in fixes)
     doubtful = sum(fix.is_doubted for fix in fixes)

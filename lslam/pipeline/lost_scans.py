@@ -1,4 +1,4 @@
-"""Marks the scans that the integrity monitor holds to be lost: by the poses of odometry, and again by the final ones."""
+"""Marking of scans that the integrity monitor considers lost, by the poses of odometry and again by the final ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_SAID = 6
 
 
 def mark_lost(results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest) -> list[ScanResult]:
-    """The results, those that an alert speaks of marked so; the manifest has a problem for each stretch of them."""
+    """Results with the scans of alerts marked lost; the manifest gets a problem for each stretch of them."""
     raised = _alerts(results, checks)
     _report_stamps(results)
     manifest.integrity = {
@@ -27,23 +27,24 @@ def mark_lost(results: list[ScanResult], checks: list[MotionCheck], manifest: Ma
         "conclusive": sum(check.is_conclusive for check in checks),
         "alerts": len(raised),
     }
-    return _marked(results, raised, manifest, "")
+    return _mark(results, raised, manifest, "")
 
 
 def mark_lost_finally(
     results: list[ScanResult], checks: list[MotionCheck], manifest: Manifest, cause: str
 ) -> list[ScanResult]:
-    """The results after `cause`, those marked that the checks of odometry contradict only now.
+    """Results after `cause`, with scans marked lost that only the final poses contradict.
 
-    What the monitor measured between two scans stays; the motion that it is held against is that of the final poses.
+    The monitor's measurements between scans are compared with the motion of the final poses.
     """
     raised = _alerts(results, [_of_final_poses(check, results) for check in checks])
     new = [alert for alert in raised if not all(results[k].is_lost for k in range(alert.first, alert.last + 1))]
     manifest.integrity["final_alerts"] = len(new)
-    return _marked(results, new, manifest, f"after {cause}, ")
+    return _mark(results, new, manifest, f"after {cause}, ")
 
 
 def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionCheck:
+    """Motion check with the motion of the final poses."""
     motion = se3.relative(results[check.first].T_world_lidar, results[check.last].T_world_lidar)
     # How many points lie on surfaces at a pose that was moved far was not counted: as good as none.
     is_moved = bool(np.any(np.abs(motion_apart(check.claimed, motion)) > LARGE))
@@ -51,7 +52,7 @@ def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionChec
 
 
 def _report_stamps(results: list[ScanResult]) -> None:
-    """Warn of stamps that contradict poses which follow each other steadily: the clock is wrong, no scan is lost."""
+    """Warn of wrong stamps: poses follow each other steadily, but the stamps do not. No scan is lost."""
     at, off_s = stamp_faults(*_positions(results))
     if at:
         log.warning(
@@ -70,7 +71,7 @@ def _alerts(results: list[ScanResult], checks: list[MotionCheck]) -> list[Alert]
     return alerts(checks, *_positions(results))
 
 
-def _marked(results: list[ScanResult], raised: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:
+def _mark(results: list[ScanResult], raised: list[Alert], manifest: Manifest, after: str) -> list[ScanResult]:
     sentences = [after + _sentence(results, alert) for alert in raised]
     if len(sentences) > MOST_SAID:
         more = len(sentences) - MOST_SAID

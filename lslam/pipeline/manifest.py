@@ -1,4 +1,4 @@
-"""manifest.json: what was run on what, every decision taken, how it ended and what it cost."""
+"""manifest.json: input, decisions, outcome and cost of a run."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ LIBRARIES = ("numpy", "numba", "scipy", "kiss-icp")
 
 
 class Manifest:
-    """Gathers facts while the run goes on; `as_dict` is the file at any moment.
+    """Facts collected during a run; `as_dict` is the file at any moment.
 
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
     reading : what else than its path the sequence was opened with: topics, extrinsics
     unscored : why a known ground truth gave no score, empty where it did
-    deskew : what becomes of the motion within a scan, `describe_deskew`
+    deskew : treatment of the motion within a scan, `describe_deskew`
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates begin and whether z is up
-    imu : what became of the IMU, empty without `--imu`; keyframes : how many and how large
+    imu : use of the IMU, empty without `--imu`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
     localization : how the drive was found in a map that exists and how many scans that holds, empty without one
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
-    segments : of a run that lost its map on the way, each with what ties it to the others
+    segments : of a run that lost its map on the way, each with its connection to the others
     integrity : how many pairs of scans checked the motion beside the method, how many were conclusive, and the alerts raised
     problems : what went wrong in this run, beside what was wrong with the recording before; warnings : what its log warns of,
         which stands behind them in the file and does not decide how the run ended
@@ -80,12 +80,12 @@ class Manifest:
 
     @property
     def outcome(self) -> str:
-        """How the run ends if nothing else goes wrong."""
+        """Outcome of the run if nothing else goes wrong."""
         return self._ended or ("degraded" if self.problems or self.sequence.problems else "done")
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Add the seconds the block takes to the timings."""
+        """Context that adds the duration of its block, s, to the timings."""
         began = time.perf_counter()
         try:
             yield
@@ -93,7 +93,7 @@ class Manifest:
             self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - began
 
     def judge(self, results: list[ScanResult], expected: int, diverged: bool) -> None:
-        """Count what became of the scans and decide how the run ended."""
+        """Count the results of the scans and derive the outcome of the run."""
         self.counts = {"scans": len(results)} | {
             status: sum(r.status == status for r in results) for status in ("ok", "bridged", "skipped")
         }
@@ -114,7 +114,7 @@ class Manifest:
             self.interrupt(f"interrupted after {len(results)} of {expected} scans")
 
     def _judge_degenerate(self, results: list[ScanResult]) -> None:
-        """A direction that many scans leave open is where the motion prior drifts."""
+        """Add a problem if many scans leave a direction unobservable: there the motion prior drifts."""
         weak = [r for r in results if len(r.degenerate)]
         if len(weak) > MOST_DEGENERATE * len(results):
             self.problems.append(
@@ -123,27 +123,27 @@ class Manifest:
             )
 
     def take_over(self, record: RunRecord) -> None:
-        """Add what is wrong with the result."""
+        """Add problems of the result."""
         self.problems += record.problems
         self.unscored = record.unscored
 
     def interrupt(self, where: str) -> None:
-        """The run ends early because somebody asked for it."""
+        """Mark the run as ended early by request."""
         self._ended = "interrupted"
         # What ended the run is said before what was noticed on the way.
         self.problems.insert(0, where)
 
     def word_for(self, error: BaseException) -> str:
-        """Status of a run that `error` ended."""
+        """Status of a run that ended with `error`."""
         return "interrupted" if isinstance(error, InterruptedRunError) or is_interrupt(error) else "failed"
 
     def conclude(self) -> dict[str, Any]:
-        """The manifest of a run that has come to its end, kept as `last`."""
+        """Manifest of the finished run, kept as `last`."""
         self.last = self.as_dict(self.outcome)
         return self.last
 
     def as_dict(self, status: str, why: str = "") -> dict[str, Any]:
-        """The manifest as plain values."""
+        """Manifest as plain values."""
         s = self.sequence
         problems = [*s.problems, *self.problems]
         has_camera = s.calibration.T_cam0_lidar is not None
@@ -202,7 +202,7 @@ class Manifest:
 
 
 def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: str) -> tuple[str, bool]:
-    """What becomes of the motion within a scan, and whether it stays in.
+    """Treatment of the motion within a scan, in words, and whether distortion remains.
 
     has_times : whether the scans have per-point times; how : in words, how the method deskews, empty when it does not
     """

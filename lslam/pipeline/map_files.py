@@ -1,4 +1,4 @@
-"""A map on disk: the points, in map coordinates when it is known where they are, and a note that says what they are."""
+"""Map files: the points, in map coordinates if georeferenced, and a note in JSON that describes them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LOCAL = "world of trajectory.tum"
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The document; empty when there is none that can be read."""
+    """Content of a JSON file; empty when there is none that can be read."""
     try:
         tree = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, *MISFIT):
@@ -46,44 +46,44 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, document: dict[str, Any]) -> None:
-    """Strict JSON, indented, atomically; numbers that JSON has not become null. Raises OutputError."""
+    """Write strict JSON, indented, atomically; NaN and infinities become null. Raises OutputError."""
     write_text(path, json.dumps(strict(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n")
 
 
 def note_of(path: Path) -> Note:
-    """What the note beside a map says of it; empty when it says nothing."""
+    """Content of the note beside a map about this map; empty when it has none."""
     return _notes(path).get(path.name, {})
 
 
 def noted_last(path: Path) -> Path | None:
-    """The map beside `path`, with its stem, that was written last as the note knows it; None when it knows none."""
+    """Map beside `path`, with its stem, that was written last according to the note; None when it lists none."""
     return next((path.with_name(name) for name in _notes(path)), None)
 
 
 def is_note(path: Path) -> bool:
-    """Whether `path` may become a note: a file of this kind, none at all, or one that nobody can read."""
+    """Whether `path` may be written as a note: it is a note, missing, or unreadable."""
     return bool(read_json(path).get("schema", SCHEMA) == SCHEMA)
 
 
 def note_with(path: Path, about: Note) -> Note:
-    """The note beside `path` when it tells of that map first, and of the others of its stem that are there."""
-    return _joined({path.name: about, **{name: note for name, note in _notes(path).items() if name != path.name}})
+    """Note beside `path` that lists this map first, then the other existing maps of its stem."""
+    return _join({path.name: about, **{name: note for name, note in _notes(path).items() if name != path.name}})
 
 
 def drop_note(path: Path) -> None:
-    """Tell of the map no more: another is about to take its name. Raises OutputError."""
+    """Remove a map from the note before another takes its name. Raises OutputError."""
     notes, target = _notes(path), path.with_suffix(".json")
     if notes.pop(path.name, None) is None:
         return
     if notes:
-        write_json(target, _joined(notes))
+        write_json(target, _join(notes))
         return
     with output_errors(target):
         target.unlink(missing_ok=True)
 
 
 def _notes(path: Path) -> dict[str, Note]:
-    """By file name, the last written first; files that are gone, and names that are none of a map's, are left out."""
+    """Notes by file name, the last written first, without missing files and names that no map has."""
     tree = read_json(path.with_suffix(".json"))
     others = tree.pop("others", None)
     told = {str(tree.get("file")): tree, **(others if isinstance(others, dict) else {})}
@@ -99,14 +99,14 @@ def _is_of(path: Path, name: str) -> bool:
     return other.name == name and other.stem == path.stem and other.suffix.lower() in MAP_SUFFIXES
 
 
-def _joined(notes: dict[str, Note]) -> Note:
+def _join(notes: dict[str, Note]) -> Note:
     first, *others = notes
     return notes[first] | ({"others": {name: notes[name] for name in others}} if others else {})
 
 
 @dataclass(frozen=True)
 class MapNote:
-    """What a map file cannot say of itself: the sequence it was made of, the edge of its voxels, m, what was done to it.
+    """Facts that a map file cannot hold: source sequence, voxel edge, m, and processing steps.
 
     world : its coordinates in words, where they are those of the trajectory
     """
@@ -118,7 +118,7 @@ class MapNote:
 
     @classmethod
     def of(cls, sequence: str, config: MapConfig, built: BuiltMap, world: str) -> MapNote:
-        """Of the map that a run made, by its configuration, in its `world`."""
+        """Note for the map of a run, by its configuration, in its `world`."""
         return cls(sequence, config.voxel, built.done, f"{LOCAL}: {world}")
 
 
@@ -126,7 +126,7 @@ def write_built(
     path: Path, built: BuiltMap, config: MapConfig, sequence: str, trajectory: Trajectory, world: str,
     georeference: Georeference | None,
 ) -> None:  # fmt: skip
-    """The map of a run, and beside it what its configuration asks for: a surface, the occupancy, the way on the Earth.
+    """Write the map of a run, and if configured a surface, the occupancy, and the trajectory on the Earth.
 
     Raises as `write_map`.
     """
@@ -141,7 +141,7 @@ def write_built(
 
 
 def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeference | None = None) -> None:
-    """Write the cloud, world frame, m, in the format of the suffix, and what it is into `<stem>.json` beside it.
+    """Write the cloud, world frame, m, in the format of the suffix, and its note `<stem>.json` beside it.
 
     LAS and LAZ of a georeferenced run are in its coordinate reference system; PLY and PCD hold float32, which is too coarse
     for that: they stay in the run's world, and the note says how to go on. Raises as `write_cloud`, and UsageError when the
@@ -175,7 +175,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
 
 
 def write_geojson(path: Path, trajectory: Trajectory, georeference: Georeference, sequence: str) -> None:
-    """The trajectory as a line on the Earth."""
+    """Write the trajectory as a line on the Earth."""
     about = {
         "sequence": sequence,
         "lslam": __version__,
@@ -187,7 +187,7 @@ def write_geojson(path: Path, trajectory: Trajectory, georeference: Georeference
 
 
 def write_occupancy(folder: Path, grid: OccupancyGrid, world: str) -> None:
-    """occupancy.npz and .ply, every cell that was seen, and floor_plan.png with floor_plan.yaml for ROS' map_server.
+    """Write occupancy.npz and .ply, every observed cell, and floor_plan.png with floor_plan.yaml for ROS' map_server.
 
     The PLY holds the middles of the cells, m, with `log_odds` in hundredths: above 0 occupied, below free.
     """
@@ -207,13 +207,13 @@ def write_occupancy(folder: Path, grid: OccupancyGrid, world: str) -> None:
 
 
 def write_mesh(path: Path, cloud: Cloud, note: MapNote, trajectory: Trajectory) -> None:
-    """A surface through the map as PLY, world frame, m."""
+    """Write a surface through the map as PLY, world frame, m."""
     made = surface(in_memory(cloud), note.voxel, trajectory.positions)
     write_ply_mesh(path, made.vertices, made.triangles, f"lslam {__version__} map surface; {note.world}")
 
 
 def georeference_note(georeference: Georeference) -> dict[str, Any]:
-    """A georeference as plain values, for JSON."""
+    """Georeference as plain values for JSON."""
     return {
         "origin_lat_lon_height": [float(v) for v in georeference.origin],
         "T_enu_world": georeference.T_enu_world.tolist(),
@@ -225,13 +225,13 @@ def georeference_note(georeference: Georeference) -> dict[str, Any]:
 
 
 def height_note(georeference: Georeference) -> dict[str, Any]:
-    """What its heights count from, where that is not the ellipsoid or the coordinate reference system's own."""
+    """Zero level of the heights, where it is neither the ellipsoid nor that of the coordinate reference system."""
     said = {"height_epsg": georeference.height_epsg, "geoid": georeference.geoid}
     return {name: value for name, value in said.items() if value}
 
 
 def georeference_of(note: Any) -> Georeference | None:
-    """What `georeference_note`, or a manifest, says; None when that is nothing."""
+    """Georeference from the values of `georeference_note` or a manifest; None when there is none."""
     try:
         origin = np.array(note["origin_lat_lon_height"], np.float64).reshape(3)
         T_enu_world = np.array(note["T_enu_world"], np.float64).reshape(4, 4)
@@ -250,9 +250,9 @@ def georeference_of(note: Any) -> Georeference | None:
 
 
 def in_own_world(path: Path, cloud: ArrayCloud) -> tuple[ArrayCloud, Georeference | None]:
-    """A map in the world of the run that wrote it, and where that lies on the Earth.
+    """Map in the world of the run that wrote it, and its georeference.
 
-    One that no run wrote, or that lies nowhere, is in its own coordinates.
+    A map of another program, or without a georeference, stays in its own coordinates.
     """
     about = note_of(path)
     georeference = georeference_of(about.get("georeference"))

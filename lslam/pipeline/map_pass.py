@@ -53,8 +53,10 @@ MOST_SCANS = 30
 
 @dataclass(frozen=True)
 class BuiltMap:
-    """The merged map, its view from above, some of its points for pages, what was done to it, in words, and the
-    occupancy when it was asked for."""
+    """Result of building a map: the merged map, its top view, and a sample of its points for pages.
+
+    Also the processing steps, in words, and the occupancy if requested.
+    """
 
     merged: Cloud
     view: TopView
@@ -67,10 +69,11 @@ def build_map(
     sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool], spool: Path | None = None, checkpoints: MapCheckpoints | None = None,
 ) -> BuiltMap:  # fmt: skip
-    """Merge every scan that was registered; bridged scans, and those of another frame, would draw their error into the map.
+    """Merge every registered scan.
 
-    A map too large for memory is kept in a temporary folder in `spool` meanwhile. Raises InterruptedRunError when
-    `should_stop` says so; `checkpoints` know then where to go on.
+    Bridged scans, and scans of another frame, are left out: their error would enter the map. A map too large for memory is
+    kept in a temporary folder in `spool`. Raises InterruptedRunError when `should_stop` says so; `checkpoints` then allow to
+    continue.
     """
     section = config.map
     poses = np.stack([r.T_world_lidar for r in results])
@@ -95,10 +98,10 @@ def scans_again(
     sequence: Sequence, prepare: Callable[[Scan], Any], numbers: range, config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool], interrupted: str, done: int = 0, offer: Callable[[int, bool], None] | None = None,
 ) -> Iterator[tuple[int, Loaded]]:  # fmt: skip
-    """A second pass over raw scans: their numbers, and what `prepare` made of them while the caller works on earlier ones.
+    """Second pass over raw scans: their numbers, and the results of `prepare`, which runs ahead in a thread.
 
     interrupted : message of the InterruptedRunError that is raised when `should_stop` says so
-    done : so many scans an earlier pass is done with; offer : is called with each further number, and whether it is the last
+    done : number of scans that an earlier pass has done; offer : is called with each further number, and whether it is the last
     """
     for _ in range(done):
         on_step()
@@ -115,7 +118,7 @@ def scans_again(
 
 
 def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], PosedScan | None]:
-    """What deskews a scan by the poses of all and puts it at its own; None for one that was not registered.
+    """Function that deskews a scan by all poses and moves it to its own; it returns None for an unregistered scan.
 
     For the thread that reads, since merging takes as long as reading and deskewing together.
     """
@@ -137,9 +140,9 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
 
 
 class MapMaker:
-    """What the scans of a run go through on their way into its map: cleaning, merging, the occupancy.
+    """Processing of scans into a map: cleaning, merging, occupancy.
 
-    section : what is asked for; spool : folder for maps too large for memory; keep : for one that is gone on with
+    section : configuration; spool : folder for maps too large for memory; keep : folder for a map that can be resumed
     up : (3,) unit vector, up in the world of the scans
     """
 
@@ -159,12 +162,12 @@ class MapMaker:
         self._given: list[int] = []
 
     def add(self, number: int, scan: PosedScan) -> None:
-        """One more registered scan, and its number among all scans."""
+        """Add a registered scan, and its number among all scans."""
         self._given.append(number)
         self._merge([scan] if self._cleaner is None else self._cleaner.add(scan))
 
     def finish(self) -> BuiltMap:
-        """The map of all that was added."""
+        """Map of all added scans."""
         if self._cleaner is not None:
             self._merge(self._cleaner.finish())
             log.info("map: %d of %d points moved and are left out", self._cleaner.removed, self._cleaner.seen)
@@ -178,14 +181,14 @@ class MapMaker:
         return BuiltMap(merged, view, thinned(merged, SAMPLE), done, occupancy)
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; voxels and cells go to `keep`."""
+        """State for `restore`; voxels and cells are written to `keep`."""
         parts = {"merger": self._merger, "cleaner": self._cleaner, "occupancy": self._occupancy}
         return {name: part.state() for name, part in parts.items() if part is not None} | {
             "given": np.array(self._given, np.int64)
         }
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken, in an empty maker of the same kind; raises InputError when voxels are missing."""
+        """Restore `state` in an empty maker of the same kind. Raises InputError when voxels are missing."""
         self._merger.restore(state["merger"])
         self._given = state["given"].tolist()
         if self._occupancy is not None:
@@ -194,7 +197,7 @@ class MapMaker:
             del self._given[self._cleaner.restore(state["cleaner"]) :]
 
     def first_again(self, done: int) -> int:
-        """With which scan reading has to begin, when `done` are done: the cleaner looks back."""
+        """Number of the scan from which reading must begin again after `done` scans, since the cleaner looks back."""
         if self._cleaner is None or not done:
             return done
         return self._given[-1] + 1 if self._given else 0
@@ -207,6 +210,7 @@ class MapMaker:
 
 
 def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:
+    """Processing steps of the map, in words."""
     done = [] if section.crop is None else [f"cropped to {list(section.crop)}"]
     if cleaner is not None:
         done.append(f"cleaned: {cleaner.removed} of {cleaner.seen} points moved")
@@ -214,9 +218,9 @@ def _done(section: MapConfig, cleaner: Cleaner | None) -> tuple[str, ...]:
 
 
 def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
-    """The scan without what lies in a box of the LiDAR frame (x_min, x_max, y_min, y_max, z_min, z_max), m.
+    """Scan without the points in a box of the LiDAR frame (x_min, x_max, y_min, y_max, z_min, z_max), m.
 
-    To be done before deskewing: what rides along does not move against the sensor.
+    It must be called before deskewing, since parts of the vehicle do not move relative to the sensor.
     """
     low, high = np.array(box[::2], np.float32), np.array(box[1::2], np.float32)
     inside = np.all((scan.points >= low) & (scan.points <= high), axis=1)
@@ -224,7 +228,7 @@ def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
 
 
 def motion_within(scan: Scan, stamps_ns: Longs, poses: Floats) -> MotionPrior:
-    """How the sensor moved during a sweep, from the final poses (N, 4, 4) of all scans; one pose when they cannot say."""
+    """Motion of the sensor during a sweep, from the final poses (N, 4, 4) of all scans; one pose if they do not tell."""
     times = knots_over(scan.span)
     if len(times) < 2 or len(stamps_ns) < 2:
         return MotionPrior.at_once(np.eye(4))
@@ -232,20 +236,20 @@ def motion_within(scan: Scan, stamps_ns: Longs, poses: Floats) -> MotionPrior:
 
 
 class Maker(Protocol):
-    """What makes a map of scans, one after the other."""
+    """Interface of a map builder that takes scan after scan."""
 
     def state(self) -> State:
-        """What `restore` needs to go on from here."""
+        """State for `restore`."""
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken, in an empty maker of the same kind; raises InputError when voxels are missing."""
+        """Restore `state` in an empty maker of the same kind. Raises InputError when voxels are missing."""
 
 
 M = TypeVar("M", bound=Maker)
 
 
 class MapCheckpoints:
-    """What an interrupted pass over the scans leaves to one over the same poses."""
+    """Checkpoints of a pass over scans, for a later pass over the same poses after an interruption."""
 
     def __init__(self, checkpoints: Checkpoints, what: str) -> None:
         self._checkpoints, self._what = checkpoints, what
@@ -253,11 +257,11 @@ class MapCheckpoints:
 
     @property
     def folder(self) -> Path:
-        """Where voxels are kept, in folders of their own."""
+        """Folder for the voxels, in subfolders."""
         return self._checkpoints.folder
 
     def begin(self, make: Callable[[], M], poses: Floats) -> tuple[M, int]:
-        """A maker that is where an earlier pass over `poses` (N, 4, 4) left off, and after how many scans that was."""
+        """Maker in the state of an earlier pass over `poses` (N, 4, 4), and the number of scans it has done."""
         self._poses = hashlib.sha256(np.ascontiguousarray(poses).tobytes()).hexdigest()
         latest, maker = self._checkpoints.latest(), make()
         try:
@@ -279,7 +283,7 @@ class MapCheckpoints:
 
 
 def map_checkpoints(folder: RunFolder, config: Config, what: str = "map") -> MapCheckpoints | None:
-    """Those of a run folder; None when they are not wanted."""
+    """Checkpoints of a run folder; None when they are not wanted."""
     every_s = config.odometry.checkpoint_s
     if every_s == 0:
         return None
@@ -301,7 +305,7 @@ class FeatureCloud:
 
 
 class FeatureMaker:
-    """Less sharp edges and less planar points in voxels; keep : folder for a map that is gone on with."""
+    """Averages less sharp edges and less planar points in voxels; keep : folder for a map that can be resumed."""
 
     def __init__(self, voxel: float, reach: float, keep: Path | None = None) -> None:
         self._parts = {
@@ -310,22 +314,22 @@ class FeatureMaker:
         }
 
     def add(self, features: Features, T_world_lidar: Floats) -> None:
-        """Those of one more scan, and its pose (4, 4)."""
+        """Add the features of a scan at its pose (4, 4)."""
         self._parts["edges"].add(features.less_edges.points, T_world_lidar)
         self._parts["planes"].add(features.less_planes.points, T_world_lidar)
 
     def finish(self) -> FeatureCloud:
-        """The map of all that was added."""
+        """Map of all added features."""
         both = [part.result().points for part in self._parts.values()]
         kinds = np.repeat(np.array([EDGE, PLANE], np.uint8), [len(points) for points in both])
         return FeatureCloud(np.concatenate(both), kinds)
 
     def state(self) -> State:
-        """What `restore` needs to go on from here; the voxels go to `keep`."""
+        """State for `restore`; the voxels are written to `keep`."""
         return {name: part.state() for name, part in self._parts.items()}
 
     def restore(self, state: State) -> None:
-        """Go on where `state` was taken, in an empty maker of the same kind; raises InputError when voxels are missing."""
+        """Restore `state` in an empty maker of the same kind. Raises InputError when voxels are missing."""
         for name, part in self._parts.items():
             part.restore(state[name])
 
@@ -334,9 +338,9 @@ def build_feature_map(
     sequence: Sequence, odometry: FeatureSource, results: list[ScanResult], config: Config, on_step: Callable[[], None],
     should_stop: Callable[[], bool], checkpoints: MapCheckpoints | None = None,
 ) -> FeatureCloud:  # fmt: skip
-    """Less sharp edges and less planar points of every scan that was registered, in voxels of `loam.feature_map_voxel`.
+    """Map of the less sharp edges and less planar points of all registered scans, in voxels of `loam.feature_map_voxel`.
 
-    Raises InterruptedRunError when `should_stop` says so; `checkpoints` know then where to go on.
+    Raises InterruptedRunError when `should_stop` says so; `checkpoints` then allow to continue.
     """
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     poses = np.stack([r.T_world_lidar for r in results])
@@ -358,7 +362,7 @@ def build_feature_map(
 
 
 def view_features(sequence: Sequence, odometry: FeatureSource, results: list[ScanResult]) -> FeatureView | None:
-    """The features of some of the scans that were registered, at their final poses; None without any.
+    """Features of some of the registered scans, at their final poses; None without any.
 
     A scan that can no longer be read, or has no features, is left out.
     """

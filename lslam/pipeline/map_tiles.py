@@ -1,4 +1,4 @@
-"""The map in square tiles with an index, each a file of its own; one tile is in memory at a time."""
+"""Map in square tiles with an index, each a file; one tile is in memory at a time."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def rebuild_in_tiles(
     run: EarlierRun, sequence: Sequence, folder: Path, size: float, *, crs: OutputCrs | None = None,
     on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Any]:  # fmt: skip
-    """The map of a run anew, in tiles of `size` m, in `folder`, which `check_tiles` has checked; gives the index.
+    """Build the map of a run again, in tiles of `size` m, in `folder`, checked by `check_tiles`. Returns the index.
 
     Raises as `rebuild` does.
     """
@@ -55,7 +55,7 @@ def rebuild_in_tiles(
 def write_tiles(
     folder: Path, cloud: Cloud, note: MapNote, size: float, suffix: str, georeference: Georeference | None = None
 ) -> dict[str, Any]:
-    """Write the cloud as `folder`/tile_X_Y.<suffix> and the index map.json, which it gives.
+    """Write the cloud as `folder`/tile_X_Y.<suffix> and the index map.json. Returns the index.
 
     Tile X, Y holds X * size <= x < (X + 1) * size, m, of the world, or of the coordinate reference system in LAS and LAZ of a
     georeferenced run. Raises OutputError, and UsageError for coordinates that no map can be written in.
@@ -85,7 +85,7 @@ def write_tiles(
 
 
 def _publish(stage: Path, folder: Path, names: set[str]) -> None:
-    """Give the tiles their place, those of an earlier map gone; the index follows, so that it never tells of tiles to come."""
+    """Remove the old index and tiles not in `names`, then move the new tiles to their place. The index follows later."""
     with output_errors(f"the tiles in {folder}"):
         (folder / INDEX).unlink(missing_ok=True)
         for file in folder.glob("tile_*_*.*"):
@@ -96,7 +96,7 @@ def _publish(stage: Path, folder: Path, names: set[str]) -> None:
 
 
 def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple[int, int], ArrayCloud]]:
-    """The points of each tile, tiles in order."""
+    """Points of each tile, tiles in order."""
     waiting: dict[tuple[int, int], list[Floats]] = {}
     held, keys = 0, set[tuple[int, int]]()
     with output_errors(f"the tiles in {spool.parent}"):
@@ -120,7 +120,7 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
 
 
 def _spill(waiting: dict[tuple[int, int], list[Floats]], spool: Path) -> set[tuple[int, int]]:
-    """Append what waits to the files of its tiles."""
+    """Append the buffered points to the files of their tiles."""
     for key, parts in waiting.items():
         with ExitStack() as stack:
             stream = stack.enter_context(_part(spool, key).open("ab"))
@@ -151,7 +151,7 @@ def read_tiles(folder: Path) -> tuple[ArrayCloud, dict[str, Any]]:
 
 
 def check_tiles(folder: Path, size: float, overwrite: bool) -> None:
-    """Raise UsageError, OutputExistsError or OutputError before any work is done for tiles that will not do."""
+    """Raise UsageError, OutputExistsError or OutputError for an impossible output of tiles, before any work is done."""
     if not 1.0 <= size <= 10_000.0:
         raise UsageError(f"--tiles {size:g} is out of range: 1 to 10000 m")
     if folder.exists() and any(folder.iterdir()):

@@ -1,4 +1,4 @@
-"""Several runs made one: each tied to the others, loops between all keyframes, one robust pose graph, one map."""
+"""Merging of several runs: each is placed relative to the others; then loops, one robust pose graph, and one map."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Stop = Callable[[], bool]
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A session that could not be tied to the others, and why."""
+    """A session that could not be connected to the others, and the reason."""
 
     name: str
     why: str
@@ -44,7 +44,7 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Merged:
-    """The outcome.
+    """Result of `merge_runs`.
 
     runs : that were merged, in the order in which they were tied; sessions : likewise, at the poses they were tied at
     results : all scans of each at their final poses, in the common world: that of the first
@@ -62,15 +62,15 @@ class Merged:
     left_out: list[LeftOut] = field(default_factory=list)
 
     def between(self, session: int) -> int:
-        """Accepted loops that join a session with another."""
+        """Accepted loops between two sessions."""
         ends = [(self.chain.session_of(c.a), self.chain.session_of(c.b)) for c in self.candidates if c.is_accepted]
         return sum(a != b and session in (a, b) for a, b in ends)
 
 
 def expanded(folders: Sequence[Path]) -> list[Path]:
-    """Run folders, with those of a merged folder in its place.
+    """Run folders, where a merged folder is replaced by its runs.
 
-    Raises InputError for a folder that is none, UsageError for fewer than two or one that is named twice.
+    Raises InputError for a folder that is no run, UsageError for fewer than two or a duplicate.
     """
     out: list[Path] = []
     for folder in folders:
@@ -86,7 +86,7 @@ def expanded(folders: Sequence[Path]) -> list[Path]:
 
 
 def sessions_of(folder: Path) -> list[Path] | None:
-    """The run folders that a merged folder was made of, None of the folder of a single run."""
+    """Run folders behind a merged folder, None for the folder of a single run."""
     try:
         manifest = parse_json((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -97,7 +97,7 @@ def sessions_of(folder: Path) -> list[Path] | None:
 
 
 def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:
-    """A run with its keyframes; raises InputError when there are none."""
+    """Session of a run with its keyframes. Raises InputError when there are none."""
     run = read_run(folder)
     store = KeyframeStore(folder / KEYFRAMES)
     if len(store) < 2:
@@ -112,7 +112,7 @@ def read_session(folder: Path, name: str) -> tuple[EarlierRun, Session]:
 
 
 def _with_covariances(run: EarlierRun) -> list[ScanResult]:
-    """The run's scans, with the covariances of their registrations where they are kept."""
+    """Scans of the run, with the covariances of their registrations if stored."""
     results = results_of(run)
     path = run.folder / "covariances.npz"
     if not path.is_file():
@@ -130,16 +130,16 @@ def merge_runs(
     folders: Sequence[Path], config: Config, should_stop: Stop = lambda: False,
     on_stage: Callable[[str], None] = lambda stage: None, checkpoints: Checkpoints | None = None,
 ) -> Merged:  # fmt: skip
-    """Tie, close loops, optimise.
+    """Connect the sessions, find loops, optimise.
 
-    The first run gives the world. Raises RunFailedError when nothing can be tied to it, InterruptedRunError when `should_stop`
-    says so; InputError and UsageError as `expanded` and `read_session`.
+    The first run defines the world. Raises RunFailedError when no other can be connected to it, InterruptedRunError when
+    `should_stop` says so; InputError and UsageError as `expanded` and `read_session`.
     """
     read = [read_session(folder, name) for folder, name in zip(folders, names_of(folders), strict=True)]
     warm_up(config.loops)
     runs = {session.name: run for run, session in read}
     on_stage("tie")
-    tied, left_out = _tied([session for _, session in read], config, should_stop)
+    tied, left_out = _connect([session for _, session in read], config, should_stop)
     while True:
         if len(tied) < 2:
             raise RunFailedError(
@@ -149,7 +149,7 @@ def merge_runs(
         on_stage("loops")
         candidates = _loops(chain, config, should_stop, checkpoints)
         on_stage("graph")
-        merged = _solved(chain, candidates, config, runs, left_out, should_stop)
+        merged = _solve(chain, candidates, config, runs, left_out, should_stop)
         loose = [n for n in range(1, len(tied)) if merged.between(n) == 0]
         if not loose:
             return merged
@@ -158,7 +158,7 @@ def merge_runs(
 
 
 def names_of(folders: Sequence[Path]) -> list[str]:
-    """Their names, with a number where two are the same."""
+    """Names of the runs, with a number added to duplicates."""
     names: list[str] = []
     for folder in folders:
         name = folder.absolute().name
@@ -167,8 +167,11 @@ def names_of(folders: Sequence[Path]) -> list[str]:
     return names
 
 
-def _tied(sessions: list[Session], config: Config, should_stop: Stop) -> tuple[list[Session], list[LeftOut]]:
-    """The sessions that are found among those before them, the first given; tried again as long as more of the town is known."""
+def _connect(sessions: list[Session], config: Config, should_stop: Stop) -> tuple[list[Session], list[LeftOut]]:
+    """Sessions connected to the ones before, starting with the first.
+
+    Failed ones are tried again after each success, since more of the place is mapped then.
+    """
     tied, waiting, why = [sessions[0]], sessions[1:], {}
     while waiting:
         left = []
@@ -190,7 +193,7 @@ def _tied(sessions: list[Session], config: Config, should_stop: Stop) -> tuple[l
 
 
 def _loops(chain: Chain, config: Config, should_stop: Stop, checkpoints: Checkpoints | None) -> list[LoopCandidate]:
-    """Loop candidates of the whole chain; what an interrupted merge found of the same keyframes serves again."""
+    """Loop candidates of the whole chain; those of an interrupted merge with the same keyframes are reused."""
     known = None if checkpoints is None else checkpoints.latest()
     if known is not None and np.array_equal(known["poses"], chain.poses):
         found: list[LoopCandidate] = known["candidates"]
@@ -203,7 +206,7 @@ def _loops(chain: Chain, config: Config, should_stop: Stop, checkpoints: Checkpo
     return candidates
 
 
-def _solved(
+def _solve(
     chain: Chain, candidates: list[LoopCandidate], config: Config, runs: dict[str, EarlierRun], left_out: list[LeftOut],
     should_stop: Stop,
 ) -> Merged:  # fmt: skip

@@ -1,4 +1,4 @@
-"""What merging runs writes: a trajectory a session, the graph, one map, a page, and a manifest that names the runs."""
+"""Output of merging runs: a trajectory per session, the graph, a map, a page, and a manifest."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ COLUMNS = "session,run,scans,keyframes,first_keyframe,start_votes,start_tried,lo
 
 @dataclass(frozen=True)
 class SessionRow:
-    """One session of a merged folder, for people and programs. `ate` : se3, m, alone and merged; None without truth."""
+    """One session of a merged folder, for tables and JSON. `ate` : se3, m, alone and merged; None without truth."""
 
     name: str
     run: str
@@ -61,7 +61,7 @@ def merge_into(
     folders: Sequence[Path], out: Path, config: Config, watch: Watch, *, overwrite: bool = False, resume: bool = False,
     command: str = "",
 ) -> dict[str, Any]:  # fmt: skip
-    """Merge runs into the folder `out`, and give its manifest.
+    """Merge runs into the folder `out`. Returns its manifest.
 
     Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`.
     """
@@ -86,7 +86,7 @@ def merge_into(
 
 
 def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> dict[str, Any]:
-    """Everything but the manifest, whose content it gives."""
+    """Write everything but the manifest, and return the manifest's content."""
     problems = [f"{one.name} is left out: {one.why}" for one in merged.left_out]
     recordings = [_recording(run, problems) for run in merged.runs]
     trajectories = [to_trajectory(results, "merge") for results in merged.results]
@@ -129,7 +129,7 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
 
 
 def _recording(run: EarlierRun, problems: list[str]) -> Recording | None:
-    """The raw scans of a run, None and one more of the problems where they are gone."""
+    """Raw scans of a run; None, with a problem, where they are missing."""
     try:
         return open_scans(run)
     except InputError as error:
@@ -163,7 +163,7 @@ def _rows(
 def _ate(
     before: Trajectory, after: Trajectory, recording: Recording | None, config: Config
 ) -> tuple[float, float] | None:
-    """m, se3, of a session alone and merged; None without ground truth."""
+    """ATE, se3, m, of a session alone and merged; None without ground truth."""
     if recording is None or recording.ground_truth is None:
         return None
     errors = []
@@ -188,7 +188,7 @@ def _line(row: SessionRow) -> str:
 
 
 def _georeference(merged: Merged) -> Georeference | None:
-    """Where the common world lies on the Earth, by the first session that knows."""
+    """Georeference of the common world, by the first session that has one."""
     for n, run in enumerate(merged.runs):
         if run.georeference is not None:
             first = merged.sessions[n].keyframes[0].T_world_lidar
@@ -205,7 +205,7 @@ def _map(
     spool: Path,
     up: Floats,
 ) -> BuiltMap:
-    """The scans of all sessions in one map; up : (3,) unit vector in their common world."""
+    """Map of the scans of all sessions; up : (3,) unit vector in their common world."""
     watch.on_start(
         "map", sum(len(r) for r, recording in zip(results, recordings, strict=True) if recording is not None)
     )

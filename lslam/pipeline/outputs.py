@@ -1,4 +1,4 @@
-"""What a run writes: trajectories, tables of loops, matches with buildings, times and IMU states, map, evaluation, report."""
+"""Output files of a run: trajectories, tables of loops, building matches, times and IMU states, map, evaluation, report."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def write_loops(path: Path, candidates: Sequence[LoopCandidate], scans: Sequence
 
 
 def _sigmas(candidate: LoopCandidate) -> tuple[float, float]:
-    """m and deg."""
+    """Largest standard deviations of position, m, and rotation, deg."""
     if candidate.constraint is None:
         return float("nan"), float("nan")
     C = candidate.constraint.covariance
@@ -108,7 +108,7 @@ def timing_text(
     indices: list[int], stamps_ns: list[int], names: list[str], seconds: Floats,
     back_end: Mapping[int, Mapping[str, float]] | None = None, saved: Mapping[int, float] | None = None,
 ) -> str:  # fmt: skip
-    """The file of scans by number and stamp, with seconds (N, S) of the stages `names`.
+    """Table of times of scans by number and stamp, with seconds (N, S) of the stages `names`.
 
     back_end : seconds by row and name, of stages that do not count in the total of a scan
     saved : seconds by row that were not needed, a column when there are any; empty where nobody knows
@@ -127,7 +127,7 @@ def timing_text(
 
 
 def imu_states_text(results: Iterable[ScanResult]) -> str:
-    """What was known of the IMU, each value beside its standard deviation: a row per scan that has an `ImuState`.
+    """Table of IMU states, each value with its standard deviation: a row per scan that has an `ImuState`.
 
     A state that is not estimated is empty. SI units, radians.
     """
@@ -149,17 +149,17 @@ BYTES_PER_SCAN, BYTES_OF_REPORT = 4000, 500_000
 
 
 def least_bytes(scans: int) -> int:
-    """What a run of so many scans writes, map aside."""
+    """Least size of a run's output, bytes, without the map."""
     return BYTES_OF_REPORT + BYTES_PER_SCAN * scans
 
 
 def config_text(config: Config) -> str:
-    """config.toml: a run repeats with `--config` and this file."""
+    """Text of config.toml: `--config` with this file repeats the run."""
     return f"# lslam {__version__}, resolved configuration\n" + to_toml(config)
 
 
 def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibration) -> None:
-    """trajectory.tum (LiDAR), trajectory_kitti.txt (camera 0 when Tr is known, else LiDAR), covariances.npz."""
+    """Write trajectory.tum (LiDAR), trajectory_kitti.txt (camera 0 if Tr is known, else LiDAR) and covariances.npz."""
     trajectory = record.trajectory
     frames = np.array([r.frame for r in record.results])
     title = f"lslam {__version__}, {record.method}: T_world_lidar"
@@ -188,9 +188,9 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
 
 
 def write_scans(folder: RunFolder, record: RunRecord) -> None:
-    """timing.csv, seconds per stage, those of the back end beside their sum, and scans.csv, what became of each scan.
+    """Write timing.csv, seconds per stage with those of the back end apart, and scans.csv, the result of each scan.
 
-    With an IMU also imu_states.csv, what was known of it after each.
+    With an IMU also imu_states.csv, its estimated state after each scan.
 
     `saved_s` of timing.csv is what the IMU saved where a scan was registered from constant velocity too, empty elsewhere.
     """
@@ -217,9 +217,9 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
 
 
 def write_localization(folder: RunFolder, record: RunRecord) -> None:
-    """localization.csv: each scan against the map that the run was located in, its place in the coordinates of the map's file.
+    """Write localization.csv: the result of each scan on the prior map, with positions in the coordinates of the map's file.
 
-    trajectory.geojson where that map lies on the Earth.
+    Also write trajectory.geojson if that map is georeferenced.
     """
     rows = [
         "index,stamp_ns,status,doubted,overlap,inlier_share,innovation_m,innovation_deg,sigma_m,sigma_deg,x,y,z,reason"
@@ -241,7 +241,7 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
 
 
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
-    """map.ply, .pcd, .las or .laz with map.json beside, in map coordinates where the run knows where it is."""
+    """Write map.ply, .pcd, .las or .laz with map.json beside, in map coordinates if the run is georeferenced."""
     points = len(built.merged) + (0 if built.occupancy is None else len(built.occupancy))
     folder.require_space(BYTES_PER_POINT * points + BYTES_PER_POINT_SHOWN * len(built.sample), "the map")
     path = folder.path / f"map.{config.format}"
@@ -249,7 +249,7 @@ def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: Run
 
 
 def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
-    """feature_map.ply, world frame of the trajectory; the scalar `class` is 1 on edges and 0 on planes."""
+    """Write feature_map.ply, world frame of the trajectory; the scalar `class` is 1 on edges and 0 on planes."""
     folder.require_space(BYTES_PER_POINT * len(features), "the feature map")
     write_ply(
         folder.path / "feature_map.ply", features.points, scalars={"class": features.kinds},
@@ -258,7 +258,7 @@ def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
 
 
 def write_evaluation(folder: RunFolder, record: RunRecord, evaluation: Evaluation | None) -> None:
-    """evaluation.json, when ground truth or a map is known."""
+    """Write evaluation.json, when ground truth or a map is known."""
     document = run_document(record, evaluation)
     if document is not None:
         text = json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False)
@@ -266,14 +266,14 @@ def write_evaluation(folder: RunFolder, record: RunRecord, evaluation: Evaluatio
 
 
 def write_html(folder: RunFolder, record: RunRecord, evaluation: Evaluation | None) -> None:
-    """report.html."""
+    """Write report.html."""
     from lslam.reports.html import write_report
 
     write_report(folder.path / "report.html", record, evaluation)
 
 
 def _in_camera(trajectory: Trajectory, calibration: Calibration) -> Trajectory:
-    """Poses of camera 0 in camera 0 at the start, of the LiDAR likewise when no Tr is known: the file's first is the identity."""
+    """Poses of camera 0 in camera 0 at the start, or of the LiDAR if Tr is unknown; the first is the identity."""
     poses = se3.relative(trajectory.poses[:1], trajectory.poses)
     T = calibration.T_cam0_lidar
     if T is None:

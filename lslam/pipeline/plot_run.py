@@ -1,4 +1,4 @@
-"""What the figures of a run are drawn of, from its folder and, where they need it, from its recording."""
+"""Data for the figures of a run, from its folder and, if needed, from its recording."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def plotted_run(
     folder: Path, what: str, sequence: Path | None = None,
     truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None, **reading: Any,
 ) -> PlottedRun:  # fmt: skip
-    """As much of the run as the figure `what` shows.
+    """Parts of the run that the figure `what` needs.
 
     sequence : where the raw scans have moved; truth_of : gives what replaces the recording's truth, None for nothing
     reading : as `open_sequence`
@@ -74,7 +74,7 @@ def write_figure(run: PlottedRun, what: str, path: Path, width: float, font: flo
 
 
 def width_of(text: str) -> float:
-    """mm, of `column`, `page` or a number; raises UsageError."""
+    """Width of a figure, mm, from `column`, `page` or a number. Raises UsageError."""
     if text in WIDTHS:
         return WIDTHS[text]
     try:

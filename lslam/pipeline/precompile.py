@@ -1,7 +1,7 @@
-"""The kernels of a run, compiled or loaded before its first scan: one table says which part of a run calls which.
+"""Kernels of a run, compiled or loaded before its first scan, by a table of kernels per part of a run.
 
-Cold start: a second process compiles what the first comes to last, on a core that would be idle meanwhile. The compiler has one
-lock for all threads of a process. Both keep their kernels in the same cache, and load what is there.
+At a cold start a second process compiles the kernels that the first needs last, on an idle core. A process is needed since
+the compiler has one lock for all threads. Both share one cache.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ KERNELS = {
 
 
 class Warmed(Protocol):
-    """What has kernels of its own."""
+    """Object with kernels of its own."""
 
     def warm_up(self) -> None:
         """Compile or load them."""
@@ -72,7 +72,10 @@ class Warmed(Protocol):
 
 
 def load_kernels(config: Config, trackers: Iterable[Warmed], *, is_over: bool = False) -> None:
-    """Compile or load what a run calls; trackers : what sees its scans; is_over : all of these are registered."""
+    """Compile or load the kernels that a run calls.
+
+    trackers : those that process its scans; is_over : all of these are registered
+    """
     for tracker in () if is_over else trackers:
         tracker.warm_up()
     for part in KERNELS.values():
@@ -82,9 +85,9 @@ def load_kernels(config: Config, trackers: Iterable[Warmed], *, is_over: bool = 
 
 @contextmanager
 def helped(config: Config) -> Iterator[Callable[[], None]]:
-    """What starts the second process, and has effect once; it ends with the block, whether it was done or not.
+    """Context with a function that starts the second process once; the process ends with the block.
 
-    Without a second core, or a cache that both can reach, nothing starts.
+    Without a second core, or a shared cache, nothing starts.
     """
     started: list[subprocess.Popen[bytes]] = []
 
@@ -108,7 +111,7 @@ def helped(config: Config) -> Iterator[Callable[[], None]]:
 
 
 def main(names: list[str]) -> None:
-    """Compile what the parts of that name have for the second process."""
+    """Compile the second process's share of the kernels of the named parts."""
     for name in names:
         ahead = KERNELS[name].ahead
         if ahead is not None:

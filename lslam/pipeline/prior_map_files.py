@@ -1,4 +1,4 @@
-"""The map that a drive is located in, read from what an earlier run or another program left."""
+"""Prior map for localisation, read from the output of an earlier run or another program."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LARGE, KILOMETRE = 1e5, 1000.0
 
 
 def require_map(target: Path, needs_place: bool = False) -> Path:
-    """The cloud file of a map, or its folder of tiles, before it is read: raises InputError when there is none.
+    """Cloud file of a map, or its folder of tiles, without reading it. Raises InputError when there is none.
 
     needs_place : satellite fixes are to lead into it. Raises UsageError when nobody knows where it lies on the Earth.
     """
@@ -54,7 +54,7 @@ def _cloud_file(target: Path) -> Path:
 
 
 def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
-    """The map, in coordinates that lie near it: those of the run, or of the file less whole kilometres.
+    """Read the map, in coordinates near it: those of the run, or of the file less whole kilometres.
 
     Raises InputError naming what is missing or broken.
     """
@@ -74,7 +74,7 @@ def read_prior_map(target: Path, config: RegistrationConfig) -> PriorMap:
 
 
 def _up_of(folder: Path) -> Floats:
-    """(3,) up in the world of the run in a folder, by the mounting of its sensor; z where there is none."""
+    """(3,) up in the world of the run in a folder, by the mounting of its sensor; z by default."""
     try:
         return read_session(folder, folder.name)[1].up
     except (InputError, ConfigError):

@@ -1,4 +1,4 @@
-"""The map of an earlier run built anew, from the raw scans and the poses the run found: no odometry."""
+"""Building the map of an earlier run again, from its raw scans and poses, without odometry."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ _KEPT = "%s keeps the figures of the map before: it %s"
 
 @dataclass(frozen=True)
 class EarlierRun:
-    """What a run folder says: its configuration with new settings over it, its poses, which scans were registered."""
+    """Content of a run folder: configuration with new settings applied, poses, and which scans were registered."""
 
     folder: Path
     manifest: dict[str, Any]
@@ -80,24 +80,24 @@ class EarlierRun:
 
     @property
     def sequence_path(self) -> str:
-        """Where the raw scans lay."""
+        """Path of the raw scans at the time of the run."""
         return str(self.manifest.get("sequence", {}).get("path", ""))
 
     @property
     def topics(self) -> dict[str, str]:
-        """Which topics and LiDARs of a bag were asked for; extrinsics are of no use to a map."""
+        """Topics and LiDARs of a bag that the run used; a map needs no extrinsics."""
         reading = self.manifest.get("sequence", {}).get("reading", {})
         return {name: str(text) for name, text in reading.items() if name.endswith(("_topic", "_frame"))}
 
     @property
     def world(self) -> str:
-        """Where its coordinates begin and whether z is up, in words."""
+        """Description of the world: its origin, and whether z is up."""
         return str(self.manifest.get("frames", {}).get("world", "LiDAR at the first scan"))
 
 
 @dataclass(frozen=True)
 class RebuiltMap:
-    """What `rebuild` wrote."""
+    """Result of `rebuild`."""
 
     path: Path
     points: int
@@ -130,12 +130,12 @@ def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
 
 
 def is_gone(run: EarlierRun) -> bool:
-    """Whether the recording is no longer where it was."""
+    """Whether the recording is missing at its old path."""
     return not as_path(run.sequence_path).exists()
 
 
 def recording_of(run: EarlierRun, sequence: Path | None = None, flag: str = "--sequence") -> Path:
-    """Where the run's recording lies, or what it has moved to; raises InputError when it is gone, naming the `flag`."""
+    """Path of the run's recording, or its new place. Raises InputError naming the `flag` when it is missing."""
     if sequence is None and is_gone(run):
         raise InputError(
             f"the raw scans of {run.folder} are gone: {run.sequence_path} does not exist; say where they are with {flag}"
@@ -144,7 +144,7 @@ def recording_of(run: EarlierRun, sequence: Path | None = None, flag: str = "--s
 
 
 def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--sequence", **reading: Any) -> Sequence:
-    """The scans the run worked on; `sequence` names them where they have moved.
+    """Scans of the run; `sequence` names them if they have moved.
 
     flag : what to say where they are with; reading : goes to `open_sequence`, over the topics that the run was told
 
@@ -156,7 +156,7 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
     given = {name: value for name, value in reading.items() if value is not None}
     opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **(known | given))
     dropped = run.config.preprocess.drop_labels
-    opened = _clocked(run, with_labels(opened, "preprocess.drop_labels") if dropped else opened)
+    opened = _with_clock(run, with_labels(opened, "preprocess.drop_labels") if dropped else opened)
     opened = WithoutClasses(opened, dropped) if dropped else opened
     chosen = select(opened, section.start, section.count, section.skip_frames)
     count = len(run.trajectory)
@@ -167,8 +167,8 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
     return chosen
 
 
-def _clocked(run: EarlierRun, opened: Sequence) -> Sequence:
-    """The recording with the times of its points that the run decided on."""
+def _with_clock(run: EarlierRun, opened: Sequence) -> Sequence:
+    """Recording with the rule for its points' times as the run decided."""
     facts = run.manifest.get("sequence", {}).get("point_times")
     if facts is None:
         return opened
@@ -208,7 +208,7 @@ def rebuild(
         if should_stop():
             raise InterruptedRunError(INTERRUPTED)
         score = crispness(built.merged)
-        with _staged(path.parent) as stage:
+        with _stage(path.parent) as stage:
             write_built(
                 stage / path.name, built, run.config.map, sequence.name, run.trajectory, run.world, georeference
             )
@@ -220,7 +220,7 @@ def rebuild(
 
 
 def check_output(path: Path, overwrite: bool) -> None:
-    """Raise UsageError, OutputExistsError or OutputError before any work is done for a file that will not do."""
+    """Raise UsageError, OutputExistsError or OutputError for an impossible output file, before any work is done."""
     if path.suffix.lower() not in MAP_SUFFIXES:
         raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
     if not path.parent.is_dir():
@@ -233,7 +233,7 @@ def check_output(path: Path, overwrite: bool) -> None:
 
 
 def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
-    """Where the run lies, in the coordinates asked for."""
+    """Georeference of the run, in the requested coordinates."""
     georeference = run.georeference
     if crs is None:
         return georeference
@@ -248,7 +248,7 @@ def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
 
 
 def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> RunRecord:
-    """What the run's report shows of its map, and its manifest with this one in it."""
+    """Record for the run's report about its map, and the manifest with the new map."""
     points, section = len(built.merged), run.config.map
     about = {"file": name, "points": points, "voxel": section.voxel, "done": list(built.done)}
     manifest = {**run.manifest, "map_points": points, "map": about}
@@ -260,8 +260,8 @@ def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> Ru
 
 
 @contextmanager
-def _staged(folder: Path) -> Iterator[Path]:
-    """A folder within `folder` to write into, which is gone in the end."""
+def _stage(folder: Path) -> Iterator[Path]:
+    """Temporary folder within `folder`."""
     with output_errors(folder):
         stage = tempfile.TemporaryDirectory(prefix=SPOOL, dir=folder, ignore_cleanup_errors=True)
     with stage as path:
@@ -269,7 +269,7 @@ def _staged(folder: Path) -> Iterator[Path]:
 
 
 def _publish(stage: Path, path: Path) -> None:
-    """Give everything in `stage` its name beside `path`; at no instant does a note tell of another map than there is."""
+    """Rename all files in `stage` to beside `path`; at no instant does a note describe another map than the one on disk."""
     note = stage / path.with_suffix(".json").name
     write_json(note, note_with(path, note_of(stage / path.name)))
     drop_note(path)
@@ -280,7 +280,7 @@ def _publish(stage: Path, path: Path) -> None:
 
 
 def results_of(run: EarlierRun) -> list[ScanResult]:
-    """The poses and what became of the scans, as a run hands them to its map; scans keep their numbers in the recording."""
+    """Poses and results of the scans for building a map; scans keep their numbers in the recording."""
     section = run.config.input
     return [
         ScanResult(section.start + section.skip_frames * k, int(stamp), T, status)
@@ -303,7 +303,7 @@ def covariances_of(run: EarlierRun) -> Floats | None:
 
 
 def map_of(target: Path) -> Path:
-    """A map file, or the one that was written last in a run folder; raises InputError when there is none."""
+    """Map file, or the one written last in a run folder. Raises InputError when there is none."""
     if not target.is_dir():
         return target
     found = [target / f"map{suffix}" for suffix in MAP_SUFFIXES if (target / f"map{suffix}").is_file()]
@@ -313,7 +313,7 @@ def map_of(target: Path) -> Path:
 
 
 def _statuses(path: Path, count: int) -> tuple[Status, ...]:
-    """What became of each scan; scans of a run that left no table count as registered, those of another frame as bridged."""
+    """Status of each scan; without a table all count as registered, those of another frame as bridged."""
     known: dict[str, Status] = {"ok": "ok", "bridged": "bridged", "skipped": "skipped"}
     try:
         with path.open(newline="", encoding="utf-8", errors="replace") as stream:
@@ -334,7 +334,7 @@ def _statuses(path: Path, count: int) -> tuple[Status, ...]:
 
 
 def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
-    """Write into `target` what lies in the run folder `folder`, all of it as it is but what it says of the map.
+    """Write into `target` the files of the run folder `folder`, with the parts about its map renewed.
 
     record : of the new map, what is drawn with it, and the manifest as it shall be. A report that the run did not write is
         not made; what cannot be read is left alone, which is said. Raises OutputError.
@@ -357,7 +357,7 @@ def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
 
 
 def viewed_run(folder: Path) -> ViewedRun:
-    """Trajectory, odometry where there was a back end, and the map, all in the run's world.
+    """Trajectory, odometry if there was a back end, and map, all in the run's world.
 
     Raises InputError naming what is missing or broken; a run without a map is shown without one.
     """
@@ -370,7 +370,7 @@ def viewed_run(folder: Path) -> ViewedRun:
 
 
 def _cloud(folder: Path) -> ArrayCloud | None:
-    """The run's map; LAS of a georeferenced run comes back from its coordinates."""
+    """Map of the run; LAS of a georeferenced run is transformed back to its world."""
     try:
         path = map_of(folder)
     except InputError as error:

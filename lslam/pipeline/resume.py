@@ -1,4 +1,4 @@
-"""What a run takes over from an earlier one: the folder that it goes on in, or the odometry under a new pose graph."""
+"""Reuse of an earlier run: continuing in its folder, or taking its odometry for a new pose graph."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def input_digest(sequence: Sequence, truth: Trajectory | None) -> str:
 
 
 def listing_digest(path: Path) -> str:
-    """Likewise of a recording that is not opened: what is in it follows from its files.
+    """As `input_digest`, for a recording that is not opened: its content follows from its files.
 
     Raises InputError when it cannot be listed.
     """
@@ -76,7 +76,7 @@ def _listing(path: Path, scans: int) -> hashlib._Hash:
 
 
 def imu_digest(sequence: Sequence) -> str:
-    """Digest of what the IMU measured and where it sits: for KITTI odometry that lies outside of the recording's folder."""
+    """Digest of the IMU's data and mounting. For KITTI odometry these are outside of the recording's folder."""
     digest = hashlib.sha256()
     imu, T_lidar_imu = sequence.imu, sequence.calibration.T_lidar_imu
     for values in () if imu is None else (imu.stamps_ns, imu.accel, imu.gyro):
@@ -86,7 +86,7 @@ def imu_digest(sequence: Sequence) -> str:
 
 
 def job_digest(config: Config, of_input: str, of_imu: str = "") -> str:
-    """Digest of a run: its resolved configuration, its input, the IMU if it uses one, and lslam's version.
+    """Digest of a run: its resolved configuration, input, IMU if used, and lslam's version.
 
     Which metrics are shown makes no other run.
     """
@@ -118,7 +118,7 @@ def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
 def run_identity(
     sequence: Sequence, truth: Trajectory | None, config: Config, given: Trajectory | None = None
 ) -> dict[str, str]:
-    """What a run and its resumption must share beside the configuration; for manifest.json.
+    """Facts that a run and its resumption must share beside the configuration; for manifest.json.
 
     given : the poses of --poses
 
@@ -141,7 +141,7 @@ def run_identity(
 
 
 def _content(*paths: str) -> str:
-    """Digest of what files say; empty without any."""
+    """Digest of the content of files; empty without any."""
     try:
         known = [Path(path).read_bytes() for path in paths if path]
     except OSError as error:
@@ -160,7 +160,7 @@ def _digest(values: Iterable[Any]) -> str:
 
 
 def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
-    """Whether there is something to go on with; False when nothing was begun in `folder`.
+    """Whether there is a run to resume; False when nothing was begun in `folder`.
 
     Raises
     ------
@@ -187,7 +187,7 @@ def may_go_on(folder: Path, identity: dict[str, str], config: Config) -> bool:
 def _difference(
     known: dict[str, Any], version: str, begun: dict[str, Any], identity: dict[str, str], config: Config
 ) -> str:
-    """What differs between the run that was begun and this one, in words; empty when nothing does."""
+    """Differences between the earlier run and this one, in words; empty when there are none."""
     if version != __version__:
         return f"it was begun by lslam {version}, this is {__version__}"
     before, now = (_flat(tree) for tree in (begun, printable_tree(config.model_dump(mode="json"))))
@@ -213,7 +213,7 @@ def _difference(
 
 
 def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:
-    """Raise what a finished run ended with."""
+    """Raise the outcome of a finished run."""
     said = manifest.get("problems")
     why = "; ".join(str(problem) for problem in said) if isinstance(said, list) else ""
     said = f"the run in {folder} is finished"
@@ -226,7 +226,7 @@ def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """`section.key` -> value; what TOML cannot say (null) is left out."""
+    """Values by `section.key`; null values, which TOML lacks, are left out."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         if isinstance(value, dict):
@@ -237,7 +237,7 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> Sequence:
-    """The recording of the run, with the streams that its configuration asks for; `reading` goes over what the run was told.
+    """Recording of the run, with the streams that its configuration needs; `reading` overrides the run's options.
 
     Raises InputError when it is gone.
     """
@@ -249,13 +249,13 @@ def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
 
 
 def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> dict[str, Any]:
-    """Options of `open_sequence` for the recording of the run, or for what it has moved to."""
+    """Options of `open_sequence` for the recording of the run, or for its new place."""
     told = run.manifest.get("sequence", {}).get("reading", {}) if sequence is None else {}
     return told | {name: value for name, value in reading.items() if value is not None}
 
 
 def require_another(run: Path, out: Path) -> None:
-    """Raise UsageError when both are one folder, by whatever name."""
+    """Raise UsageError when both paths are one folder."""
     if out.resolve() == run.resolve():
         raise UsageError(f"--out {out}: the run itself stays as it is, name another folder")
 

@@ -1,4 +1,4 @@
-"""The folder of one run: held by one process, every file written beside its name and renamed, status last."""
+"""Run folder: locked by one process; every file is written under a temporary name and renamed, the status last."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ UPLOADED_FROM = "spool"
 
 
 class RunFolder:
-    """A run's output folder, held by this process while it is open.
+    """Output folder of a run, locked by this process while it is open.
 
     overwrite : clear what an earlier run left; goes_on : keep its checkpoint and keyframes, clear its results
 
@@ -83,7 +83,7 @@ class RunFolder:
         self.write_text(MANIFEST, text + "\n")
 
     def require_space(self, size: int, what: str) -> None:
-        """Raise OutputError when the disk has not `size` bytes left for `what`."""
+        """Raise OutputError when the disk has less than `size` bytes left for `what`."""
         with output_errors(f"output folder {self.path}"):
             left = shutil.disk_usage(self.path).free
         if left < size:
@@ -93,11 +93,11 @@ class RunFolder:
             )
 
     def drop_checkpoint(self) -> None:
-        """The run is over: what it would have gone on with is of no use any more."""
+        """Delete the checkpoint of a finished run."""
         shutil.rmtree(self.path / CHECKPOINT, ignore_errors=True)
 
     def keep_odometry(self) -> None:
-        """The run is over: of its checkpoints those of odometry stay beside the keyframes, for another pose graph.
+        """Keep the checkpoint of odometry of a finished run beside the keyframes, for another pose graph.
 
         The checkpoints stay too, until `drop_checkpoint`: nothing is lost in between.
         """
@@ -109,7 +109,7 @@ class RunFolder:
                     _share(file, self.path / KEYFRAMES / name)
 
     def begin_from(self, run: Path) -> None:
-        """Lay the keyframes and the odometry of another run ready to go on from, unless they are.
+        """Link or copy keyframes and odometry of another run into this folder, unless they are there.
 
         Raises OutputError when they cannot be written.
         """
@@ -134,7 +134,7 @@ class RunFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Let go of the folder."""
+        """Release the folder."""
         if self._log_handler is not None:
             self._log_handler.detach()
         if not (self.path / MANIFEST).exists():
@@ -153,7 +153,7 @@ class RunFolder:
             self._lock = None
 
     def _clear(self, needed: Collection[str] = ()) -> None:
-        """Remove an earlier run's files, nothing else; what is `needed` stays, and what was kept to go on with it."""
+        """Remove an earlier run's files and nothing else, except those `needed` and those kept for resuming."""
         for name in OURS:
             if name in needed:
                 continue
@@ -168,7 +168,7 @@ class RunFolder:
 
 
 def _share(file: Path, target: Path) -> None:
-    """The same file under another name, or a copy of it; files of a run are replaced, never changed."""
+    """Link the file under another name, or copy it; files of a run are replaced, never changed."""
     if not file.is_file():
         raise FileNotFoundError(file)
     part = target.with_name(f"{target.name}.part")
@@ -189,7 +189,7 @@ def _clear_own(folder: Path, names: str) -> None:
 
 
 class _LogFile(logging.FileHandler):
-    """log.txt: what the user sees and, also for Python callers who set up no logging, everything from INFO on."""
+    """Handler of log.txt: messages shown to the user and everything from INFO on, also for Python callers without logging."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, encoding="utf-8", errors="backslashreplace")
@@ -197,25 +197,25 @@ class _LogFile(logging.FileHandler):
         self._level_before = log.level
 
     def attach(self) -> None:
-        """Listen; lower the logger's level for as long as it takes."""
+        """Attach to the logger; its level is lowered meanwhile."""
         self._level_before = log.level
         if log.getEffectiveLevel() > logging.INFO:
             log.setLevel(logging.INFO)
         log.addHandler(self)
 
     def detach(self) -> None:
-        """Stop listening and put the level back."""
+        """Detach from the logger and restore its level."""
         log.removeHandler(self)
         log.setLevel(self._level_before)
         with contextlib.suppress(OSError):  # a full disk shows up where results are written
             self.close()
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """A full disk must not print a traceback per line: the results' own error follows."""
+        """Ignore errors: a full disk must not print a traceback per line, and the results' own error follows."""
 
 
 def check_target(path: Path, overwrite: bool) -> None:
-    """Raise what `RunFolder` would for a folder that is there, before any work; nothing is held or written."""
+    """Raise what `RunFolder` would for an existing folder, without locking or writing."""
     with output_errors(f"output folder {path}"):
         _require_free(path, overwrite)
 
@@ -229,7 +229,7 @@ def require_run(path: Path) -> None:
 
 
 def require_odometry(path: Path) -> None:
-    """Raise InputError unless the run in `path` kept what `RunFolder.begin_from` takes."""
+    """Raise InputError unless the run in `path` has the files for `RunFolder.begin_from`."""
     if not (path / KEYFRAMES / ODOMETRY).is_file():
         if (path / CHECKPOINT).is_dir():
             raise InputError(
@@ -272,7 +272,7 @@ def _is_held(path: Path) -> bool:
 
 
 def _hold(path: Path) -> IO[str]:
-    """Lock the folder. The holder before us may have removed the file between our open and our lock: look again."""
+    """Lock the folder. The previous owner may have removed the lock file between our open and our lock, so check again."""
     while True:
         stream = (path / LOCK).open("a")
         if not lock(stream):
@@ -286,9 +286,9 @@ def _hold(path: Path) -> IO[str]:
 
 @contextlib.contextmanager
 def held(path: Path) -> Iterator[None]:
-    """Hold a run folder for what is done to a run that is over; raises OutputExistsError while another run is at work in it.
+    """Lock a finished run's folder for changes. Raises OutputExistsError while another process works in it.
 
-    What one that was killed left of a map is cleared away. Raises OutputError where nothing can be written.
+    Remains of a killed process are removed. Raises OutputError where nothing can be written.
     """
     with output_errors(path):
         stream = _hold(path)
@@ -319,7 +319,7 @@ def default_folder(sequence: str, method: str, now: float | None = None) -> Path
 
 
 def spool_of(place: RemotePath) -> Path:
-    """Where the run folder of `place` is filled, the same for every attempt on this machine. Raises OutputError."""
+    """Local folder in which the run for `place` is made, the same for every attempt. Raises OutputError."""
     folder = cache_folder(UPLOADED_FROM)
     if folder is None:
         raise OutputError(f"{place} needs a folder to be filled in: name a folder of your own in XDG_CACHE_HOME")
@@ -327,7 +327,7 @@ def spool_of(place: RemotePath) -> Path:
 
 
 def check_place(place: RemotePath, may_replace: bool) -> None:
-    """Raise OutputExistsError for a run that is not to be replaced, and for objects that no run has put there."""
+    """Raise OutputExistsError for a run in storage that may not be replaced, and for objects that are of no run."""
     inside = {path.name for path in place.glob("*")}
     if place.is_file() or inside - {*OURS, KEYFRAMES, REPLIES}:
         raise OutputExistsError(f"output folder {place} is not a run of lslam; --overwrite replaces runs only")
@@ -340,9 +340,9 @@ def check_place(place: RemotePath, may_replace: bool) -> None:
 
 
 def upload(folder: Path, place: RemotePath) -> None:
-    """The run in `folder` to `place`, where there is a manifest only as long as all of it is there; then drop `folder`.
+    """Upload the run in `folder` to `place`, the manifest last, then delete `folder`.
 
-    Raises StorageError saying where the results are meanwhile.
+    Raises StorageError naming the folder where the results are.
     """
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and _is_result(path.relative_to(folder))]
     names = [path.relative_to(folder).as_posix() for path in files]

@@ -1,4 +1,4 @@
-"""The segments of a run as sessions: each is searched among those before it, and what is found stands in one frame."""
+"""Segments of a run as sessions: each is placed relative to earlier ones by place recognition, into one frame."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MAX_SENTENCES = 6
 
 @dataclass(frozen=True)
 class _Part:
-    """A segment, and its scans and keyframes as a session; None where its map left no initialisation."""
+    """A segment, and its session of scans and keyframes; None if its map failed to initialise."""
 
     segment: Segment
     results: list[ScanResult]
@@ -38,9 +38,9 @@ class _Part:
 def join_segments(
     results: list[ScanResult], store: KeyframeStore, config: Config, manifest: Manifest, should_stop: Callable[[], bool]
 ) -> list[ScanResult]:
-    """The results in as few frames as the segments allow, that of most scans being 0; its keyframes stay in the store.
+    """Results in as few frames as possible, frame 0 with most scans; keyframes of that frame stay in the store.
 
-    The manifest names the segments. A run of one segment is left alone; one that is asked to stop searches no further.
+    The manifest lists the segments. A run of one segment is unchanged. On a stop the search ends.
     """
     first = next((k for k, r in enumerate(results) if r.status == "ok"), 0)
     if not first and not results[-1].segment:
@@ -62,7 +62,7 @@ def join_segments(
         for frame in frames[1:]
     ]
     placed = sorted((part for frame in frames for part in frame), key=lambda part: part.segment.number)
-    moved = {part.segment.number: part.results for part in placed} | _chained(frames[0], store, config)
+    moved = {part.segment.number: part.results for part in placed} | _chain(frames[0], store, config)
     manifest.segments = [asdict(part.segment) for part in placed]
     _say([part.segment for part in placed], manifest)
     # Where a frame of its own lies, nobody knows.
@@ -74,7 +74,7 @@ def join_segments(
 
 
 def checks_within(checks: list[MotionCheck], results: list[ScanResult]) -> list[MotionCheck]:
-    """The checks of motions within one segment: across a border nothing was claimed."""
+    """Motion checks within one segment; between segments odometry claims no motion."""
     return [check for check in checks if results[check.first].segment == results[check.last].segment]
 
 
@@ -90,7 +90,7 @@ def _part(scans: list[ScanResult], number: int, store: KeyframeStore, config: Co
 
 
 def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: Callable[[], bool]) -> None:
-    """Add the part to the first frame, the largest first, that it is found in; else it begins another."""
+    """Add the part to the first frame, the largest first, in which it is found; else begin a new frame."""
     reasons = []
     for frame in sorted(frames, key=lambda frame: -sum(other.segment.registered for other in frame)):
         targets = [other.session for other in frame if other.session is not None]
@@ -107,9 +107,9 @@ def _place(part: _Part, frames: list[list[_Part]], config: Config, should_stop: 
 def _placement(
     session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool]
 ) -> tuple[Session | None, str]:
-    """The session in the frame of the known ones, and what says so; None, and why not.
+    """The session placed among the known ones, and the evidence in words; None, and the reason, if it is not found.
 
-    Where no second of its keyframes agrees, the last ones before it have to.
+    If no second keyframe of it agrees, the last keyframes before it must.
     """
     near = _vicinity(known[-1], session)
     placed, reason = tie(session, known, config, should_stop, near)
@@ -127,9 +127,9 @@ def _placement(
 def _is_found_from_before(
     session: Session, before: Session, reach: float, config: Config, should_stop: Callable[[], bool]
 ) -> bool:
-    """Whether the last keyframes before a tied session find their place in that, too, and most of what they see there.
+    """Whether the last keyframes before a placed session are also found there, with most of what they observe.
 
-    reach : m, about where the tie puts them
+    reach : search radius, m, around the poses that follow from the placement
     """
     last = PartOfStore(before.store, range(len(before.keyframes))[-config.keyframes.submap_size :])
     own = last.keyframes[0]
@@ -144,7 +144,7 @@ def _is_found_from_before(
 
 
 def _vicinity(before: Session, session: Session) -> Vicinity:
-    """Where the sensor may have come to since the last registered scan: as fast as there, but for what it may change."""
+    """Region that the sensor may have reached since the last registered scan, by its speed there and possible acceleration."""
     (a, b), first = [r for r in before.results if r.status == "ok"][-2:], session.keyframes[0]
     seconds = max(1e-9 * (first.stamp_ns - b.stamp_ns), 0.0)
     start, end = (before.T_town_session @ r.T_world_lidar for r in (a, b))
@@ -153,8 +153,8 @@ def _vicinity(before: Session, session: Session) -> Vicinity:
     return Vicinity(end[:3, 3] + steps * (end[:3, 3] - start[:3, 3]), max(reach, LEAST_REACH))
 
 
-def _chained(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> dict[int, list[ScanResult]]:
-    """The scans of each segment of the frame as of one drive, whose keyframes alone stay in the store."""
+def _chain(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> dict[int, list[ScanResult]]:
+    """Scans of the segments of a frame as one drive; only their keyframes stay in the store."""
     sessions = [part.session for part in frame if part.session is not None]
     if not sessions:
         return {}
@@ -165,11 +165,11 @@ def _chained(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> di
         first, T = chained[0], session.T_town_session
         # What the first scan of the segment knows of its own map is small beside the tie.
         base = np.zeros((6, 6)) if n == 0 or first.covariance is None else first.covariance
-        out[session.results[0].segment] = [_moved(r, T, first.T_world_lidar[:3, 3], base) for r in session.results]
+        out[session.results[0].segment] = [_move(r, T, first.T_world_lidar[:3, 3], base) for r in session.results]
         assert isinstance(session.store, PartOfStore)
         if n:
             last = sessions[n - 1]
-            out[last.results[0].segment] = _bridged(out[last.results[0].segment], last.T_town_session, session)
+            out[last.results[0].segment] = _bridge(out[last.results[0].segment], last.T_town_session, session)
         of_scan = {r.stamp_ns: r for r in out[session.results[0].segment]}
         for own, now in zip(session.store.whole, chained, strict=True):
             moved = of_scan[own.stamp_ns]
@@ -181,10 +181,11 @@ def _chained(frame: Sequence[_Part], store: KeyframeStore, config: Config) -> di
     return out
 
 
-def _bridged(results: list[ScanResult], T: Floats, following: Session) -> list[ScanResult]:
-    """The results, those after the last registered one between what `T` (4, 4) makes of their priors and the next segment does.
+def _bridge(results: list[ScanResult], T: Floats, following: Session) -> list[ScanResult]:
+    """Results with the scans after the last registered one interpolated between both segments.
 
-    The next segment begins at the prior of its first scan, so that the two differ by what the priors erred over the gap.
+    T (4, 4) places this segment. The next one began at the prior of its first scan, so its placement shows the error of the
+    priors over the gap, which is distributed over time.
     """
     last = max(k for k, r in enumerate(results) if r.status == "ok")
     begin_ns, end_ns = results[last].stamp_ns, following.results[0].stamp_ns
@@ -198,8 +199,8 @@ def _bridged(results: list[ScanResult], T: Floats, following: Session) -> list[S
     return out
 
 
-def _moved(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanResult:
-    """The result in the world that T (4, 4) leads to, its covariance beside that of the segment's `origin` (3,), m."""
+def _move(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanResult:
+    """Result in the world reached by T (4, 4), with its covariance added to that of the segment's `origin` (3,), m."""
     moved = result.moved(T)
 
     def chained(own: Floats | None) -> Floats | None:

@@ -47,7 +47,7 @@ log = logging.getLogger("lslam")
 
 
 def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
-    """Put the final poses into the record: those of the pose graph, level; or, in its place, those in an existing map."""
+    """Put the final poses into the record: of the pose graph, made level, or of localisation in a prior map."""
     if job.config.localize.map:
         localise_poses(job, record)
         if record.georeference is not None:
@@ -60,7 +60,7 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
 
 
 def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
-    """The evaluation, or None with the reason among the record's problems."""
+    """Evaluation against ground truth; None, with the reason among the record's problems."""
     if record.ground_truth is None:
         return None
     # Poses in frames of their own have no error.
@@ -86,7 +86,7 @@ def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation |
 
 
 def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
-    """The merged map, from the raw scans and the final poses."""
+    """Merged map from the raw scans and the final poses."""
     config, watch, manifest = job.config, job.watch, job.manifest
     if not config.map.write or manifest.outcome == "interrupted":
         return
@@ -106,7 +106,7 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
 
 
 def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
-    """The feature map, likewise, when it was asked for."""
+    """Feature map from the raw scans and the final poses, if requested."""
     config, watch, manifest, odometry = job.config, job.watch, job.manifest, job.odometry
     if not config.map.write_features or manifest.outcome == "interrupted" or not isinstance(odometry, FeatureSource):
         return
@@ -121,7 +121,7 @@ def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> 
 
 
 def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluation: Evaluation | None) -> None:
-    """report.html; the record's manifest is the run's last word, with the report's own time."""
+    """Write report.html. The record's manifest is final then, including the report's own time."""
     manifest = job.manifest
     manifest.take_over(record)
     record.manifest = manifest.conclude()
@@ -139,7 +139,7 @@ def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluati
 def in_folder(
     job: PreparedRun, out: Path | None, overwrite: bool, resume: bool, earlier: EarlierRun | None
 ) -> Iterator[PreparedRun]:
-    """The run fitted to its scene, with its folder, which is held for the block and, in storage, uploaded after it.
+    """Context of the run fitted to its scene, with its folder locked, and uploaded at the end if it is in storage.
 
     The status is written last, however the block ends. One in storage is filled on this machine; what is to go on stays there.
     earlier : the run whose odometry serves
@@ -181,7 +181,7 @@ def in_folder(
 
 
 def _begun(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierRun | None) -> PreparedRun:
-    """The run in its folder, which says so from now on.
+    """The run in its folder, with a manifest that marks it as running.
 
     Raises InputError when the odometry of the earlier run cannot be read.
     """
@@ -199,7 +199,7 @@ def _begun(job: PreparedRun, folder: RunFolder, goes_on: bool, earlier: EarlierR
 
 
 def write_results(job: PreparedRun, record: RunRecord, done: BackEnd, evaluation: Evaluation | None) -> None:
-    """The whole result, into the folder of the run where it has one, and the manifest into the record."""
+    """Write all results into the run's folder, if it has one, and the manifest into the record."""
     folder = job.folder
     if folder is None:
         job.manifest.take_over(record)
@@ -221,7 +221,7 @@ def write_results(job: PreparedRun, record: RunRecord, done: BackEnd, evaluation
 
 
 def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:
-    """The status, after everything else; a disk too full even for this must not hide the first error."""
+    """Write the status after everything else; a full disk at this point must not hide the first error."""
     try:
         folder.write_manifest(manifest)
     except OutputError as error:
@@ -229,7 +229,7 @@ def _write_last(folder: RunFolder, manifest: dict[str, object]) -> None:
 
 
 def raise_outcome(manifest: Manifest, config: Config, way_out: str) -> None:
-    """Raise what became of a run that is neither done nor merely degraded; `way_out` ends the sentence."""
+    """Raise the outcome of a run that is neither done nor degraded; `way_out` ends the sentence."""
     why = "; ".join(manifest.problems)
     if manifest.outcome == "interrupted":
         raise InterruptedRunError(f"{why}; what was done is written{way_out}")

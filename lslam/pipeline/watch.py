@@ -1,4 +1,4 @@
-"""How a caller follows a run, and what it gets in the end."""
+"""Progress callbacks of a run, and its result for the caller."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from lslam.reports.text import summary
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What a run gives back to Python: the record the report is written from, and the score when truth is known."""
+    """Result of `run`: the record behind the report, and the score when truth is known."""
 
     record: RunRecord
     evaluation: Evaluation | None
@@ -48,7 +48,7 @@ class RunOutcome:
         return None if absolute is None else np.linalg.norm(absolute.errors, axis=1)
 
     def plot(self, what: str = "trajectory") -> Any:
-        """A figure of `lslam plot` as one of matplotlib: trajectory, map, errors, features, imu or buildings.
+        """matplotlib figure of `lslam plot`: trajectory, map, errors, features, imu or buildings.
 
         Raises UsageError for another name, InputError for what the run does not have.
         """
@@ -70,7 +70,7 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class Watch:
-    """How a caller follows a run and ends it early.
+    """Progress callbacks of a run, and a way to stop it early.
 
     on_start(stage, scans), then on_step() per scan; on_end(outcome) also when the run then raises because it diverged,
     was interrupted or missed a gate

@@ -1,1 +1,1 @@
-"""Evaluation and run records for people: text, tables, JSON, plots, HTML."""
+"""Presentation of evaluations and run records: text, tables, JSON, plots, HTML."""

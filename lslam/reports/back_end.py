@@ -1,4 +1,4 @@
-"""What the pose graph did, for the summary and the report: loops, fixes, errors before and after, uncertainty on the plan."""
+"""Results of the pose graph for the summary and the report: loops, fixes, errors before and after, uncertainty."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BESIDE, SMALLEST, LARGEST = 40.0, 50.0, 150.0
 
 
 def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
-    """Names and values for the summary; nothing of a run without a back end."""
+    """Names and values for the summary; empty for a run without a back end."""
     rows = []
     if record.loops or record.manifest.get("graph", {}).get("loops"):
         closed = sum(c.is_accepted for c in record.loops)
@@ -78,7 +78,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
 
 
 def _drift_row(table: Table) -> tuple[str, str]:
-    """What was set right, as one line."""
+    """Corrected drift of the odometry, as one line."""
     told = [
         f"{word} {estimate} ± {sigma}" + "".join(f" (rms {rms})" for rms in rest)
         for word, estimate, sigma, *rest in table.rows
@@ -87,7 +87,7 @@ def _drift_row(table: Table) -> tuple[str, str]:
 
 
 def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
-    """Plan, error and map at a loop; before and after the pose graph where it moved anything that can be seen."""
+    """Figures of plan, error and map at a loop, before and after the pose graph, where it visibly moved poses."""
     odometry = record.odometry
     if odometry is None or odometry is record.trajectory:
         return []
@@ -128,7 +128,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
 
 
 def most_moved(record: RunRecord) -> float:
-    """How far the back end moved the pose that it moved most, m; both trajectories in the world of the final one."""
+    """Largest displacement of a pose by the back end, m, with both trajectories in the world of the final one."""
     if record.odometry is None or len(record.odometry) != len(record.trajectory):
         return 0.0
     before = se3.apply(record.T_final_odometry, record.odometry.positions)
@@ -137,14 +137,14 @@ def most_moved(record: RunRecord) -> float:
 
 
 def _extent(record: RunRecord) -> float:
-    """The longer side of the plan of the trajectory, m."""
+    """Longer side of the trajectory's plan, m."""
     xy = record.trajectory.positions[:, :2]
     xy = xy[np.isfinite(xy).all(1)]
     return float(np.ptp(xy, axis=0).max()) if len(xy) else 0.0
 
 
 def before_and_after(after: Evaluation, before: Evaluation, what: str = "the pose graph") -> str:
-    """ATE of both by the first alignment that both have."""
+    """ATE before and after the pose graph, by the first alignment that both have."""
     name = _common_alignment(after, before)
     if name is None:
         return "ATE n/a"
@@ -163,7 +163,7 @@ def _common_alignment(after: Evaluation, before: Evaluation) -> str | None:
 
 
 def _error_figures(evaluation: Evaluation | None, what: str) -> list[Figure]:
-    """Position error before and after the pose graph, or `what` stands for it, over the way; nothing without ground truth."""
+    """Position error over path length before and after the pose graph, or after `what`; empty without ground truth."""
     if evaluation is None or evaluation.odometry is None:
         return []
     before = evaluation.odometry
@@ -181,16 +181,16 @@ def _error_figures(evaluation: Evaluation | None, what: str) -> list[Figure]:
 
 
 def _common(record: RunRecord) -> Floats:
-    """(2, 2) m2, of the shift of the map that holds the run, which is in the covariance of every pose."""
+    """(2, 2) covariance, m2, of the shift of the building map against the run, which is a part of every pose's covariance."""
     if record.osm is None or not np.isfinite(record.osm.shift_sigma).all():
         return np.zeros((2, 2))
     return np.diag(record.osm.shift_sigma**2)
 
 
 def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:
-    """Outlines (33, 2) of horizontal uncertainty at some poses, to scale, and the largest half axis, m.
+    """Outlines (33, 2), m, of the horizontal uncertainty of some poses, to scale, and the largest half axis, m.
 
-    What all poses are unsure by together moves the run and bends nothing: it is not drawn.
+    The common part of all covariances is not drawn: it shifts the run as a whole and does not bend it.
     """
     covariances, positions = record.trajectory.covariances, record.trajectory.positions
     if covariances is None or len(positions) < 2:
@@ -207,7 +207,7 @@ def _ellipses(record: RunRecord) -> tuple[list[Floats], float]:
 
 
 def loop_figures(view: LoopView | None) -> list[Figure]:
-    """Both figures; nothing without a loop, or where the correction is less than a pixel of them."""
+    """Both figures of a loop; empty without a loop, or where the correction is below one pixel."""
     if view is None:
         return []
     size = float(np.clip(2 * view.correction + BESIDE, SMALLEST, LARGEST))

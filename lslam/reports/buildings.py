@@ -1,4 +1,4 @@
-"""The building pages of the report: the map before and after with the walls seen, displacements, and what held what."""
+"""Building pages of the report: map before and after with observed walls, displacements, and constraints."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class BuildingPages:
 
 
 def building_pages(record: RunRecord) -> BuildingPages | None:
-    """The section of a run that was held by a map; None of others."""
+    """Section of a run that was constrained by a map of buildings; None for others."""
     if record.osm is None or record.buildings is None:
         return None
     poses = se2.of_se3(record.trajectory.poses[record.keyframe_scans])
@@ -42,7 +42,7 @@ def building_pages(record: RunRecord) -> BuildingPages | None:
 
 
 def building_figures(found: CorrectedMap, matches: OsmMatches, poses: Floats) -> list[Figure]:
-    """Plans: buildings before and after with the walls seen, and where the map held the trajectory.
+    """Plans: buildings before and after with the observed walls, and where the map constrained the trajectory.
 
     poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame
     """
@@ -64,7 +64,7 @@ def building_figures(found: CorrectedMap, matches: OsmMatches, poses: Floats) ->
 
 
 def drift_tables(record: RunRecord) -> list[Table]:
-    """The drift that walls or loops told and that was taken out, steady or wandering; none where none was claimed."""
+    """Tables of drift that was estimated from walls or loops and removed, constant or varying; empty without any."""
     known = record.manifest.get("graph", {})
     kind, claim = next(((kind, known[f"{kind}_drift"]) for kind in KINDS if f"{kind}_drift" in known), ("", None))
     if claim is None:
@@ -94,7 +94,7 @@ def drift_tables(record: RunRecord) -> list[Table]:
 
 
 def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
-    """Displacements, largest first, and why matches were not used."""
+    """Tables of displacements, largest first, and of the reasons why matches were rejected."""
     order = sorted(found.buildings, key=lambda c: (c.status == "unseen", -float(np.linalg.norm(c.displacement[:2]))))
     rows = tuple(_row(c) for c in order[:MOST_ROWS])
     counts = Counter(c.status for c in found.buildings)
@@ -124,12 +124,12 @@ def _row(correction: BuildingCorrection) -> tuple[str, ...]:
 
 
 def _plain(reason: str) -> str:
-    """The reason without its number, so that like ones are counted together."""
+    """Reason without its number, so that equal ones can be counted."""
     return re.sub(r"^[\d.]+ times", "… times", reason) or "given up"
 
 
 def _holds(matches: OsmMatches, poses: Floats) -> Figure:
-    """Where along the way the map held the trajectory."""
+    """Figure of the parts of the path where the map constrained the trajectory."""
     at = {match.keyframe: match for match in matches.keyframes}
     used = np.array([k for k, match in at.items() if match.is_accepted], np.intp)
     kinds = [
@@ -147,7 +147,7 @@ def _holds(matches: OsmMatches, poses: Floats) -> Figure:
 
 
 def _dots(xy: Floats) -> Floats:
-    """Points that are not joined by a line."""
+    """Points that are drawn without connecting lines."""
     return np.stack([xy, np.full_like(xy, np.nan)], axis=1).reshape(-1, 2)
 
 
@@ -157,7 +157,7 @@ def _is_near(building: Building, way: Floats) -> bool:
 
 
 def _seen_walls(sights: Sequence[KeyframeMatch], poses: Floats) -> Floats:
-    """(S, 2, 2) walls of so many keyframes, evenly chosen, that the page stays small."""
+    """(S, 2, 2) walls observed from a few evenly chosen keyframes, to keep the page small."""
     total = sum(len(s.walls) for s in sights)
     every = max(1, -(-total // MOST_WALLS))
     found = [se2.apply(poses[s.keyframe], s.walls) for s in sights[::every] if len(s.walls)]
@@ -174,7 +174,7 @@ def _outlines(buildings: Iterable[Building]) -> list[Floats]:
 
 
 def _parts(lines: list[Floats]) -> list[Floats]:
-    """Lines in a row, parted by NaN, in pieces that the chart draws point for point."""
+    """Pieces of a line that is broken by NaN, short enough to be drawn without thinning."""
     gap = np.full((1, 2), np.nan)
     parts: list[list[Floats]] = [[]]
     size = 0

@@ -55,7 +55,7 @@ def write_page(
 def render_page(
     folder: Path, comparison: Comparison, drawings: Sequence[Drawing], crop: tuple[float, float, float] | None = None
 ) -> str:
-    """The page as text; links to runs are relative to `folder`."""
+    """Page as text; links to runs are relative to `folder`."""
     place = None if crop is None else Crop(*crop)
     sections = [_section(folder, comparison, name, drawings, place) for name in comparison.sequences]
     return render(
@@ -114,7 +114,7 @@ def _text(value: Any) -> str:
 
 
 def style_of(method: str, methods: Sequence[str]) -> str:
-    """The class of the style sheet that a method is drawn with, the same everywhere on the page."""
+    """Style sheet class of a method, the same everywhere on the page."""
     return f"s{methods.index(method) % STYLES + 1}"
 
 
@@ -173,7 +173,7 @@ def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
 
 
 def crop_figures(drawing: Drawing, crop: Crop | None) -> list[list[Figure]]:
-    """One list per place, with one figure per method that has a map; places are chosen in the first method's map."""
+    """For each place, one figure per method that has a map; places are chosen in the first method's map."""
     clouds = [_cloud(run) for run in drawing.runs]
     known = [cloud for cloud in clouds if cloud is not None]
     if not known:

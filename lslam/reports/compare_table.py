@@ -40,19 +40,19 @@ class CompareTable:
 
     @property
     def folded(self) -> tuple[str, ...]:
-        """The header on several lines: units and long lists below."""
+        """Header split into several lines: units and long lists below."""
         return tuple(name.replace(", ", "\n").replace("/", "/\n") for name in self.header)
 
     @property
     def width(self) -> int:
-        """Columns of the terminal it takes with the folded header and three spaces between columns."""
+        """Width in characters on a terminal, with the folded header and three spaces between columns."""
         heads = [max(len(line) for line in name.split("\n")) for name in self.folded]
         cells = [max((len(row[k]) for row in self.rows), default=0) for k in range(len(self.header))]
         return sum(max(pair) + 3 for pair in zip(heads, cells, strict=True))
 
 
 def tables(comparison: Comparison, width: int | None = None) -> list[CompareTable]:
-    """The methods' table, in as many parts (errors, time, health) as `width` asks for; pairs, differences, failures."""
+    """Tables of methods, in as many parts (errors, time, health) as `width` requires; of pairs, differences and failures."""
     splits: list[list[tuple[str, ...]]] = [
         [("error", "time", "health")], [("error",), ("time", "health")], [("error",), ("time",), ("health",)],
     ]  # fmt: skip
@@ -66,13 +66,13 @@ def tables(comparison: Comparison, width: int | None = None) -> list[CompareTabl
         *out,
     ] + [
         table
-        for table in (_paired(comparison), _differences(comparison), _degraded(comparison), _failures(comparison))
+        for table in (_pairs(comparison), _differences(comparison), _doubts(comparison), _failures(comparison))
         if table.rows
     ]
 
 
 def recipes(comparison: Comparison) -> list[str]:
-    """How the numbers are made, one sentence each."""
+    """Definitions of the numbers, one sentence each."""
     shown = [
         m
         for m in comparison.metrics
@@ -159,12 +159,12 @@ def _cell(metric: Metric, row: SummaryRow) -> str:
 
 
 def _with_spread(mean: str, value: Spread) -> str:
-    """The mean's text with the deviation over seeds, in as many decimals."""
+    """Text of the mean with the standard deviation over seeds, with equal decimals."""
     return mean if value.n < 2 else f"{mean} ± {fixed(value.std, len(mean.partition('.')[2]))}"
 
 
 def _health(row: SummaryRow) -> str:
-    """Mean counts per run; a row without a usable run has none."""
+    """Text of the mean counts per run, separated by slashes, `-` where unknown: a row without a usable run has none."""
     values = [row.values.get(key) for key in HEALTH]
     return "/".join("-" if v is None else f"{v.mean:.3g}" for v in values)
 
@@ -175,7 +175,7 @@ def _usable(row: SummaryRow) -> str:
 
 
 def _is_best(metric: Metric, row: SummaryRow, rivals: Sequence[SummaryRow]) -> bool:
-    """Whether no method on the sequence is better; times compare only among runs that were alone on the machine."""
+    """Whether a method is the best on the sequence; times are compared only among runs alone on the machine."""
     known = [r.values[metric.key].mean for r in rivals if metric.key in r.values]
     if not metric.best or metric.key not in row.values or len(known) < 2:
         return False
@@ -184,7 +184,7 @@ def _is_best(metric: Metric, row: SummaryRow, rivals: Sequence[SummaryRow]) -> b
     return row.values[metric.key].mean == (min(known) if metric.best == "low" else max(known))
 
 
-def _paired(comparison: Comparison) -> CompareTable:
+def _pairs(comparison: Comparison) -> CompareTable:
     header = ("method", "against", "pairs", "ratio of ATE", "wins/ties/losses", "p")
     rows = []
     for pair in comparison.paired:
@@ -203,7 +203,7 @@ def _differences(comparison: Comparison) -> CompareTable:
     return CompareTable("distance between trajectories, without ground truth", header, tuple(rows), 3)
 
 
-def _degraded(comparison: Comparison) -> CompareTable:
+def _doubts(comparison: Comparison) -> CompareTable:
     rows = tuple((r.sequence, r.method, str(r.seed), r.reason) for r in comparison.degraded)
     title = f"{counted(len(rows), 'run')} degraded: part of it is doubted"
     return CompareTable(title, ("sequence", "method", "seed", "reason"), rows, 4)

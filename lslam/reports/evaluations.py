@@ -55,7 +55,7 @@ def to_document(evaluation: Evaluation, timing: Timing | None = None) -> Documen
 
 
 def run_document(record: RunRecord, evaluation: Evaluation | None) -> Document | None:
-    """What a run says of itself: the evaluation, and how crisp its map is; None when neither is known."""
+    """Document of a run: its evaluation, and the entropy scores of its map; None when neither is known."""
     if evaluation is None and record.crispness is None:
         return None
     document: Document = {"schema": SCHEMA, "version": VERSION, "lslam": __version__, "estimate": record.method}
@@ -67,7 +67,7 @@ def run_document(record: RunRecord, evaluation: Evaluation | None) -> Document |
 
 
 def crispness_document(score: Crispness) -> Document:
-    """The crispness of a map as plain values."""
+    """Map entropy scores as plain values."""
     thickness = None if score.plane_variance is None else math.sqrt(score.plane_variance)
     plain = strict({"recipe": score.recipe, **asdict(score), "plane_thickness_m": thickness})
     assert isinstance(plain, dict)
@@ -83,7 +83,7 @@ def to_json(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] 
 
 
 def strict(value: Any) -> Any:
-    """The value with None for every number that JSON has not: NaN and the infinities."""
+    """The value with None in place of NaN and infinities, which JSON lacks."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -114,13 +114,13 @@ def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] =
 
 
 def _rows(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None]) -> list[MetricRow]:
-    """One cell per estimate; recipes are the same for all of them, being one configuration's."""
+    """All rows of the table, one cell per estimate."""
     rows = [row for metric in shown_metrics(evaluations[0]) for row in metric.rows(evaluations)]
     return rows + _timing_rows(timings) if any(timings) else rows
 
 
 def _in_full(row: MetricRow) -> str:
-    """A label that stands alone: a row below a number is led by it."""
+    """Label of a row with the name of the row that it belongs to."""
     return f"{row.under}, {row.label}" if row.under else row.label
 
 
@@ -151,7 +151,7 @@ def _head(evaluations: Sequence[Evaluation], names: list[str]) -> list[str]:
 
 
 def _recipes(evaluations: Sequence[Evaluation]) -> list[str]:
-    """How each number was made; what differs between estimates (poses, pairs) stands in their columns."""
+    """Definition of each number; facts that differ between estimates (poses, pairs) are in their columns."""
     lines = [line for metric in shown_metrics(evaluations[0]) for line in metric.recipes(evaluations[0])]
     return ["how:", *(f"  {line}" for line in lines)]
 
@@ -171,7 +171,7 @@ def _text(rows: list[MetricRow], names: list[str]) -> list[str]:
 
 
 def short_names(names: list[str]) -> list[str]:
-    """The shortest path endings that tell the estimates apart; a run is called by its folder."""
+    """Shortest path endings that distinguish the estimates; a run is named by its folder."""
     parts = [name.replace("\\", "/").removesuffix("/trajectory.tum").split("/") for name in names]
     for depth in range(1, max(len(p) for p in parts) + 1):
         short = ["/".join(p[-depth:]) for p in parts]

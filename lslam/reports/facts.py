@@ -1,4 +1,4 @@
-"""What a run's record says in numbers and sentences: shared by the summary on stdout and the HTML report."""
+"""Numbers and sentences about a run from its record, for the summary on stdout and the HTML report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIRECTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
 
 @dataclass(frozen=True)
 class Failure:
-    """A scan that was bridged or skipped, and why."""
+    """A scan that was bridged or skipped, and the reason."""
 
     index: int
     status: str
@@ -28,7 +28,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Degeneracy:
-    """A pose with directions the scan said nothing about."""
+    """A pose with directions that the scan did not constrain."""
 
     index: int
     directions: str
@@ -41,7 +41,7 @@ class RunFacts:
     status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
     registered, bridged, skipped : scans that were registered, followed the motion prior, could not be read
     standing : scans of a sensor at rest, registered or not
-    stand_ins : scans by who posed them in place of the method, in the order in which they first did
+    stand_ins : number of scans by fallback that posed them in place of the method, in order of first use
     path_length : m; duration : s between the first and the last pose
     stages : in the order they ran; total : the sum of stages per scan
     over_limit : scans whose stages took longer than the real-time limit
@@ -67,18 +67,18 @@ class RunFacts:
 
     @property
     def posed_by(self) -> str:
-        """In words, who posed scans in place of the method; empty when it posed them all."""
+        """Fallbacks that posed scans in place of the method, in words; empty when it posed them all."""
         said = ", ".join(f"{who} {count}" for who, count in self.stand_ins.items())
         return f"{said} of {self.scans} scans" if said else ""
 
     @property
     def is_flawless(self) -> bool:
-        """Nothing at all went wrong."""
+        """Whether nothing went wrong."""
         return self.status in ("done", "ok") and not (self.reasons or self.failures or self.degenerate)
 
 
 def run_facts(record: RunRecord) -> RunFacts:
-    """Read a record; every number is finite, whatever the poses are."""
+    """Facts of a record; every number is finite, whatever the poses are."""
     results = record.results
     names, seconds = stage_matrix(results)
     totals = seconds.sum(1)
@@ -123,7 +123,7 @@ def stage_matrix(results: list[ScanResult]) -> tuple[list[str], Floats]:
 
 
 def describe(degenerate: NDArray[Any]) -> str:
-    """The main component of each unit twist (K, 6), world axes.
+    """Text of the main component of each unit twist (K, 6), world axes.
 
     >>> describe(np.array([[0.1, 0.99, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1.0]]))
     'along y, about z'
@@ -132,7 +132,7 @@ def describe(degenerate: NDArray[Any]) -> str:
 
 
 def _status(record: RunRecord, failed: bool) -> tuple[str, tuple[str, ...]]:
-    """The manifest's word, else what the record itself shows."""
+    """Status in the manifest, else derived from the record."""
     reasons = [str(problem) for problem in record.problems]
     more = record.manifest.get("problems")
     if isinstance(more, (list, tuple)):

@@ -35,7 +35,7 @@ MOST = 400_000
 
 @dataclass(frozen=True)
 class PlottedRun:
-    """What figures are drawn of, in the run's world; what a run does not have is None."""
+    """Data for the figures of a run, in the run's world; None for missing parts."""
 
     name: str
     trajectory: Trajectory
@@ -55,7 +55,10 @@ def require_figure(what: str) -> None:
 
 
 def draw_figure(run: PlottedRun, what: str, width: float = WIDTHS["column"]) -> Any:
-    """The matplotlib figure, `width` mm wide; raises UsageError as `require_figure`, InputError for what a run does not have."""
+    """matplotlib figure, `width` mm wide.
+
+    Raises UsageError as `require_figure`, InputError for data that the run does not have.
+    """
     require_figure(what)
     draw, height = FIGURES[what]
     figure = shown_figure()(figsize=(width / INCH, height * width / INCH), layout="constrained")
@@ -99,6 +102,7 @@ def _trajectory(figure: Any, run: PlottedRun) -> None:
 
 
 def _errors(figure: Any, run: PlottedRun) -> None:
+    """Draw position errors in the LiDAR's axes, and rotation errors, over path length. Raises InputError without ground truth."""
     absolute = first_available(run.evaluation)
     if run.evaluation is None or absolute is None:
         raise InputError(f"{run.name} has no ground truth: say where it is with --gt")
@@ -176,7 +180,7 @@ def _buildings(figure: Any, run: PlottedRun) -> None:
 
 
 def _points(plot: Any, run: PlottedRun, T: Floats | None = None) -> Any:
-    """The map beneath, by height: dark is low."""
+    """Draw the map below the other data, coloured by height: dark is low."""
     if run.cloud is None or not len(run.cloud):
         raise InputError(f"{run.name} has no map: build one with lslam map")
     points = _some(run.cloud.points)
@@ -190,7 +194,7 @@ def _points(plot: Any, run: PlottedRun, T: Floats | None = None) -> Any:
 
 
 def _legend(figure: Any, plot: Any, markerscale: float = 1.0) -> None:
-    """Above all plots, where no line runs."""
+    """Draw the legend above all plots, where it hides no line."""
     lines, names = plot.get_legend_handles_labels()
     figure.legend(
         lines, names, loc="outside upper center", ncol=4, frameon=False, handlelength=1.2, columnspacing=1.0,
@@ -199,7 +203,7 @@ def _legend(figure: Any, plot: Any, markerscale: float = 1.0) -> None:
 
 
 def _about(plot: Any, points: Floats) -> None:
-    """A square about points (N, 2) but for the 2 % furthest out each way, which would press the others together."""
+    """Set the limits to a square around the points (N, 2), without the outermost 2 % in each direction."""
     if not len(points):
         return
     low, high = np.percentile(points, [2, 98], axis=0)

@@ -36,7 +36,7 @@ BAND_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class _Course:
-    """A figure of some of `IMU_STATES`: those from `begin` to before `end`, times `factor`."""
+    """A figure of the `IMU_STATES` columns `begin` to `end` (exclusive), times `factor`."""
 
     title: str
     y_label: str
@@ -82,7 +82,7 @@ def _course(course: _Course, seconds: Floats, values: Floats, sigmas: Floats) ->
 
 
 def _readings(record: RunRecord) -> list[Figure]:
-    """What the recording's IMU says, as it stands there, while the scans were taken."""
+    """Raw IMU readings during the recording's scans."""
     imu = record.imu
     if imu is None or not record.results:
         return []
@@ -137,7 +137,7 @@ def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -
 
 
 def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
-    """The page as text."""
+    """Report page as text."""
     facts = run_facts(record)
     return render(
         "report.html.j2",
@@ -170,7 +170,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
 
 
 def map_context(record: RunRecord) -> dict[str, Any]:
-    """What the templates of `MAP_PARTS` show."""
+    """Values for the templates `MAP_PARTS`."""
     return {
         "map_cards": _map_cards(record.crispness),
         "map_figure": _map_figure(record),
@@ -194,7 +194,7 @@ def _map_figure(record: RunRecord) -> MapFigure | None:
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:
-    """The manifest as (dotted key, texts) rows, in its order; status and problems stand elsewhere on the page.
+    """Rows (dotted key, texts) of the manifest, in its order; status and problems are shown elsewhere on the page.
 
     >>> flatten({"input": {"kind": "bin"}, "notes": ["a", "b"], "status": "ok"})
     [('input.kind', ['bin']), ('notes', ['a', 'b'])]
@@ -221,7 +221,7 @@ def _plain(value: Any) -> str:
 
 
 def _map_note(built: Any) -> str:
-    """What is special about a map that the run did not make itself; empty for the run's own."""
+    """Remark on a map that was built after the run; empty for the run's own."""
     if not isinstance(built, Mapping):
         return ""
     done = built.get("done")
@@ -258,7 +258,7 @@ def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
 
 
 def _config_text(folder: Path | None) -> str:
-    """The resolved configuration that lies in the run folder; empty when there is none."""
+    """Resolved configuration stored in the run folder; empty when there is none."""
     if folder is None:
         return ""
     try:
@@ -268,9 +268,9 @@ def _config_text(folder: Path | None) -> str:
 
 
 def with_new_map(page: str, record: RunRecord) -> str:
-    """The page of a run with the figures, the picture and the manifest of `record` in place of those of the map before.
+    """Page of a run with the map's figures, picture and manifest replaced by those of `record`.
 
-    Raises ValueError when the page has not the marks of the parts.
+    Raises ValueError when the marks of these parts are missing in the page.
     """
     for name, file in MAP_PARTS.items():
         begin, end = (f"<!-- {word} {name} -->\n" for word in ("begin", "end"))

@@ -1,4 +1,4 @@
-"""The page of merged runs: the map of all, each session on it in its colour, and where each was tied in."""
+"""Page of merged runs: the common map, each session on it in its colour, and the connections between sessions."""
 
 from __future__ import annotations
 
@@ -26,8 +26,10 @@ RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that ag
 
 @dataclass(frozen=True)
 class SessionView:
-    """One session: positions (N, 3), m, common world, as it was tied to the others and after the pose graph, and the
-    numbers (N,) of its scans."""
+    """One session in the common world.
+
+    Positions (N, 3), m, as it was connected to the others and after the pose graph; numbers (N,) of its scans.
+    """
 
     name: str
     before: Floats
@@ -87,7 +89,7 @@ def _figure(title: str, caption: str, sessions: Sequence[SessionView], positions
 
 
 def _sessions_data(sessions: Sequence[SessionView], ties: Floats) -> dict[str, Any]:
-    """What the script draws over the points: each session's positions and the numbers of its scans, and the loops."""
+    """Data for the script: positions and scan numbers of each session, and the loops."""
     names = [s.name for s in sessions]
     shown = []
     for s in sessions:

@@ -1,4 +1,4 @@
-"""What a page's script is given: every scan, points of the map, and the map's drawing with its crops. Numbers are base64."""
+"""Data for a page's script: all scans, map points, and the map's image with crops. Numbers are base64."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _STEP = 5.0
 
 
 def scan_data(record: RunRecord, evaluation: Evaluation | None) -> dict[str, Any] | None:
-    """Every pose of a run with what became of its scan; None of a run without poses.
+    """Every pose of a run with the result of its scan; None for a run without poses.
 
     index, stamps (ns after `first_stamp_ns`), positions (m), angles (roll, pitch, yaw, deg), status and `way` (m travelled)
     are of each pose. With ground truth also `error` (m, by `alignment`) and `truth_way` (m along it), NaN where none matches;
@@ -76,7 +76,7 @@ def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
     absolute = first_available(evaluation)
     if absolute is None:
         return {}
-    at = _matched(trajectory, evaluation)
+    at = _pose_indices(trajectory, evaluation)
     error, way = np.full((2, len(trajectory)), np.nan)
     error[at], way[at] = np.linalg.norm(absolute.errors, axis=1), evaluation.distance
     T = absolute.T_gt_est
@@ -91,7 +91,7 @@ def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
 
 
 def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -> dict[str, Any] | None:
-    """Some points of the map for the script; None without any.
+    """Some points of the map for the script; None if the map is empty.
 
     points : (M, 3) int16 q, where a coordinate is `low` + `step` (q + 32768), m; nearest : (M,) the nearest pose
     height, values : range of colours; intensity : (M,) 0 to 255 over their usual range, when the map has them
@@ -124,7 +124,7 @@ def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -
 
 
 def _nearest(points: Floats, positions: Floats) -> NDArray[np.intp]:
-    """(M,) the position nearest to each point, among those that are finite; 0 where none is."""
+    """(M,) index of the finite position nearest to each point; 0 if none is finite."""
     from scipy.spatial import cKDTree
 
     known = np.flatnonzero(np.isfinite(positions).all(1))
@@ -135,13 +135,13 @@ def _nearest(points: Floats, positions: Floats) -> NDArray[np.intp]:
 
 
 def _by_pose(trajectory: Trajectory, results: list[ScanResult]) -> list[ScanResult | None]:
-    """The result of each pose's scan."""
+    """Scan result of each pose."""
     at = {r.stamp_ns: r for r in results}
     return [at.get(stamp) for stamp in trajectory.stamps_ns.tolist()]
 
 
-def _matched(trajectory: Trajectory, evaluation: Evaluation) -> NDArray[np.intp]:
-    """(N,) which pose of the trajectory each matched one of the evaluation is."""
+def _pose_indices(trajectory: Trajectory, evaluation: Evaluation) -> NDArray[np.intp]:
+    """(N,) for each matched pose of the evaluation, the index of the trajectory's pose."""
     if evaluation.matched == len(trajectory):
         return np.arange(len(trajectory))
     stamps = evaluation.stamps_ns - round(evaluation.time_offset * 1e9)
@@ -159,7 +159,7 @@ def _status(result: ScanResult | None) -> int:
 
 
 def _angles_deg(poses: Floats) -> Floats:
-    """(N, 3) roll, pitch, yaw; NaN of poses that are not finite."""
+    """(N, 3) roll, pitch, yaw, deg; NaN for poses that are not finite."""
     angles = np.full((len(poses), 3), np.nan)
     good = np.isfinite(poses).all((1, 2))
     angles[good] = np.degrees(so3.euler_rpy(poses[good, :3, :3]))
@@ -167,7 +167,7 @@ def _angles_deg(poses: Floats) -> Floats:
 
 
 def packed(values: NDArray[Any], kind: str) -> str:
-    """Base64 of an array in one of numpy's little-endian kinds."""
+    """Base64 of an array in one of numpy's little-endian types."""
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
 
 
@@ -181,12 +181,12 @@ class Crop:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """x_min, x_max, y_min, y_max."""
+        """Limits x_min, x_max, y_min, y_max, m."""
         half = self.size / 2
         return (self.x - half, self.x + half, self.y - half, self.y + half)
 
     def inside(self, points: Floats) -> Floats:
-        """Those of the points (K, 2) or (K, 3) that lie in it."""
+        """Points among (K, 2) or (K, 3), m, that lie in the square."""
         x0, x1, y0, y1 = self.extent
         return points[((points[:, :2] >= (x0, y0)) & (points[:, :2] <= (x1, y1))).all(axis=1)]
 
@@ -218,7 +218,7 @@ def choose_crops(points: NDArray[Any], size: float = SIZE_M, most: int = MOST_CR
 
 
 def crop_images(clouds: Sequence[NDArray[Any] | None], crop: Crop) -> tuple[list[NDArray[np.float32] | None], float]:
-    """Points per pixel of each cloud (M, 3) in the square, row 0 at the largest y, and the count that is black in all.
+    """Images of the square, points per pixel of each cloud (M, 3), row 0 at the largest y; and the common count drawn black.
 
     None stays None; the count is the largest of the images' 99.5th percentiles of occupied pixels, at least 1.
     """
@@ -228,7 +228,7 @@ def crop_images(clouds: Sequence[NDArray[Any] | None], crop: Crop) -> tuple[list
 
 
 def _structure(points: NDArray[Any]) -> tuple[Longs, Floats]:
-    """Columns with relief on a grid (x, y), 0 or 1, and the grid's lower corner."""
+    """Grid (x, y) of columns with relief, 0 or 1, and the grid's lower corner, m."""
     xyz = np.asarray(points, np.float64)
     xyz = xyz[np.isfinite(xyz).all(1)]
     if not len(xyz):
@@ -246,7 +246,7 @@ def _structure(points: NDArray[Any]) -> tuple[Longs, Floats]:
 
 
 def _window_sums(counts: Longs, window: int, step: int) -> Longs:
-    """Sums over squares of `window` cells whose corners are `step` cells apart."""
+    """Sums over windows of `window` x `window` cells, placed every `step` cells."""
     padded = np.pad(counts, ((0, max(window - counts.shape[0], 0)), (0, max(window - counts.shape[1], 0))))
     table = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int64)
     table[1:, 1:] = padded.cumsum(0).cumsum(1)
@@ -268,8 +268,10 @@ FROM_ABOVE = "The more voxels of a column are occupied, the stronger it is drawn
 
 @dataclass(frozen=True)
 class MapFigure:
-    """A map from above: its drawing, the range of heights, m, that colours stand for, None of one that is grey, and its
-    pixel, m."""
+    """A map from above.
+
+    It has an image, the range of heights that colours stand for, m (None for a grey one), and the pixel size, m.
+    """
 
     figure: Figure
     heights: tuple[float, float] | None
@@ -285,7 +287,7 @@ def map_figure(
     world: str,
     by: By = "",
 ) -> MapFigure | None:
-    """The map from above with trajectories on it; None where no point lies in it.
+    """Map from above with trajectories; None if the image has no points.
 
     image : (H, W) points per pixel, row 0 at the largest y; heights : (H, W) their mean z, m; grey without
     extent : x_min, x_max, y_min, y_max, m; world : a sentence that says whose frame it is; by : as of a plane chart
@@ -314,7 +316,7 @@ LEGEND = (("s1", "edges"), ("s2", "planar points"))
 
 
 def feature_figures(view: FeatureView | None) -> list[Figure]:
-    """What was seen on one scan, what the map is made of, and how many features each scan had; nothing without features."""
+    """Figures of the features of one scan, the feature map, and the number of features per scan; empty without features."""
     if view is None:
         return []
     crop = Crop(0.0, 0.0, 2 * REACH)

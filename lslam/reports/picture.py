@@ -1,4 +1,4 @@
-"""Pictures drawn with matplotlib: one look, the same bytes for the same input, on paper and in a notebook."""
+"""Pictures drawn with matplotlib: one style, and the same bytes for the same input, on paper and in a notebook."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNKNOWN = "#bbbbbb"
 
 
 def check_plot_path(path: Path) -> None:
-    """UsageError when the suffix of `path` names no picture format we write: asked before the work, not after."""
+    """Raise UsageError if the suffix of `path` names no supported picture format; called before the work."""
     kind = path.suffix.lstrip(".").lower()
     if kind not in FORMATS:
         raise UsageError(f"{path}: a picture ends with .png, .svg or .pdf")
@@ -37,7 +37,7 @@ def check_plot_path(path: Path) -> None:
 
 @contextmanager
 def house_style(font: float = 9.0) -> Iterator[None]:
-    """The look; a figure is made and turned into a picture inside. Text stays text, of `font` points."""
+    """Context with the common style; figures are made and saved inside. Text stays text, of `font` points."""
     from matplotlib import rc_context
 
     with rc_context({"svg.hashsalt": "lslam", "svg.fonttype": "none", "font.size": font}):
@@ -45,7 +45,7 @@ def house_style(font: float = 9.0) -> Iterator[None]:
 
 
 def pictures(figure: Any, kinds: Sequence[str]) -> list[bytes]:
-    """The files of a matplotlib figure without a layout of its own: found once, it takes longer than drawing."""
+    """Files of a matplotlib figure in several formats; the layout is computed only once, since it is slow."""
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     ConstrainedLayoutEngine().execute(figure)
@@ -53,7 +53,7 @@ def pictures(figure: Any, kinds: Sequence[str]) -> list[bytes]:
 
 
 def picture(figure: Any, kind: str, dpi: int = 120) -> bytes:
-    """The file of a matplotlib figure in one of FORMATS, without the time it was made."""
+    """File of a matplotlib figure in one of FORMATS, without a creation time."""
     stamp: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}, "png": {}}[kind]
     stream = io.BytesIO()
     figure.savefig(stream, format=kind, dpi=dpi, metadata=stamp)
@@ -62,7 +62,7 @@ def picture(figure: Any, kind: str, dpi: int = 120) -> bytes:
 
 @cache
 def shown_figure() -> type[Any]:
-    """matplotlib's figure, which a notebook shows without pyplot."""
+    """matplotlib figure that a notebook shows without pyplot."""
     from matplotlib.figure import Figure
 
     class ShownFigure(Figure):
@@ -75,7 +75,7 @@ def shown_figure() -> type[Any]:
 
 
 def label(plot: Any, x: str, y: str) -> None:
-    """Name the axes and keep out of the way of what is drawn."""
+    """Label the axes and remove the upper and right frame."""
     plot.set_xlabel(x)
     plot.set_ylabel(y)
     plot.grid(alpha=0.25)
@@ -149,7 +149,7 @@ def _axis_errors(plot: Any, evaluation: Evaluation, name: str) -> None:
 
 
 def _drift_axes(plot: Any, evaluations: Sequence[Evaluation], names: Sequence[str]) -> None:
-    """A line per estimate over segment length; words where none has two lengths, and there would be dots alone."""
+    """Plot drift over segment length, a line per estimate; a text where no estimate has two lengths."""
     drifts = [e.scores["kitti_drift"] for e in evaluations]
     if any(len(drift.by_length) > 1 for drift in drifts):
         for drift, colour in zip(drifts, _colours(len(names)), strict=True):
@@ -170,7 +170,7 @@ def _drift_axes(plot: Any, evaluations: Sequence[Evaluation], names: Sequence[st
 
 
 def _best_alignment(evaluation: Evaluation) -> AbsoluteError:
-    """The first alignment asked for that is determined; the origin's errors otherwise."""
+    """Errors by the first requested alignment that is determined; else those by the origin."""
     for error in evaluation.ate.values():
         if error.available:
             return error
@@ -232,7 +232,7 @@ WIDTH = 150.0
 
 
 def as_html(text: str, picture_svg: bytes | None = None) -> str:
-    """Text as it stands, and under it a picture."""
+    """Preformatted text with a picture below."""
     shown = f"<pre>{html.escape(text)}</pre>"
     if picture_svg is None:
         return shown
@@ -240,6 +240,6 @@ def as_html(text: str, picture_svg: bytes | None = None) -> str:
 
 
 def drawn(make: Any) -> bytes:
-    """SVG of the matplotlib figure that `make` gives, in the house's style."""
+    """SVG of the matplotlib figure that `make` returns, in the common style."""
     with house_style():
         return picture(make(), "svg")

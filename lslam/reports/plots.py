@@ -1,4 +1,4 @@
-"""The figures of the HTML report: which series, in which units, with which words."""
+"""Figures of the HTML report: their series, units and texts."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def time_figure(record: RunRecord, facts: RunFacts) -> Figure | None:
 
 
 def registration_figures(record: RunRecord) -> list[Figure]:
-    """Inliers, overlap, rmse, iterations and the prior's error (Girolimetto, equation 5.1): those that the method reports."""
+    """Figures of inliers, overlap, rmse, iterations and the prior's error (Girolimetto, equation 5.1), as far as reported."""
     results = record.results
     index = np.array([r.index for r in results], np.float64)
     failed = np.array([r.index for r in results if r.status != "ok"], np.float64)
@@ -167,7 +167,7 @@ def registration_figures(record: RunRecord) -> list[Figure]:
 
 
 def uncertainty_figures(record: RunRecord) -> list[Figure]:
-    """One sigma of position and rotation per pose; nothing when the method gives no covariance.
+    """One sigma of position and rotation per pose; empty when the method gives no covariance.
 
     The covariance is read as registration gives it: of t' = t + d[:3], R' = exp(d[3:]) R in world axes, so its diagonal
     holds the variances of the position itself, without a lever arm to the world's origin.
@@ -202,7 +202,7 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
 
 
 def first_available(evaluation: Evaluation | None) -> AbsoluteError | None:
-    """The alignment the trajectory is drawn with: se3 when there is one."""
+    """Alignment for drawing the trajectory: se3 when there is one."""
     if evaluation is None:
         return None
     for name in (*ALIGNMENTS, *evaluation.ate):
@@ -238,7 +238,7 @@ def _three(names: tuple[str, str, str], x: NDArray[Any], values: Floats) -> list
 
 
 def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> Floats:
-    """(K, 2) where bridged and skipped scans are drawn: moved like the estimate."""
+    """(K, 2) positions, m, of bridged and skipped scans, transformed like the estimate."""
     places = np.array([r.T_world_lidar[:3, 3] for r in record.results if r.status != "ok"]).reshape(-1, 3)
     if absolute is not None:
         places = absolute.scale * places @ absolute.T_gt_est[:3, :3].T + absolute.T_gt_est[:3, 3]
@@ -246,7 +246,7 @@ def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> Floa
 
 
 def _covariances(record: RunRecord) -> Floats | None:
-    """The trajectory's covariances, else those of the scans; NaN where a scan has none."""
+    """Covariances of the trajectory, else those of the scans; NaN where a scan has none."""
     if record.trajectory.covariances is not None:
         return record.trajectory.covariances
     given = [r.covariance for r in record.results]
@@ -260,7 +260,7 @@ def stage_chart(index: NDArray[Any], ms: Floats, limit: float, title: str) -> tu
 
     Returns the SVG and a sentence about what the scale hides: bins, peaks cut off, a limit out of view.
     """
-    x, layers, highest, remark = _binned(np.asarray(index, np.float64), ms)
+    x, layers, highest, remark = _bins(np.asarray(index, np.float64), ms)
     totals = ms.sum(1)
     usual = float(np.percentile(totals, 95))
     top = _scale(totals, usual)
@@ -295,13 +295,13 @@ def stage_chart(index: NDArray[Any], ms: Floats, limit: float, title: str) -> tu
 
 
 def _scale(totals: Floats, usual: float) -> float:
-    """The top of the axis: everything, unless a few peaks (the first scan of a run, say) would hide the rest."""
+    """Upper end of the axis: the maximum, unless a few peaks (the first scan of a run, say) would compress the rest."""
     highest = float(totals.max())
     top = highest if highest <= 2.5 * usual else 1.4 * usual
     return 1.08 * top if top > 0 else 1.0
 
 
-def _binned(index: Floats, ms: Floats) -> tuple[Floats, Floats, Floats | None, str]:
+def _bins(index: Floats, ms: Floats) -> tuple[Floats, Floats, Floats | None, str]:
     """Edges (B+1,), mean per stage (B, S) and, when a bin holds several scans, the longest total of each bin."""
     if len(ms) <= svg.BINS:
         step = float(np.median(np.diff(index))) if len(index) > 1 else 1.0

@@ -1,4 +1,4 @@
-"""Colours for heights, and density images as small PNG files with an alpha channel, written without an imaging library."""
+"""Colour palette for heights, and density images as small PNG files with transparency, without an imaging library."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ VIRIDIS = (
 
 
 def palette() -> NDArray[np.uint8]:
-    """(16, 3) the colours above as red, green, blue."""
+    """(16, 3) palette as red, green, blue."""
     return np.array([[int(colour[i : i + 2], 16) for i in (0, 2, 4)] for colour in VIRIDIS], np.uint8)
 
 
 def usual_range(values: NDArray[np.floating]) -> tuple[float, float]:
-    """The 2nd and 98th percentile of the finite values (0, 1 without any), so that a few stray ones take no colours away."""
+    """2nd and 98th percentile of the finite values (0, 1 without any), so that outliers do not compress the colours."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 1.0
@@ -35,9 +35,9 @@ LEVELS = 16  # four bits per pixel
 
 
 def density_png(image: NDArray[Any], top: float | None = None) -> bytes:
-    """PNG of a density image (H, W): black whose opacity grows with the logarithm of the density.
+    """PNG of a density image (H, W): black, with an opacity that grows with the logarithm of the density.
 
-    The palette has 16 levels; `top`, or else the 99.5th percentile of the occupied pixels, and what lies above is opaque.
+    The palette has 16 levels. Densities from `top` on, by default the 99.5th percentile of the occupied pixels, are opaque.
     Empty and non-finite pixels are transparent, so the page's paper shows through in light and dark.
     """
     levels = _levels(np.nan_to_num(np.asarray(image, np.float32), nan=0.0, posinf=0.0, neginf=0.0), top)
@@ -60,7 +60,7 @@ def density_png(image: NDArray[Any], top: float | None = None) -> bytes:
 
 
 def halved(image: NDArray[Any], values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """A density image (H, W) and its values with half as many pixels each way: sums, and means by density."""
+    """Density image (H, W) and its values at half the resolution: densities are summed, values averaged by density."""
     height, width = (2 * (n // 2) for n in image.shape)
     blocks = (height // 2, 2, width // 2, 2)
     density = np.nan_to_num(np.asarray(image[:height, :width], np.float32)).reshape(blocks)
@@ -70,7 +70,7 @@ def halved(image: NDArray[Any], values: NDArray[Any]) -> tuple[NDArray[np.float3
 
 
 def coloured_png(image: NDArray[Any], values: NDArray[Any], low: float, high: float) -> bytes:
-    """PNG of a density image (H, W) whose colour says `values` (H, W), from `low` to `high`, and whose opacity the density.
+    """PNG of a density image (H, W): colours show `values` (H, W) from `low` to `high`, opacities the density.
 
     Of 16 colours and 16 opacities; empty pixels are transparent.
     """
@@ -109,7 +109,7 @@ def _png(chunks: list[tuple[bytes, bytes]]) -> bytes:
 
 
 def data_uri(png: bytes) -> str:
-    """The image as text that needs no second file."""
+    """Image as a data URI, embedded in the page."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 

@@ -1,4 +1,4 @@
-"""A run as a rerun recording (.rrd), to be looked at in three dimensions. The only file that knows rerun."""
+"""Export of a run as a rerun recording (.rrd), for viewing in three dimensions. The only file that imports rerun."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ESTIMATE, _ODOMETRY = (31, 119, 180), (214, 39, 40)
 
 @dataclass(frozen=True)
 class ViewedRun:
-    """What is drawn, all in the run's world, m.
+    """Data for the recording, all in the run's world, m.
 
     odometry : the trajectory before the pose graph, where there was one
     """
@@ -33,7 +33,7 @@ class ViewedRun:
 
 
 def require_rerun() -> Any:
-    """The module; raises InputError with the way out when it is missing."""
+    """The rerun module. Raises InputError with instructions when it is missing."""
     with importing("rerun", install_hint("view")):
         import rerun
     return rerun

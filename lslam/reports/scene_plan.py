@@ -1,4 +1,4 @@
-"""The plan of a simulated scene as a picture: the top view with metres at its grid, and a key of scale, north and colours."""
+"""Plan of a simulated scene as a picture: top view with labelled grid, and a legend of scale, north and colours."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _HALO = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.5}
 
 
 def write_plan(path: Path, plan: ScenePlan) -> None:
-    """Write the view, its pixels as they are, with the key below it, as a PNG; raises OutputError."""
+    """Write the view in its own pixels with the legend below it, as a PNG. Raises OutputError."""
     from matplotlib.figure import Figure
     from matplotlib.image import imsave
 
@@ -51,7 +51,7 @@ def write_plan(path: Path, plan: ScenePlan) -> None:
 
 
 def _laid_on(image: Pixels, figure: Any) -> Pixels:
-    """The figure, which is as wide and higher, over the image: as an image of matplotlib's its pixels would shift."""
+    """Image with the figure, which is as wide and higher, blended over it. matplotlib would resample the image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     figure.patch.set_alpha(0)
@@ -65,7 +65,7 @@ def _laid_on(image: Pixels, figure: Any) -> Pixels:
 
 
 def bar_length(width: float) -> int:
-    """m, a 1, 2 or 5 with zeros: the scale bar of a plan `width` m wide.
+    """Length of the scale bar, m, of a plan `width` m wide: 1, 2 or 5 times a power of ten.
 
     >>> [bar_length(width) for width in (60.0, 180.0, 950.0)]
     [20, 50, 200]
@@ -75,7 +75,7 @@ def bar_length(width: float) -> int:
 
 
 def _text(figure: Any, x: float, y: float, text: str, **style: Any) -> Any:
-    """Text at a pixel from the lower left corner."""
+    """Draw text at a pixel from the lower left corner."""
     return figure.text(x, y, text, transform=None, **style)
 
 
@@ -86,7 +86,7 @@ def _shape(figure: Any, kind: str, *given: Any, **style: Any) -> None:
 
 
 def _label_grid(figure: Any, plan: ScenePlan, below: int) -> None:
-    """Metres at the lower end of every darker column and the left end of every darker row."""
+    """Draw metres at the lower end of every darker column and the left end of every darker row."""
     for metre, column in plan.marks(0):
         _text(figure, column + 4, below + 4, str(metre), va="bottom", bbox=_HALO)
     for metre, row in plan.marks(1):
@@ -94,7 +94,7 @@ def _label_grid(figure: Any, plan: ScenePlan, below: int) -> None:
 
 
 def _draw_scale(figure: Any, plan: ScenePlan, below: int, letter: float) -> None:
-    """The north arrow, a bar of two halves with metres above it, and what the grid is."""
+    """Draw the north arrow, a scale bar of two halves with metres above it, and the grid spacing."""
     top = below - 0.5 * letter
     left = 0.9 * letter
     _shape(figure, "Polygon", [(left, top - letter), (left - 0.5 * letter, top - 2.4 * letter), (left, top - 2 * letter),
@@ -112,7 +112,7 @@ def _draw_scale(figure: Any, plan: ScenePlan, below: int, letter: float) -> None
 
 
 def _legend_rows(figure: Any, names: list[Any], width: int, letter: float) -> list[list[Any]]:
-    """Names with colour, kind of mark and where they begin, in rows that are no wider than the plan."""
+    """Legend entries (name, colour, kind of mark, position) in rows no wider than the plan."""
     rows: list[list[Any]] = [[]]
     x = 0.5 * letter
     for name, colour, kind in names:

@@ -1,4 +1,4 @@
-"""What all pages have in common: templates, the script that makes them move, and the policy that no other runs."""
+"""Common parts of all pages: templates, the page's script, and a content security policy that allows no other script."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ RUN = ("page.js", "map.js", "overlay.js", "charts.js")
 
 @dataclass(frozen=True)
 class Script:
-    """The text of an inline script, and its digest as a content security policy names it."""
+    """Text of an inline script, and its digest for the content security policy."""
 
     text: str
     digest: str
 
 
 def render(name: str, script: tuple[str, ...] = CHARTS, **shown: Any) -> str:
-    """A page of this package: the template `name`, which extends the shell, with the files of `script` in it."""
+    """Page of this package: the template `name`, which extends the shell, with the files of `script` inserted."""
     return template(name).render(version=__version__, script=_script(script), **shown)
 
 
 def template(name: str) -> Template:
-    """A template of this package; everything it shows is escaped, and a name it does not know is an error."""
+    """Template of this package; values are escaped, and an unknown name is an error."""
     return _environment().get_template(name)
 
 
@@ -46,7 +46,7 @@ def _script(names: tuple[str, ...]) -> Script:
 
 @cache
 def _environment() -> Environment:
-    """One for all pages of a process: to compile a template takes longer than to fill it."""
+    """Template environment, shared by all pages of a process, since compiling a template takes longer than filling it."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     return Environment(

@@ -20,7 +20,7 @@ LOST = "x"
 
 
 class PicturePoint(NamedTuple):
-    """A drawn point: `x`, `y` as shares of the picture from its upper left corner, and what it stands for."""
+    """Drawn point: `x`, `y` as fractions of the picture from its upper left corner, and its description."""
 
     x: float
     y: float
@@ -28,9 +28,9 @@ class PicturePoint(NamedTuple):
 
 
 def picture_points(figure: Any, cross: str) -> list[PicturePoint]:
-    """The points of all plots of a matplotlib figure that is laid out: curve, abscissa, ordinate with half its interval.
+    """Points of all plots of a matplotlib figure after layout: curve, abscissa, ordinate with half its interval.
 
-    cross : what a cross says instead of an ordinate
+    cross : text of a cross, in place of an ordinate
     """
     size = np.array(figure.bbox.size)
     found = []
@@ -45,8 +45,8 @@ def picture_points(figure: Any, cross: str) -> list[PicturePoint]:
             for (x, y), (left, up), half in zip(data, places, halves, strict=True):
                 if not (np.isfinite([left, up]).all() and 0 <= up <= 1):
                     continue
-                value = cross if line.get_marker() == LOST else _labelled(ordinate, _number(y) + half)
-                words = (title, name, _labelled(abscissa, _tick(plot, x)), value)
+                value = cross if line.get_marker() == LOST else _value_text(ordinate, _number(y) + half)
+                words = (title, name, _value_text(abscissa, _tick(plot, x)), value)
                 found.append(
                     PicturePoint(
                         round(float(left), 4), round(float(1 - up), 4), ", ".join(word for word in words if word)
@@ -56,9 +56,9 @@ def picture_points(figure: Any, cross: str) -> list[PicturePoint]:
 
 
 def _lines(plot: Any) -> Iterator[tuple[Any, str, list[str]]]:
-    """Lines with markers, the name of the curve, and half the interval about each point, in words.
+    """Lines with markers, the name of the curve, and half the interval at each point, as text.
 
-    A name that begins with an underscore stands in no legend.
+    A name that begins with an underscore is not in the legend.
     """
     named = {}
     for container in plot.containers:
@@ -73,14 +73,14 @@ def _lines(plot: Any) -> Iterator[tuple[Any, str, list[str]]]:
             yield line, *named.get(line, (name, [""] * len(line.get_xdata())))
 
 
-def _labelled(label: str, value: str) -> str:
-    """A value with the name and the unit of its axis."""
+def _value_text(label: str, value: str) -> str:
+    """Value as text with the name and the unit of its axis."""
     name, comma, unit = label.rpartition(", ")
     return f"{name} {value} {unit}" if comma else f"{label} {value}"
 
 
 def _tick(plot: Any, x: float) -> str:
-    """The word at an abscissa where words stand there."""
+    """Tick label at an abscissa, on an axis of words."""
     from matplotlib.ticker import FuncFormatter
 
     formatter = plot.xaxis.get_major_formatter()
@@ -135,7 +135,7 @@ class StudyFigure:
 
 
 def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
-    """All figures that the study has numbers for."""
+    """All figures for which the study has numbers."""
     from matplotlib.figure import Figure
 
     known = [r for r in result.results if r.curve.ran.any()]
@@ -159,7 +159,7 @@ def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
 
 
 def _zoom(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
-    """Only where some curves are lost somewhere and others nowhere."""
+    """Figure without the lost points; only where some curves diverge and others do not."""
     steady = [r for r in shown if not r.curve.is_lost.any()]
     return len(steady) < len(shown) and bool(steady) and _errors(figure, result, steady)
 
@@ -173,7 +173,7 @@ def _times(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bo
 
 
 def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
-    """A panel per curve with a line per stage of registration; none where registration has a single stage."""
+    """Draw a panel per curve with a line per stage of registration. Returns False if registration has a single stage."""
     own = [[name for name, m in r.stage_means.items() if name not in NOT_REGISTRATION and m.n.any()] for r in shown]
     if max(len(names) for names in own) < 2:
         return False
@@ -193,7 +193,7 @@ def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
 
 
 def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
-    """Each curve over its own largest value; a bar below it where it is within a tenth of that."""
+    """Efficiency of each curve relative to its largest value; a bar below where it is within a tenth of that."""
     names = ("efficiency", "total_efficiency")
     for plot, name in zip(figure.subplots(1, 2), names, strict=True):
         for k, (r, look) in enumerate(_with_looks(result, shown)):
@@ -214,7 +214,7 @@ def _quantity(
     plot: Any, result: StudyResult, shown: Sequence[CurveResult], name: str, words: str,
     of_row: Callable[[StudyRow], float],
 ) -> None:  # fmt: skip
-    """Means with their intervals; crosses at the top where a curve is lost; runs beside as dotted lines."""
+    """Means with their intervals; crosses at the top where a curve is lost; reference runs as dotted lines."""
     tops = []
     rows_of_crosses = 0
     for r, look in _with_looks(result, shown):
@@ -247,7 +247,7 @@ def _quantity(
 
 
 def _beside(result: StudyResult, of_row: Callable[[StudyRow], float]) -> Iterator[tuple[StudyRow, str]]:
-    """The first seed of each method beside the study that has the number, with its grey."""
+    """Reference runs beside the study that have the number: the first seed of each method, with its grey."""
     seen: dict[str, StudyRow] = {}
     for row in result.beside:
         if np.isfinite(of_row(row)):
@@ -257,7 +257,7 @@ def _beside(result: StudyResult, of_row: Callable[[StudyRow], float]) -> Iterato
 
 
 def _with_looks(result: StudyResult, shown: Sequence[CurveResult]) -> Iterator[tuple[CurveResult, dict[str, Any]]]:
-    """What is shown with how it is drawn: the same in all figures of a study.
+    """Curves with their line styles, the same in all figures of a study.
 
     Colour by curve while there are few; where there are many, by second parameter in order, with a dash per series.
     """
@@ -282,7 +282,7 @@ def _with_looks(result: StudyResult, shown: Sequence[CurveResult]) -> Iterator[t
 
 
 def _abscissa(plot: Any, result: CurveResult) -> None:
-    """Logarithmic where most values crowd at the low end; words where they are words."""
+    """Set up the abscissa: logarithmic where most values crowd at the low end; words where values are words."""
     values: Floats = result.curve.values
     if result.curve.words:
         plot.set_xticks(values, result.curve.words)
@@ -298,14 +298,14 @@ def _abscissa(plot: Any, result: CurveResult) -> None:
 
 
 def _legend(figure: Any, *plots: Any) -> None:
-    """Each name once, below everything."""
+    """Draw a legend below all plots, each name once."""
     found = {name: handle for plot in plots for handle, name in zip(*plot.get_legend_handles_labels(), strict=True)}
     columns = max(1, _LEGEND_WIDTH // (max((len(name) for name in found), default=0) + 6))
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
 def draw_laws(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
-    """The law of each curve, or of each series over both parameters; False where there is none."""
+    """Draw the law of each curve, or of each series over both parameters. Returns False if there is none."""
     colours = {r.curve.label: colour for r, colour in zip(result.results, COLOURS, strict=False)}
     singles = [(r.curve.label, r.law) for r in shown if r.law is not None and r.curve.label in colours]
     laws = list(result.products.items()) or singles
@@ -342,7 +342,7 @@ def _single(upper: Any, lower: Any, law: Law, curve: str, colour: str) -> None:
 
 
 def _product(upper: Any, lower: Any, law: Law, name: str) -> None:
-    """A line per value of the second parameter: one law over all of them."""
+    """Draw one law of both parameters, as a line per value of the second one."""
     from matplotlib import colormaps
 
     seconds = np.unique(law.points[:, 1])

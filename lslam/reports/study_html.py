@@ -64,7 +64,7 @@ def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequen
 
 
 def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
-    """Why findings about time are left undecided, and what has them judged; empty when they are."""
+    """Reasons why findings about time are undecided, and how to decide them; empty when they are decided."""
     usable = [row for row in rows if row.is_usable]
     shared = sum(not row.is_timing_comparable for row in usable)
     if not shared:
@@ -85,7 +85,7 @@ def _as_text(section: StudySection, style: str, heading: str, item: str) -> list
 
 
 def _words(result: StudyResult, keys: Set[str]) -> list[str]:
-    """What tells the files of one result from those of another, in characters that any file system takes.
+    """File name parts that distinguish one result from others, safe for any file system.
 
     keys : of all results; the section is named where two have a key of the same name in it
     """

@@ -35,7 +35,7 @@ _UNITS = {
 
 
 def study_tables(result: StudyResult) -> list[CompareTable]:
-    """All tables that hold anything."""
+    """All tables of a study that are not empty."""
     tables = [_verdicts(result), _landmarks(result), _laws(result), _means(result), _beside(result), _failures(result)]
     return [table for table in tables if table.rows]
 
@@ -61,7 +61,7 @@ def means_grid(results: Sequence[StudyResult]) -> Grid:
 
 
 def study_recipes(result: StudyResult) -> list[str]:
-    """How the numbers are made, one sentence each."""
+    """Definitions of the numbers, one sentence each."""
     return [
         f"translation: {TRANSLATION[result.metric]}; rotation: equation 2.15 of Girolimetto",
         "registration: all stages of a scan but reading, preparing, standing still and keyframes",
@@ -192,12 +192,12 @@ class Best:
     point: tuple[StudyRow, ...]
 
     def mean(self, name: str) -> float:
-        """Of a number over the seeds."""
+        """Mean of a number over the seeds of the best point."""
         return float(sum(getattr(row, name) for row in self.point)) / len(self.point)
 
 
 def best_points(rows: Sequence[StudyRow]) -> list[Best]:
-    """One per sequence and method, with and without IMU and beside apart, in the order of the rows."""
+    """Best point per sequence and method, in the order of the rows; runs with IMU, and runs beside the study, are separate."""
     groups: dict[tuple[str, str], list[StudyRow]] = {}
     for row in rows:
         groups.setdefault((row.sequence, label(row)), []).append(row)
@@ -208,7 +208,7 @@ def best_points(rows: Sequence[StudyRow]) -> list[Best]:
 
 
 def label(row: StudyRow) -> str:
-    """The method as people read it.
+    """Display name of a row's method.
 
     >>> label(StudyRow("", "", "open", 0, "icp", uses_imu=True, is_beside=True))
     'icp+imu (beside)'

@@ -1,7 +1,7 @@
 """Small charts as inline SVG: no plotting library, colours and fonts left to the page's style sheet.
 
-Each is whole as it stands. For the page's script, which zooms charts and finds scans in them, axes and data are groups of
-their own, `data-view` has the limits of the axes and their places, and `data-by` what of a scan the abscissa is.
+Each chart is complete without the script. The page's script zooms charts and finds scans in them. For it, axes and data are
+separate groups, `data-view` holds the limits and positions of the axes, and `data-by` names the quantity of the abscissa.
 
 Drawn by hand because a report must be quick (importing a plotting library alone takes half a second of a run that
 lasts two), readable on a phone and follow the page's light and dark colours. Long series are drawn as minimum and
@@ -62,8 +62,8 @@ class Frame:
         by: By = "",
     ) -> None:
         self.width, self.height, self.by, self.kind = width, height, by, "chart"
-        self.x0, self.x1 = _widened(*x_range)
-        self.y0, self.y1 = _widened(*y_range)
+        self.x0, self.x1 = _widen(*x_range)
+        self.y0, self.y1 = _widen(*y_range)
         self.left, self.right = MARGIN_LEFT, width - MARGIN_RIGHT
         self.top, self.bottom = MARGIN_TOP, height - MARGIN_BOTTOM
         self.parts: list[str] = []
@@ -93,11 +93,11 @@ class Frame:
         self._labels.append(_text(6, 14, y_label, "start", "label"))
 
     def add(self, element: str) -> None:
-        """One more element."""
+        """Append an SVG element."""
         self.parts.append(element)
 
     def text(self, x: float, y: float, text: str, anchor: str = "start", style: str = "tick") -> None:
-        """Escaped text."""
+        """Append text, escaped."""
         self.add(_text(x, y, text, anchor, style))
 
     def polyline(self, x: NDArray[Any], y: NDArray[Any], style: str) -> None:
@@ -130,7 +130,7 @@ class Frame:
             self.add(f'<path class="{style}" d="{"".join(f"M{p} {self.top}V{self.bottom}" for p in places)}"/>')
 
     def svg(self, title: str) -> str:
-        """The finished element; `title` is what a screen reader says. What has no axes does not move."""
+        """Finished SVG element; `title` is for screen readers. A chart without axes cannot be zoomed."""
         head = f'<svg viewBox="0 0 {self.width} {self.height}" role="img" aria-label="{escape(title)}"'
         content = "".join(self.parts)
         if not self._labels:
@@ -199,7 +199,7 @@ def path(px: NDArray[Any], py: NDArray[Any]) -> str:
 
 
 def finite_runs(values: NDArray[Any]) -> list[slice]:
-    """Slices over which values are finite."""
+    """Slices of consecutive finite values."""
     good = np.concatenate([[0], np.isfinite(values).astype(np.int8), [0]])
     edges = np.flatnonzero(np.diff(good))
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -232,7 +232,7 @@ def line_chart(
     bands : areas behind the lines; where one is wider than the lines need, as at the start of a filter, it is cut off
     by : what of a scan the abscissa is
     """
-    x_span, y_span = span_of([line.x for line in lines]), span_of([*(line.y for line in lines), *_settled(bands)], zero)
+    x_span, y_span = span_of([line.x for line in lines]), span_of([*(line.y for line in lines), *_tail(bands)], zero)
     if x_span is None or y_span is None:
         return ""
     pad = 0.06 * (y_span[1] - y_span[0])
@@ -249,13 +249,13 @@ def line_chart(
     return frame.svg(title)
 
 
-def _settled(bands: Sequence[Band]) -> list[NDArray[Any]]:
-    """Limits of the bands in their second half."""
+def _tail(bands: Sequence[Band]) -> list[NDArray[Any]]:
+    """Limits of the bands in their second half, where a filter has converged."""
     return [v[len(v) // 2 :] for band in bands for v in (band.low, band.high)]
 
 
-def _widened(low: float, high: float) -> tuple[float, float]:
-    """A range that can be divided by, also for one value."""
+def _widen(low: float, high: float) -> tuple[float, float]:
+    """Range with a positive width, also for a single value."""
     least = 1e-9 * max(1.0, abs(low), abs(high))
     if high - low > least:
         return low, high
@@ -297,7 +297,7 @@ def plane_chart(
     x_span, y_span = span_of(xs), span_of(ys)
     if x_span is None or y_span is None:
         return ""
-    frame = _fitted(x_span, y_span, width, tallest, 0.0 if backdrop else 0.05)
+    frame = _fit_frame(x_span, y_span, width, tallest, 0.0 if backdrop else 0.05)
     frame.by, frame.kind = by, "plane"
     frame.axes("x, m", "y, m", x_ticks=min(6, width // 80), y_ticks=max(2, round((frame.bottom - frame.top) / 60)))
     if backdrop is not None:
@@ -325,8 +325,8 @@ def plane_chart(
     return frame.svg(title)
 
 
-def _fitted(x_span: tuple[float, float], y_span: tuple[float, float], width: int, tallest: int, pad: float) -> Frame:
-    """A frame with one scale for x and y, its height following the shape of the data."""
+def _fit_frame(x_span: tuple[float, float], y_span: tuple[float, float], width: int, tallest: int, pad: float) -> Frame:
+    """Frame with one scale for x and y, its height chosen for the data."""
     margins_x = MARGIN_LEFT + MARGIN_RIGHT
     margins_y = MARGIN_TOP + MARGIN_BOTTOM
     size = np.array([x_span[1] - x_span[0], y_span[1] - y_span[0]])
@@ -341,7 +341,7 @@ def _fitted(x_span: tuple[float, float], y_span: tuple[float, float], width: int
 
 
 def _mark_ends(frame: Frame, xy: Floats) -> None:
-    """A circle where the path starts and a square where it ends; the circle lies on top of a closed loop's square."""
+    """Draw a circle at the start of the path and a square at its end; on a closed loop the circle is on top."""
     finite = xy[np.isfinite(xy).all(1)]
     if not len(finite):
         return

@@ -1,4 +1,4 @@
-"""The summary that a run prints on stdout: what a person wants to know before opening the report."""
+"""Summary of a run on stdout."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Grid = list[list[str]]
 
 
 def localization_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[str, str]]:
-    """Names and values for the summary; nothing of a run without a map."""
+    """Names and values on localisation for the summary; empty for a run without a prior map."""
     fixes = record.map_fixes
     if not fixes:
         return []
@@ -89,7 +89,7 @@ def _scan_rows(facts: RunFacts) -> list[tuple[str, str]]:
 
 
 def imu_rows(record: RunRecord) -> list[tuple[str, str]]:
-    """What the IMU was good for, when there was one."""
+    """Names and values on the IMU's contribution; empty without an IMU."""
     imu = record.manifest.get("imu")
     if not imu:
         return []
@@ -104,16 +104,16 @@ def imu_rows(record: RunRecord) -> list[tuple[str, str]]:
         )
     ]
     if imu.get("mean_iterations"):
-        rows.append(("", f"{imu['mean_iterations']:.1f} iterations per scan; {_saved(imu)}"))
-    if said := _calibrated(imu):
+        rows.append(("", f"{imu['mean_iterations']:.1f} iterations per scan; {_saving_text(imu)}"))
+    if said := _calibration_text(imu):
         rows.append(("", said))
     return rows
 
 
-def _calibrated(imu: dict[str, Any]) -> str:
-    """In words the clock and the mounting that were estimated; empty where that is nothing.
+def _calibration_text(imu: dict[str, Any]) -> str:
+    """Estimated clock offset and mounting of the IMU, in words; empty where none was estimated.
 
-    >>> _calibrated({"time_offset_s": -0.0203, "time_offset_sigma_s": 0.0004})
+    >>> _calibration_text({"time_offset_s": -0.0203, "time_offset_sigma_s": 0.0004})
     'IMU 20.3 ms late (0.4)'
     """
     parts = []
@@ -128,8 +128,8 @@ def _calibrated(imu: dict[str, Any]) -> str:
     return "IMU " + ", ".join(parts) if parts else ""
 
 
-def _saved(imu: dict[str, Any]) -> str:
-    """What registration from constant velocity took on a sample of the scans."""
+def _saving_text(imu: dict[str, Any]) -> str:
+    """Sentence comparing iterations and time with and without the IMU's prior, on a sample of the scans."""
     if not imu.get("compared_scans"):
         return "lslam compare --imu both tells what that saves"
     saved = imu["saved_ms_per_scan"]
@@ -153,7 +153,7 @@ def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[
 
 
 def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
-    """How crisp the map is: what tells methods apart where no truth is known."""
+    """Names and values on the map's entropy, which compares methods without ground truth."""
     score = record.crispness
     if score is None or score.entropy is None or score.plane_variance is None:
         return []
@@ -187,22 +187,22 @@ def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
 
 
 def markdown(grid: Grid, names: int = 1) -> str:
-    """A Markdown table; the first `names` columns are set flush left, the others right."""
+    """Markdown table; the first `names` columns are aligned left, the others right."""
     head, *body = [[cell.strip().replace("|", "\\|") for cell in row] for row in grid]
     rule = ["---"] * names + ["---:"] * (len(head) - names)
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *body])
 
 
 def comma_separated(grid: Grid, _: int = 1) -> str:
-    """CSV as spreadsheets read it."""
+    """CSV table for spreadsheets."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([[cell.strip() for cell in row] for row in grid])
     return out.getvalue().rstrip("\n")
 
 
 def latex(grid: Grid, names: int = 1) -> str:
-    """A LaTeX tabular that needs no package."""
-    head, *body = [" & ".join(_escaped(cell) for cell in row) + r" \\" for row in grid]
+    """LaTeX tabular that needs no package."""
+    head, *body = [" & ".join(_escape(cell) for cell in row) + r" \\" for row in grid]
     columns = "l" * names + "r" * (len(grid[0]) - names)
     return "\n".join(
         [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *body, r"\hline", r"\end{tabular}"]
@@ -210,7 +210,7 @@ def latex(grid: Grid, names: int = 1) -> str:
 
 
 def aligned(grid: Grid, names: int = 1) -> str:
-    """Columns of equal width, two spaces between them."""
+    """Table of columns of equal width, two spaces between them."""
     widths = [max(len(cell) for cell in column) for column in zip(*grid, strict=True)]
     return "\n".join(
         "  ".join(f"{c:<{w}}" if k < names else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=True)))
@@ -219,7 +219,7 @@ def aligned(grid: Grid, names: int = 1) -> str:
     )  # fmt: skip
 
 
-def _escaped(cell: str) -> str:
+def _escape(cell: str) -> str:
     signs = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {"\\": "\\textbackslash{}"}
     cell = cell.translate({ord(sign): word for sign, word in signs.items()})
     return cell.strip().replace("±", "$\\pm$")

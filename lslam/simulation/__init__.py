@@ -1,4 +1,4 @@
-"""The virtual environment; here, whether the folder of a simulation may be written, seen before anything heavy is imported."""
+"""The virtual environment; here, cheap checks of the folder of a simulation before heavy imports."""
 
 from __future__ import annotations
 
@@ -32,5 +32,5 @@ def check_target(out: Path, overwrite: bool, resume: bool = False) -> None:
 
 
 def part_of(out: Path) -> Path:
-    """Where the scans of a simulation lie that is not whole yet."""
+    """Folder of the scans of an unfinished simulation."""
     return out / "sequences" / f"{NUMBER}.part"

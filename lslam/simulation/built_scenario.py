@@ -1,4 +1,4 @@
-"""From a scenario to a place: the street and the line along it, the town round it, the path through it, what moves in it."""
+"""Construction of a scenario's place: street and path, town, and moving objects."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ STEP = 0.05  # s
 
 @dataclass(frozen=True)
 class BuiltScenario:
-    """A built scenario: the city, the path of the LiDAR through it, and how many scans it gives."""
+    """A built scenario: the city, the path of the LiDAR through it, and the number of scans."""
 
     city: City
     path: paths.VehiclePath | FreePath | EightFlight
@@ -65,11 +65,12 @@ def build_scenario(
     standing: int = 0,
     visit: Visit = FIRST_VISIT,
 ) -> BuiltScenario:
-    """Build the place of `scenario`; one generator per part, so that another LiDAR or speed leaves the city as it is.
+    """Build the place of `scenario`.
 
-    Only an out-and-back, and what is round it, is longer when a speed or `count` needs it. `way_points` replace the scenario's
-    own line, `extract` its town; `standing` of the `count` scans pass before it moves off; `visit` is another drive.
-    Raises UsageError for bends too tight and more scans than fit, InputError for an extract that is far from the way-points.
+    Each part has a random generator of its own, so another LiDAR or speed leaves the city unchanged. Only an out-and-back
+    line and its surroundings grow with the speed or `count`. `way_points` replace the scenario's own line, `extract` its
+    town. `standing` of the `count` scans pass before the vehicle moves off; `visit` is another drive. Raises UsageError for
+    bends too tight and more scans than fit, InputError for an extract that is far from the way-points.
     """
     if scenario.world.kind in INDOORS and (way_points is not None or extract is not None):
         raise UsageError(
@@ -93,9 +94,9 @@ def build_scenario(
 
 
 def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCity, Floats]:
-    """Everything in `extract`, and the line (N, 3) along its streets that would be taken, with no point where there is none.
+    """City of the whole `extract`, and the line (N, 3) along its streets that would be driven; no points if there is none.
 
-    It is what a plan to pick way-points from shows.
+    A plan for picking way-points shows it.
     """
     place, build = (np.random.default_rng([seed, 2**32 - k]) for k in (1, 2))
     terrain = _terrain(scenario, place)
@@ -108,7 +109,7 @@ def whole_map(scenario: Scenario, seed: int, extract: MapExtract) -> tuple[OsmCi
 
 
 def populate(scenario: Scenario, city: City, path: PosePath, seeds: tuple[int, ...]) -> list[Mover]:
-    """What moves in `city` while the LiDAR is on `path`."""
+    """Moving objects in `city` while the LiDAR is on `path`."""
     traffic, queue = scenario.traffic, []
     if traffic.queue_s is not None:
         rng = np.random.default_rng([*seeds, 2**32 - 5])
@@ -164,14 +165,14 @@ def _check_radius(scenario: Scenario, line: RouteCurve) -> None:
 def _move(
     scenario: Scenario, route: Route, terrain: Terrain, count: int | None, standing: int, rng: np.random.Generator
 ) -> tuple[paths.VehiclePath | FreePath | EightFlight, int]:
-    """The path, and how many scans there are: `count`, or one lap, or all that fit on an open line."""
+    """The path, and the number of scans: `count`, or one lap, or all that fit on an open line."""
     line, rate = route.line, scenario.rate_hz
     distance = line.length
     if line.closed:
         wanted = distance + scenario.overlap if count is None else scenario.speed * count / rate
         # The columns of the last scan need its whole period on the path.
         distance = wanted + 2 * scenario.speed / rate
-    path = _carried(scenario, route, terrain, distance, rng)
+    path = _make_path(scenario, route, terrain, distance, rng)
     fits = int(np.floor(path.duration * rate + 1e-6))
     if not line.closed:
         if count is not None and count - standing > fits:
@@ -187,9 +188,10 @@ def _move(
     return path, min(count, fits)
 
 
-def _carried(
+def _make_path(
     scenario: Scenario, route: Route, terrain: Terrain, distance: float, rng: np.random.Generator
 ) -> paths.VehiclePath | FreePath | EightFlight:
+    """Path of the LiDAR along the route, `distance` m, by its carrier: car, walker or drone."""
     line, section = route.line, scenario.path
     if section.shape == "eights":
         above = line.position(np.array([0.5 * line.length]))[0]
@@ -211,7 +213,7 @@ def _carried(
 def check_path(scene: RayScene, city: City, poses: Callable[[NDArray[Any]], Floats], duration: float) -> None:
     """Raise UsageError naming the place where a path, 0..`duration` s, enters the ground or a building.
 
-    Three lines are followed, the path and one on either side of it: whatever solid lies between two instants is crossed.
+    Rays are cast between successive instants along the path and along one line on either side of it.
     """
     times = np.arange(0.0, duration, STEP)
     T = poses(times)
@@ -234,7 +236,10 @@ def check_path(scene: RayScene, city: City, poses: Callable[[NDArray[Any]], Floa
 
 
 def check_bends(curvature: Floats, s: Floats, speed: float, limit: float) -> None:
-    """Raise UsageError where a bend taken at `speed` m/s needs more than `limit` m/s2 across; arrays (M,), 1/m and m."""
+    """Raise UsageError where a bend taken at `speed` m/s needs more than `limit` m/s2 lateral acceleration.
+
+    Curvatures (M,), 1/m, at distances (M,), m.
+    """
     needed = speed**2 * np.abs(curvature)
     worst = int(np.argmax(needed))
     if needed[worst] > limit:
@@ -245,7 +250,7 @@ def check_bends(curvature: Floats, s: Floats, speed: float, limit: float) -> Non
 
 
 def _check_start(scene: RayScene, T: Floats) -> None:
-    """Nothing solid above the start: inside a building one would be under its roof."""
+    """Raise UsageError if anything solid is above the start: then it lies inside a building."""
     up = np.array([[0.0, 0.0, 1.0]], np.float32)
     _, face = scene.cast(T[None, :3, 3].astype(np.float32), up)
     if face[0] >= 0 and scene.mesh.surfaces[face[0]] in (Surface.WALL, Surface.ROOF, Surface.LAWN):

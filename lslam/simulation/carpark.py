@@ -1,4 +1,4 @@
-"""An open car park: rough ground with a fall, a low wall and trees on one side, houses far on the other, a few parked cars."""
+"""An open car park: rough sloping ground, a low wall and trees on one side, distant houses on the other, a few cars."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ IN_USE = 0.7  # share of blocks with such a stretch
 def build_carpark(
     line: RouteCurve, terrain: Terrain, layout: Layout, roughness: float, rng: np.random.Generator
 ) -> City:
-    """A car park round the path `line`; `roughness` is the standard deviation of its ground's surface, m.
+    """Build a car park round the path `line`; `roughness` is the standard deviation of the ground's surface, m.
 
-    Everything is placed along x in order, each kind by a generator of its own: a longer path has the same beginning.
+    Objects are placed in order along x, each kind with a generator of its own, so a longer path has the same beginning.
     Raises UsageError for a path that is too long.
     """
     walls, trees, cars, houses, ground = rng.spawn(5)
@@ -63,7 +63,7 @@ def build_carpark(
 def _add_ground(
     builder: MeshBuilder, low: Floats, high: Floats, terrain: Terrain, roughness: float, rng: np.random.Generator
 ) -> None:
-    """Ground without holes; its bumps rise and fall independently of each other."""
+    """Add ground without holes, with random bumps."""
     x, y = (_grid_lines(float(low[k]), float(high[k])) for k in (0, 1))
     if len(x) * len(y) > LARGEST:
         raise UsageError(
@@ -76,7 +76,7 @@ def _add_ground(
 
 
 def _grid_lines(low: float, high: float) -> Floats:
-    """Where the lines of the ground's grid run along one axis: close together up to `NEAR` m beyond `low` and `high`."""
+    """Coordinates of the ground's grid lines along one axis: dense up to `NEAR` m beyond `low` and `high`."""
     count = int(np.ceil((high - low + 2 * NEAR) / BUMP))
     fine = low - NEAR + BUMP * np.arange(count + 1)
     beyond = np.arange(COARSE, MARGIN - NEAR + COARSE, COARSE)
@@ -86,7 +86,7 @@ def _grid_lines(low: float, high: float) -> Floats:
 def _add_trees(
     builder: MeshBuilder, axis: RouteCurve, terrain: Terrain, layout: Layout, wall: float, rng: np.random.Generator
 ) -> None:
-    """A row of trees behind the wall, which is `wall` m to the left of the axis."""
+    """Add a row of trees behind the wall, which is `wall` m to the left of the axis."""
     s = rng.uniform(*TREES_APART)
     while s < axis.length:
         offset = wall + np.sign(wall) * rng.uniform(*TREES_BEHIND)
@@ -99,7 +99,7 @@ def _add_trees(
 def _add_cars(
     builder: MeshBuilder, axis: RouteCurve, terrain: Terrain, layout: Layout, offset: float, rng: np.random.Generator
 ) -> None:
-    """A row of bays across the axis, their middles `offset` m to its left, in use here and there."""
+    """Add a row of parking bays across the axis, their middles `offset` m to its left; some hold a car."""
     for block in np.arange(0.0, axis.length, BLOCK):
         is_used, length = rng.random() < IN_USE, rng.uniform(*ROW)
         first = block + rng.uniform(0, BLOCK - length)
@@ -119,7 +119,7 @@ def _add_houses(
     half: float,
     rng: np.random.Generator,
 ) -> tuple[list[Floats], list[float]]:
-    """Houses that face the car park, their fronts `layout.setback` m from the path; outlines and heights."""
+    """Add houses that face the car park, `layout.setback` m from the path. Returns their outlines and heights."""
     footprints: list[Floats] = []
     heights: list[float] = []
     s = rng.uniform(0, layout.gap[1])

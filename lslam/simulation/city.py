@@ -62,7 +62,7 @@ class Layout(Section):
 
     @property
     def band(self) -> float:
-        """From the middle of the road to the outer edge of the pavement."""
+        """Distance from the middle of the road to the outer edge of the pavement, m."""
         return self.road + self.pavement
 
 
@@ -98,7 +98,7 @@ def build_city(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.ran
 
 
 class Lots:
-    """Which ground is taken: the streets and the houses so far."""
+    """Occupied ground: the streets and the houses so far."""
 
     def __init__(self, streets: list[RouteCurve], layout: Layout) -> None:
         from shapely import LinearRing, LineString, Polygon, prepare, union_all
@@ -124,7 +124,7 @@ class Lots:
         return not any(self.taken[i].intersects(polygon) for i in np.flatnonzero(near))
 
     def take(self, corners: Floats, height: float) -> None:
-        """Put a building on this ground."""
+        """Mark the ground of a building as occupied."""
         self.taken.append(self.polygon(corners))
         self.footprints.append(corners)
         self.heights.append(height)
@@ -140,7 +140,7 @@ def _circle(corners: Floats) -> tuple[float, float, float]:
 def _add_road(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
-    """Road, kerbs and pavements as one strip along the street."""
+    """Add road, kerbs and pavements as one strip along the street."""
     s = street.sample(0.75)
     if street.closed:
         s = np.append(s, 0.0)
@@ -160,7 +160,7 @@ def _add_road(
 
 
 def crown_of_road(offsets: Floats, layout: Layout) -> Floats:
-    """(N,) m by which a road is higher than its edges at `offsets` (N,), m from its middle."""
+    """Height (N,), m, of a cambered road above its edges, at `offsets` (N,), m, from its middle."""
     return np.asarray(layout.camber * np.maximum(layout.road - np.abs(offsets), 0.0))
 
 
@@ -173,9 +173,10 @@ def add_ground(
     tucked: float,
     level: float = KERB - 0.07,
 ) -> None:
-    """Grass everywhere else, `level` m above the terrain; it reaches `tucked` m under pavements, or roads without any.
+    """Add grass everywhere else, `level` m above the terrain.
 
-    The level is a little below them, so that their edge shows and the grass does not come through.
+    It reaches `tucked` m under pavements, or under roads without any. The level is a little below theirs, so that their edge
+    is visible and no grass pokes through.
     """
     from scipy.spatial import cKDTree
 
@@ -201,7 +202,7 @@ def add_row(
     side: int,
     first: bool,
 ) -> None:
-    """Houses side by side along one side of the street (1 left, -1 right), where there is room."""
+    """Add houses side by side along one side of the street (1 left, -1 right), where there is room."""
     s, setback = rng.uniform(0, 4), rng.uniform(*layout.setback)
     while s < street.length:
         width = rng.uniform(*layout.house_width)
@@ -256,7 +257,7 @@ def _add_front_garden(
     position: Any,
     yaw: float,
 ) -> None:
-    """A hedge or a low wall between garden and pavement."""
+    """Add a hedge or a low wall between garden and pavement."""
     kind = rng.random()
     if kind > layout.gardens:
         return
@@ -277,7 +278,10 @@ def add_street_furniture(
     side: int,
     allowed: Callable[[Floats, float, float], bool] | None = None,
 ) -> None:
-    """Parked cars, trees, poles and bins along one side; `allowed` says whether a place (2,), offset and yaw are free."""
+    """Add parked cars, trees, poles and bins along one side.
+
+    `allowed` tells whether a place (2,), with its offset and yaw, is free.
+    """
 
     def put(part: SceneMesh, s: float, offset: float, lift: float, turn: float = 0.0) -> None:
         at = np.array([s])
@@ -306,7 +310,7 @@ def add_street_furniture(
 def add_garden_trees(
     builder: MeshBuilder, lots: Lots, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
-    """Trees wherever a random place is free."""
+    """Add trees wherever a random place is free."""
     if not layout.garden_trees:
         return
     middle = np.concatenate([street.position(street.sample(5.0)) for street in lots.streets])

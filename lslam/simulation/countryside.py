@@ -1,4 +1,4 @@
-"""Places where there is little to hold on to: a motorway through fields, and a corridor between plain walls."""
+"""Places with few features: a motorway through fields, and a corridor between plain walls."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ LODGES = 90.0  # m of way from one house to the next
 
 
 def build_motorway(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
-    """Two carriageways with guard rails, delineators, gantries and a noise barrier; beyond, trees, bushes and a few farms."""
+    """Build two carriageways with guard rails, delineators, gantries and a noise barrier; beyond them trees and bushes."""
     builder = MeshBuilder()
     add_strip(builder, street, terrain, [0.0, 3.0, 6.0, 9.0, layout.road, layout.band], rng)
     add_ground(builder, [street], terrain, layout, rng, 1.2, VERGE)
@@ -54,9 +54,9 @@ def build_motorway(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np
 
 
 def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
-    """A street between two smooth noise barriers, bare for more than 100 m at a time.
+    """Build a street between two smooth noise barriers, without features for more than 100 m at a time.
 
-    Only at the openings between them, with houses, trees and lamps, is there anything that tells how far along one is.
+    Only the openings between the barriers, with houses, trees and lamps, make the position along the street observable.
     """
     builder = MeshBuilder()
     add_strip(builder, street, terrain, [0.0, 2.0, layout.road, layout.band], rng)
@@ -92,7 +92,10 @@ def _fill_opening(
     side: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, float]:
-    """A house behind an opening of the barrier, before it lamps, a cabinet and two trees; the house's outline and height."""
+    """Add a house behind an opening of the barrier, and lamps, a cabinet and two trees before it.
+
+    Returns the house's outline and height.
+    """
     for lamp in (s + rng.uniform(-12, -6), s + rng.uniform(6, 12)):
         _put(builder, street, terrain, lamp, side * layout.band, [-0.08, -0.08, -0.3], [0.08, 0.08, 7.0], Surface.POLE)
     low, high = [-0.6, -0.25, -0.3], [0.6, 0.25, 1.5]
@@ -117,7 +120,7 @@ def add_house(
     depth: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, float]:
-    """A house whose front is `offset` m to the left of the street and faces it; its outline (4, 2) and its height."""
+    """Add a house that faces the street, its front `offset` m to the left. Returns its outline (4, 2) and height."""
     at, side = np.array([s]), np.sign(offset)
     front, tangent = street.beside(at, offset)[0], side * street.tangent(at)[0]
     inward, half = np.array([-tangent[1], tangent[0]]), width / 2 * tangent
@@ -130,7 +133,7 @@ def add_house(
 def add_strip(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, half: list[float], rng: np.random.Generator
 ) -> None:
-    """A road without kerbs, up to the last of `half` m on both sides."""
+    """Add a road without kerbs, as wide as the largest of `half`, m, on both sides."""
     s = street.sample(1.0)
     offsets = np.array([-d for d in half[:0:-1]] + half)
     xy = np.stack([street.beside(s, d) for d in offsets])
@@ -140,7 +143,7 @@ def add_strip(
 
 
 def _add_rail(builder: MeshBuilder, street: RouteCurve, terrain: Terrain, offset: float) -> None:
-    """A guard rail: a band along the road and a post every 4 m."""
+    """Add a guard rail: a band along the road and a post every 4 m."""
     add_wall(builder, street, terrain, street.sample(4.0), offset, RAIL[1], Surface.FENCE, RAIL[0], 0.1)
     for s in street.sample(4.0):
         _put(builder, street, terrain, s, offset, [-0.05, -0.05, -0.3], [0.05, 0.05, RAIL[1]], Surface.POLE)
@@ -157,7 +160,7 @@ def add_wall(
     bottom: float = -1.0,
     thickness: float = 0.4,
 ) -> None:
-    """A wall along the street at `offset` m to its left, from `bottom` to `top` m above the ground."""
+    """Add a wall along the street, `offset` m to its left, from `bottom` to `top` m above the ground."""
     rows = []
     for side, edge in ((-0.5, bottom), (-0.5, top), (0.5, top), (0.5, bottom)):
         xy = street.beside(s, offset + side * thickness)
@@ -175,7 +178,7 @@ def _put(
     high: list[float],
     surface: Surface,
 ) -> None:
-    """A box in the street's frame at `s` m along and `offset` m to the left."""
+    """Add a box in the street's frame, `s` m along and `offset` m to the left."""
     part = MeshBuilder()
     part.add_box(low, high, surface)
     at = np.array([s])
@@ -185,7 +188,7 @@ def _put(
 
 
 def _add_gantry(builder: MeshBuilder, street: RouteCurve, terrain: Terrain, s: float, reach: float) -> None:
-    """A bridge of signs over the right carriageway."""
+    """Add a bridge of signs over the right carriageway."""
     for offset in (-reach, 0.0):
         _put(builder, street, terrain, s, offset, [-0.2, -0.2, -0.5], [0.2, 0.2, 7.2], Surface.POLE)
     _put(builder, street, terrain, s, 0.0, [-0.25, -reach, 6.6], [0.25, 0.0, 7.2], Surface.POLE)
@@ -195,7 +198,7 @@ def _add_gantry(builder: MeshBuilder, street: RouteCurve, terrain: Terrain, s: f
 def _add_country(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> tuple[list[Floats], list[float]]:
-    """Clumps of trees, bushes, and a farm now and then. Returns outlines and heights of the farms."""
+    """Add clumps of trees, bushes, and a few farms. Returns outlines and heights of the farms."""
     footprints, heights = [], []
     for s in np.arange(5.0, street.length, 9.0):
         if rng.random() < layout.trees:
@@ -223,7 +226,7 @@ def _add_country(
 
 
 def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator) -> City:
-    """A way through woods or a park along `street`; the same generator state gives the same woods.
+    """Build a path through woods or a park along `street`; the same generator state gives the same woods.
 
     Of `layout` it takes the road's half width and verge (`pavement`), `garden_trees` per 5 m of way and side, of which the
     share `trees` grows, and hedges beside the way by the share of `gardens`; bins and lamps; a house by `openings`.
@@ -244,7 +247,7 @@ def _add_trees(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats,
     footprints: list[Floats],
 ) -> None:  # fmt: skip
-    """Trees and bushes at random, more of them near the way, where they get light; none on it or in a house."""
+    """Add random trees and bushes, denser near the path, none on it or in a house."""
     from scipy.spatial import cKDTree
 
     count = int(layout.garden_trees * street.length / 5.0)
@@ -268,7 +271,7 @@ def _add_trees(
 def _add_hedges(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
-    """Hedges along both edges of the way."""
+    """Add hedges along both edges of the path."""
     for side in (1, -1):
         for s in np.arange(HEDGE, street.length - HEDGE, HEDGE):
             if rng.random() >= layout.gardens:
@@ -283,7 +286,7 @@ def _add_hedges(
 def _add_things(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator
 ) -> None:
-    """Lamps and bins beside the way."""
+    """Add lamps and bins beside the path."""
     for is_there, part, apart in ((layout.poles, furniture.pole, 35.0), (layout.bins, furniture.bins, 60.0)):
         for s in np.arange(0.5 * apart, street.length, apart) if is_there else ():
             side = 1 if rng.random() < 0.5 else -1
@@ -295,7 +298,7 @@ def _add_things(
 def _add_lodges(
     builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats
 ) -> tuple[list[Floats], list[float]]:
-    """A house now and then, where it keeps off every bend of the way; outlines and heights."""
+    """Add a few houses, clear of every bend of the path. Returns outlines and heights."""
     footprints: list[Floats] = []
     heights: list[float] = []
     for s in np.arange(0.5 * LODGES, street.length, LODGES):

@@ -55,7 +55,7 @@ SPACING = 0.5  # m between the spline's knots
 
 @dataclass(frozen=True)
 class RouteCurve:
-    """A planar curve, twice continuously differentiable and more (quintic spline), over its length in m.
+    """Smooth planar curve (quintic spline), parametrised by arc length, m.
 
     Made by `smooth_curve`. On a closed curve any distance is valid and wraps; on an open one 0..length.
     """
@@ -69,24 +69,24 @@ class RouteCurve:
         return np.asarray(self.spline(self._wrap(s)))
 
     def tangent(self, s: NDArray[Any]) -> Floats:
-        """(M, 2) unit tangents at distances `s` (M,)."""
+        """(M, 2) unit tangents at distances `s` (M,), m."""
         d = np.asarray(self.spline(self._wrap(s), nu=1))
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
 
     def curvature(self, s: NDArray[Any]) -> Floats:
-        """(M,) signed curvature, 1/m, positive to the left."""
+        """(M,) signed curvature, 1/m, positive to the left, at distances `s` (M,), m."""
         at = self._wrap(s)
         d, dd = np.asarray(self.spline(at, nu=1)), np.asarray(self.spline(at, nu=2))
         return np.asarray((d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / portable.dot(d, d) / portable.norm(d))
 
     def beside(self, s: NDArray[Any], offset: Any) -> Floats:
-        """(M, 2) positions `offset` m to the left of the curve at distances `s` (M,)."""
+        """(M, 2) positions `offset` m to the left of the curve at distances `s` (M,), m."""
         t = self.tangent(s)
         left = np.stack([-t[:, 1], t[:, 0]], axis=1)
         return np.asarray(self.position(s) + np.broadcast_to(np.asarray(offset, np.float64), len(t))[:, None] * left)
 
     def sample(self, spacing: float) -> Floats:
-        """(M,) distances about `spacing` m apart along the whole curve; a closed one ends before its start."""
+        """(M,) distances about `spacing` m apart along the whole curve; on a closed one the start is not repeated."""
         count = max(int(np.ceil(self.length / spacing)), 2)
         return np.linspace(0, self.length, count + 1)[: -1 if self.closed else None]
 
@@ -118,7 +118,7 @@ def smooth_curve(points: NDArray[Any], closed: bool, smoothing: float = 1.5) -> 
 
 
 def stretched(curve: RouteCurve, by: float) -> RouteCurve:
-    """An open curve made longer by `by` m, straight on, at both ends; a closed one as it is."""
+    """Open curve extended straight by `by` m at both ends; a closed one is returned unchanged."""
     if curve.closed or by <= 0:
         return curve
     ends = np.array([0.0, curve.length])
@@ -129,7 +129,7 @@ def stretched(curve: RouteCurve, by: float) -> RouteCurve:
 
 
 def _resample(points: Floats) -> tuple[Floats, float]:
-    """The polyline at even distances near `SPACING`, and the distance."""
+    """The polyline resampled at even distances near `SPACING`, and that distance, m."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     count = max(int(np.round(along[-1] / SPACING)), 12)
     at = np.linspace(0, along[-1], count + 1)
@@ -137,7 +137,7 @@ def _resample(points: Floats) -> tuple[Floats, float]:
 
 
 def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
-    """(N, 2) points counter-clockwise round a rectangle with round corners, from the middle of the lower side along +x."""
+    """(N, 2) points of a rounded rectangle, counter-clockwise, from the middle of the lower side along +x, m."""
     corners = []
     for k, (sx, sy) in enumerate(((1, -1), (1, 1), (-1, 1), (-1, -1))):
         angle = np.linspace(-np.pi / 2, 0, 48) + k * np.pi / 2
@@ -147,7 +147,7 @@ def rounded_rectangle(width: float, depth: float, radius: float) -> Floats:
 
 
 def winding_line(rng: np.random.Generator, length: float, bend: float = 0.22) -> Floats:
-    """(N, 2) points of a street of `length` m whose heading swings by about `bend` rad over 150 to 260 m."""
+    """(N, 2) points, m, of a street of `length` m; its heading swings by `bend` rad with wavelengths of 150 to 260 m."""
     s = np.arange(0, length + 1.0)
     heading = np.zeros_like(s)
     for wavelength, share in ((rng.uniform(200, 260), 1.0), (rng.uniform(150, 190), 0.5)):

@@ -1,4 +1,4 @@
-"""How a drone flies and a walker carries a LiDAR: along a curve at a height, banking or swinging, with exact poses."""
+"""Paths of a LiDAR carried by a drone or a walker: a curve with heights, banking and swinging, with exact poses."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ def buffeting(rng: np.random.Generator, strength: float = 1.0) -> Swing:
 
 @dataclass(frozen=True)
 class FreePath:
-    """A LiDAR carried along `curve` by what does not stand on wheels.
+    """Path of a LiDAR along `curve`, carried by a drone or a walker.
 
     travelled : horizontal distance over time, a spline; duration : s it is defined for
     climb : height over distance, a spline as of `climb_spline`, m above level ground or, when `terrain` is given, that ground
-    bank : share of the tilt that balances the turn, 1 for a coordinated one; swing : what shakes it
+    bank : share of the tilt that balances the turn, 1 for a coordinated one; swing : motion added to it
     """
 
     curve: RouteCurve
@@ -130,7 +130,7 @@ def fly(
     swing: Swing,
     terrain: Terrain | None = None,
 ) -> FreePath:
-    """Carry a LiDAR along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
+    """Path along `distance` m of `curve`; on a climb the speed counts along its mean slope."""
     rise = float(climb(curve.length) - climb(0.0))
     level = curve.length / float(portable.hypot(curve.length, rise))
     pace = replace(speed, cruise=speed.cruise * level, start=speed.start * level)
@@ -151,10 +151,10 @@ STEP = 0.01  # s between the knots of its spline
 
 @dataclass(frozen=True)
 class EightFlight:
-    """A LiDAR on a quadrotor whose thrust is along its z axis; what it flies is a function of time alone.
+    """Flight of a quadrotor whose thrust is along its z axis, as a function of time.
 
     position : spline of T_city_lidar's origin over s; its second derivative says how it is tilted (Mellinger and Kumar 2011)
-    heading : spline of the direction in which it looks, rad; duration : s, from 0
+    heading : spline of the yaw, rad; duration : s, from 0
     """
 
     position: Any
@@ -179,7 +179,7 @@ class EightFlight:
 def eight_flight(
     rng: np.random.Generator, middle: NDArray[Any], speed: float, limit: float, swing: Swing
 ) -> EightFlight:
-    """Hover at `middle` (3,), then fly eights round it, at most at `speed` m/s.
+    """Flight that hovers at `middle` (3,), then flies figures of eight round it, at most at `speed` m/s.
 
     Raises UsageError where that needs more than `limit` m/s2 of thrust.
     """

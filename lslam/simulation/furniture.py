@@ -1,4 +1,4 @@
-"""What stands in a street: trees, poles, hedges, garden walls, bins and parked cars.
+"""Objects of a street: trees, poles, hedges, garden walls, bins and parked cars.
 
 Local frames: z = 0 is the ground, the object's middle at x = y = 0, its long side along x.
 """
@@ -15,7 +15,7 @@ BUSHES = 0.35  # share of the trees that are bushes, where leaves fill volumes
 
 
 def tree(rng: np.random.Generator, volume: bool = False) -> SceneMesh:
-    """A trunk and a crown of loose leaf clusters, through which some rays pass; or one whose leaves fill a volume, or a bush."""
+    """A trunk with a crown of leaf clusters, which some rays pass; or with a volume of leaves; or a bush."""
     if volume:
         return _leafy(rng)
     builder = MeshBuilder()
@@ -46,7 +46,7 @@ def _leafy(rng: np.random.Generator) -> SceneMesh:
 
 
 def _add_crown(builder: MeshBuilder, rng: np.random.Generator, size: Floats, height: float) -> None:
-    """The bumpy envelope of leaves, an ellipsoid with half axes `size` (3,), m, wound outwards."""
+    """Add the bumpy envelope of leaves, an ellipsoid with half axes `size` (3,), m, faces oriented outwards."""
     rows, columns = 8, 12
     polar, round_ = np.linspace(0, np.pi, rows), np.linspace(0, 2 * np.pi, columns + 1)
     bumps = 1 + rng.normal(0, 0.12, (rows, columns + 1))
@@ -77,7 +77,7 @@ def pole(rng: np.random.Generator) -> SceneMesh:
 
 
 def hedge(rng: np.random.Generator, length: float, volume: bool = False) -> SceneMesh:
-    """A hedge of `length` m with a bumpy surface, which is shut, or behind which leaves fill a volume."""
+    """A hedge of `length` m with a bumpy surface, opaque or filled with a volume of leaves."""
     height, width = rng.uniform(0.8, 1.7), rng.uniform(0.5, 0.9)
     rows, columns = 7, max(int(length / 0.3), 2)
     outline = np.array([[-0.5, -0.3], [-0.5, 0.5], [-0.5, 0.95], [0, 1.0], [0.5, 0.95], [0.5, 0.5], [0.5, -0.3]]) * [
@@ -145,7 +145,7 @@ def parked_car(rng: np.random.Generator) -> SceneMesh:
 
 
 def _extrude(builder: MeshBuilder, outline: Floats, half_width: float, surface: int) -> None:
-    """A convex side view (K, 2) of x and z drawn out over y, closed on all sides."""
+    """A convex side view (K, 2) of x and z extruded along y, closed on all sides."""
     count = len(outline)
     sides = [np.column_stack([outline[:, 0], np.full(count, y), outline[:, 1]]) for y in (-half_width, half_width)]
     here, there = np.arange(count), (np.arange(count) + 1) % count

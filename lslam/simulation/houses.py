@@ -37,7 +37,7 @@ class _HouseStyle:
 
 
 def house(rng: np.random.Generator, width: float, depth: float, storeys: tuple[int, int] = (2, 4)) -> SceneMesh:
-    """A house on a (width x depth) m footprint, with as many `storeys` as the range allows."""
+    """A house on a (width x depth) m footprint, with a number of storeys drawn from the range `storeys`."""
     style = _HouseStyle(
         storeys=int(rng.integers(storeys[0], storeys[1] + 1)),
         storey=rng.uniform(2.7, 3.3),
@@ -66,7 +66,7 @@ def house(rng: np.random.Generator, width: float, depth: float, storeys: tuple[i
 def _facade(
     builder: MeshBuilder, rng: np.random.Generator, style: _HouseStyle, start: Floats, end: Floats, street: bool
 ) -> None:
-    """One wall from `start` to `end` (2,), outside to its right, windows in a grid."""
+    """Add a wall from `start` to `end` (2,), its outside to the right, with a grid of windows."""
     length = float(portable.norm(end - start))
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
@@ -82,7 +82,7 @@ def _facade(
         return [(u, 0.0, z0), (v, 0.0, z0), (v, style.recess, z0), (u, style.recess, z0)]
 
     def placed(quads: list[Quad]) -> Floats:
-        """(N, 4, 3) corners, m."""
+        """(N, 4, 3) corners in the house's frame, m."""
         corners = np.array(quads, np.float64).reshape(-1, 4, 3)
         xy = start + corners[..., :1] * along - corners[..., 1:2] * outward
         return np.concatenate([xy, corners[..., 2:]], axis=-1)
@@ -117,7 +117,7 @@ def _facade(
 
 
 def _balcony(builder: MeshBuilder, middle: Floats, along: Floats, outward: Floats, floor: float, reach: float) -> None:
-    """A slab with a parapet on three sides."""
+    """Add a slab with a parapet on three sides."""
     a, b = middle - 1.1 * along, middle + 1.1 * along
     c, d = b + reach * outward, a + reach * outward
     top = floor + 0.95
@@ -127,14 +127,14 @@ def _balcony(builder: MeshBuilder, middle: Floats, along: Floats, outward: Float
 
 
 def _gabled_roof(builder: MeshBuilder, width: float, depth: float, eaves: float, pitch: float, along: bool) -> None:
-    """Two slopes that overhang by 0.4 m and two gables; the ridge runs along the street or across it."""
+    """Add two slopes that overhang by 0.4 m and two gables; the ridge runs along the street or across it."""
     w, half = (width / 2, depth / 2) if along else (depth / 2, width / 2)
     # A wide house has a flatter roof.
     rise, over = min(half * pitch, HIGHEST_ROOF), 0.4
     pitch = rise / half
 
     def place(u: float, v: float, z: float) -> list[float]:
-        """u along the ridge, v across it, both from the middle of the house."""
+        """Position from u along the ridge and v across it, both from the middle of the house."""
         return [u, depth / 2 + v, z] if along else [v, depth / 2 + u, z]
 
     slopes = [
@@ -154,7 +154,7 @@ def _gabled_roof(builder: MeshBuilder, width: float, depth: float, eaves: float,
 
 
 def _flat_roof(builder: MeshBuilder, width: float, depth: float, eaves: float) -> None:
-    """A roof slab with a parapet, open above it."""
+    """Add a roof slab with a parapet, open above it."""
     w, low, high = width / 2, eaves, eaves + 0.5
     builder.add_quads([[[-w, 0, low], [w, 0, low], [w, depth, low], [-w, depth, low]]], Surface.ROOF)
     corners = [(-w, 0.0), (w, 0.0), (w, depth), (-w, depth)]
@@ -166,7 +166,7 @@ def _flat_roof(builder: MeshBuilder, width: float, depth: float, eaves: float) -
 
 
 def _porch(builder: MeshBuilder, rng: np.random.Generator, width: float) -> None:
-    """In front of the facade: nothing, a porch with steps, or a bay over all the height of the ground floor."""
+    """Add nothing, a porch with steps, or a bay as high as the ground floor, in front of the facade."""
     kind, u = rng.random(), rng.uniform(-0.3, 0.3) * width
     if kind < 0.3:
         builder.add_box([u - 1.0, -1.2, 2.5], [u + 1.0, 0.05, 2.65], Surface.ROOF)

@@ -1,4 +1,4 @@
-"""An IMU on a moving body: exact specific force and angular rate, and what a MEMS device makes of them."""
+"""An IMU on a moving body: exact specific force and angular rate, and the readings of a MEMS device."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ class Triad:
 class ImuModel:
     """A kind of IMU; the default has no errors.
 
-    jitter : standard deviation of what stamps say over when a reading was taken, s; within 0.45 of a period
-    late : standard deviation of when a reading is taken over what its stamp, which is nominal, says, s; of any size
+    jitter : standard deviation of stamps about the times of reading, s; within 0.45 of a period
+    late : standard deviation of the times of reading about their nominal stamps, s; of any size
     """
 
     name: str
@@ -56,7 +56,7 @@ class ImuModel:
 
 
 class ImuFaults(Section):
-    """What ails any IMU that rides along.
+    """Faults added to the IMU of a scenario.
 
     jitter_ms : standard deviation of its stamps; accel_limit, gyro_limit_deg : beyond which it saturates, m/s2 and deg/s;
         what it measures itself when absent
@@ -78,7 +78,7 @@ class ImuFaults(Section):
 
 @dataclass(frozen=True)
 class SimulatedImu:
-    """What was measured, and the truth behind it.
+    """Readings of an IMU, and the truth behind them.
 
     stream : the readings; accel_bias, gyro_bias : (M, 3) constant and walking bias at each reading, m/s2 and rad/s
     truth : (M,) motion of the IMU in the city frame; T_lidar_imu : where it sits
@@ -97,7 +97,7 @@ _ICM_GYRO = Triad(4.36332313, 0.000133231, 0.087266462, 2.0, 0.000261799, 4e-6)
 
 
 def _times_ten(triad: Triad, limit: float) -> Triad:
-    """`triad` with ten times its biases, constant and walking, and 16 bits over another range."""
+    """`triad` with ten times its biases, constant and walking, and 16-bit steps over another range."""
     return replace(triad, limit=limit, step=limit / 2**15, bias=10 * triad.bias, bias_walk=10 * triad.bias_walk)
 
 
@@ -131,7 +131,7 @@ IMUS = {
 
 
 def imu_named(name: str) -> ImuModel:
-    """The model of that name. Raises UsageError with the nearest name."""
+    """Model called `name`. Raises UsageError with the nearest name."""
     if name not in IMUS:
         raise UsageError(f"no IMU {name!r}; {nearest(name, IMUS)}")
     return IMUS[name]
@@ -161,13 +161,13 @@ def simulate_imu(
 
 
 def specific_force(truth: Kinematics) -> Floats:
-    """(M, 3) what an exact accelerometer reads in the body frame, m/s2: +g upwards at rest (REP 145)."""
+    """(M, 3) specific force in the body frame, m/s2, as an exact accelerometer measures it: +g upwards at rest (REP 145)."""
     felt = truth.acceleration + np.array([0.0, 0.0, GRAVITY])
     return portable.rotate(np.swapaxes(truth.poses[:, :3, :3], -1, -2), felt)
 
 
 def measure(triad: Triad, exact: Floats, noise: Floats, rate_hz: float) -> tuple[Floats, Floats]:
-    """Readings (M, 3) and biases (M, 3) of a triad that meets `exact` (M, 3).
+    """Readings (M, 3) and biases (M, 3) of a triad whose exact input is `exact` (M, 3).
 
     noise : (M, 2, 3) standard normal numbers, for the white noise and for the steps of the bias. A white noise of density N
     sampled at f has the deviation N sqrt(f), a random walk K steps of K / sqrt(f) (IEEE Std 952).

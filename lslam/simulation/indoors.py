@@ -20,7 +20,7 @@ LOW = 2.2  # m, of what stands in the aisle
 
 
 def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """The hall round a straight `line` along x, which is the middle of its floor."""
+    """Build a hall round a straight `line` along x, the middle of its floor."""
     ends = line.position(np.array([0.0, line.length]))
     low, high = float(ends[0, 0]) - END, float(ends[1, 0]) + END
     middle = float(ends[0, 1])
@@ -49,7 +49,7 @@ def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> 
 def _add_racks(
     builder: MeshBuilder, low: float, high: float, middle: float, side: int, rng: np.random.Generator
 ) -> None:
-    """Racks of different heights and depths between the aisle and one wall, with gaps."""
+    """Add racks of different heights and depths between the aisle and one wall, with gaps."""
     x = low + rng.uniform(0.5, 3.0)
     while x < high - 3.0:
         length, depth = min(rng.uniform(2.0, 6.0), high - 0.5 - x), rng.uniform(0.8, 2.0)
@@ -66,12 +66,12 @@ SHELVES, BOXES = 7, 16
 
 
 def room_line() -> RouteCurve:
-    """Round the middle of the room."""
+    """Path round the middle of the room."""
     return smooth_curve(rounded_rectangle(*LOOP), closed=True, smoothing=0.1)
 
 
 def build_room(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """The room round `room_line`; where its furniture stands differs from seed to seed."""
+    """Build the room round `room_line`; the seed decides where its furniture stands."""
     builder, half = MeshBuilder(), SIZE / 2
     low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], SIZE[2]])
     # What is above a start is no roof that one would be caught under.
@@ -90,7 +90,7 @@ def build_room(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> 
 
 
 def _add_shelves(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """Cupboards along the walls, with boxes on top of them."""
+    """Add cupboards along the walls, with boxes on top of them."""
     for _ in range(SHELVES):
         axis, side = int(rng.integers(0, 2)), float(rng.choice([-1.0, 1.0]))
         depth, width, height = rng.uniform(0.2, 0.4), rng.uniform(0.4, 1.2), rng.uniform(0.4, 1.9)
@@ -106,7 +106,7 @@ def _add_shelves(builder: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _add_table(builder: MeshBuilder, middle: Floats, rng: np.random.Generator) -> None:
-    """A table on four legs, with things on it."""
+    """Add a table on four legs, with objects on it."""
     half, top = np.array(TABLE[:2]) / 2, TABLE[2]
     builder.add_box([*(middle - half), top - 0.03], [*(middle + half), top], Surface.FENCE)
     for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
@@ -136,7 +136,7 @@ TURNING = WIDTH / 2 + WALL / 2  # m, radius of the turns on the landings
 
 
 def stairs_line(above: float) -> tuple[RouteCurve, tuple[Floats, Floats]]:
-    """In, round and round up the flights, and out along the corridor; distances and heights, m, `above` the floor."""
+    """Path into the building, up the flights and out along the corridor; distances, m, and heights, m, `above` the floor."""
     parts: list[Floats] = []  # (K, 3) each
     xs, ys = np.array([-LANDING - 5.0, 0.0]), np.full(2, -TURNING)
     parts.append(np.column_stack([xs, ys, np.zeros(2)]))
@@ -163,7 +163,7 @@ def stairs_line(above: float) -> tuple[RouteCurve, tuple[Floats, Floats]]:
 
 
 def build_stairwell(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
-    """The building round `stairs_line`; what stands about in it differs from seed to seed."""
+    """Build the building round `stairs_line`; the seed decides about loose objects."""
     builder = MeshBuilder()
     _add_entrance(builder, rng)
     _add_shaft(builder)
@@ -178,19 +178,19 @@ def build_stairwell(line: RouteCurve, terrain: Terrain, rng: np.random.Generator
 
 
 def _floor(builder: MeshBuilder, x: tuple[float, float], y: tuple[float, float], z: float) -> None:
-    """A slab without a thickness, seen from above and below."""
+    """Add a slab without thickness, visible from above and below."""
     corners = [[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]]
     # Concrete: the class of walls and roofs above a start would be those of a building that one is caught in.
     builder.add_quads([corners], Surface.PAVEMENT)
 
 
 def _wall(builder: MeshBuilder, a: tuple[float, float], b: tuple[float, float], z: tuple[float, float]) -> None:
-    """A wall without a thickness from place `a` to `b`."""
+    """Add a wall without thickness from `a` to `b`."""
     builder.add_quads([[[*a, z[0]], [*b, z[0]], [*b, z[1]], [*a, z[1]]]], Surface.WALL)
 
 
 def _add_entrance(builder: MeshBuilder, rng: np.random.Generator) -> None:
-    """A hall before the stairs, with a few boxes and two columns beside the way."""
+    """Add a hall before the stairs, with a few boxes and two columns beside the path."""
     (length, across), x = ENTRANCE, -LANDING
     y = across / 2
     _floor(builder, (x - length, x), (-y, y), 0.0)
@@ -209,7 +209,7 @@ def _add_entrance(builder: MeshBuilder, rng: np.random.Generator) -> None:
 
 
 def _add_shaft(builder: MeshBuilder) -> None:
-    """The walls round the stairs and the one between the flights, with the two ways in and out left open."""
+    """Add the walls round the stairs and the one between the flights, open at the two doors."""
     end, top = FLIGHT + LANDING, TOP + ROOM
     for y in (-HALF, HALF):
         _wall(builder, (-LANDING, y), (end, y), (0.0, top))
@@ -223,7 +223,7 @@ def _add_shaft(builder: MeshBuilder) -> None:
 
 
 def _add_flights(builder: MeshBuilder, low: float) -> None:
-    """Two flights of steps, each a tread and a riser, and the landings they lead to."""
+    """Add two flights of steps, each step a tread and a riser, and the landings."""
     half = low + STEPS * RISE
     for k in range(STEPS):
         for first, z, away, y in (
@@ -238,13 +238,13 @@ def _add_flights(builder: MeshBuilder, low: float) -> None:
 
 
 def _add_cabinet(builder: MeshBuilder, z: float, rng: np.random.Generator) -> None:
-    """A cabinet of a fire hose on the wall of a half landing, beyond where one turns."""
+    """Add a fire-hose cabinet on the wall of a half landing."""
     end, y = FLIGHT + LANDING, rng.uniform(-1.0, 0.4)
     builder.add_box([end - 0.15, y, z + 0.6], [end, y + 0.6, z + 1.4], Surface.FENCE)
 
 
 def _add_corridor(builder: MeshBuilder) -> None:
-    """Two walls, a floor and a ceiling; in the wall towards the stairs nothing but the way out of them."""
+    """Add two walls, a floor and a ceiling. The wall towards the stairs has no feature but the door."""
     x, y = (-LANDING - CORRIDOR, -LANDING), (TURNING - BEHIND, TURNING + AHEAD)
     z = (TOP, TOP + ROOM)
     _floor(builder, x, y, z[0])

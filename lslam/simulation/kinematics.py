@@ -1,4 +1,4 @@
-"""Exact kinematics: one smooth function of time whose value is the pose and whose derivatives are what sensors feel.
+"""Exact kinematics: one smooth function of time gives the pose, and its derivatives the motion that sensors measure.
 
 Positions and unit quaternions of a path are interpolated by quintic B-splines, four times continuously differentiable. Their
 derivatives are analytic, so poses, velocities, accelerations and rates can never disagree with each other.
@@ -25,7 +25,7 @@ SINES = 12  # on each axis
 
 
 class PosePath(Protocol):
-    """Where a LiDAR is over `duration` s; what a vehicle, a drone or a walker has in common."""
+    """Pose of a LiDAR over `duration` s: the interface of vehicle, drone and walker."""
 
     @property
     def duration(self) -> float:
@@ -52,7 +52,7 @@ class Kinematics:
     rate_change: Floats
 
     def carried(self, T_body_sensor: NDArray[Any]) -> Kinematics:
-        """The motion of a sensor fixed to the body at `T_body_sensor` (4, 4), lever arm included."""
+        """Motion of a sensor fixed to the body at `T_body_sensor` (4, 4), with the effect of the lever arm."""
         R_body_sensor, arm = np.asarray(T_body_sensor)[:3, :3], np.asarray(T_body_sensor)[:3, 3]
         R = self.poses[:, :3, :3]
         swing = np.cross(self.rate, arm)
@@ -108,7 +108,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class StandingStart:
-    """`path`, begun by standing at its start for `seconds` s and moving off smoothly over `ramp` s."""
+    """`path` preceded by `seconds` s at rest and a smooth start over `ramp` s."""
 
     path: PosePath
     seconds: float
@@ -116,7 +116,7 @@ class StandingStart:
 
     @property
     def duration(self) -> float:
-        """Seconds, the standing included."""
+        """Duration, s, with the rest."""
         return self.path.duration + self.seconds + self.ramp / 2
 
     def poses(self, times: NDArray[Any]) -> Floats:
@@ -124,7 +124,7 @@ class StandingStart:
         return self.path.poses(self.path_time(times))
 
     def path_time(self, times: NDArray[Any]) -> Floats:
-        """Time on `path` at `times` (M,), s: it stands still, then its pace grows from 0 to 1 as a smooth step."""
+        """Time on `path`, s, at `times` (M,), s: constant at first, then its rate grows from 0 to 1 as a smooth step."""
         since = np.asarray(times, np.float64) - self.seconds
         u = np.clip(since / self.ramp, 0, 1)
         # The integral of 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7, whose first three derivatives vanish at both ends.
@@ -133,7 +133,7 @@ class StandingStart:
 
 
 def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
-    """Make `path` differentiable: the motion meets it every `spacing` s and is smooth between."""
+    """Differentiable motion through the poses of `path` every `spacing` s."""
     knots = np.arange(max(int(path.duration / spacing), 8) + 1) * spacing
     # A last step that is shorter than half of the others would make the spline swing.
     knots = np.append(knots[knots < path.duration - spacing / 2], path.duration)
@@ -145,7 +145,7 @@ def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
 
 
 def standing_start(path: PosePath, seconds: float) -> StandingStart:
-    """Let `path` begin with `seconds` s of standing still; the faster it starts, the longer it takes to move off."""
+    """`path` preceded by `seconds` s at rest; the faster it starts, the longer the smooth start takes."""
     step = 1e-3
     first = path.poses(np.array([0.0, step]))[:, :3, 3]
     speed = float(portable.norm(first[1] - first[0])) / step
@@ -160,7 +160,7 @@ def _conjugate_times(q: Floats, p: Floats) -> Floats:
 
 
 class Vibration(Section):
-    """Shaking of the LiDAR on its mount, in its rays and not in the truth.
+    """Vibration of the LiDAR on its mount: it moves the rays, and is not in the ground truth.
 
     angle_deg, height_mm : root mean square of roll, pitch and yaw each, and up and down; band_hz : lowest and highest frequency
     """
@@ -191,14 +191,14 @@ class Shaking:
         return np.asarray(portable.sin(angle).sum(axis=2) * self.amplitudes)
 
     def shaken(self, poses: NDArray[Any], times: NDArray[Any]) -> Floats:
-        """Poses (M, 4, 4), or one (4, 4), of a LiDAR at rest on its mount as they are at `times` (M,), s: (M, 4, 4)."""
+        """Poses (M, 4, 4) at `times` (M,), s, of a vibrating LiDAR, from poses without vibration, (M, 4, 4) or one (4, 4)."""
         off = self.at(times)
         lift = np.column_stack([np.zeros((len(off), 2)), off[:, 3]])
         return portable.product(np.asarray(poses, np.float64), se3.make(so3.exp(off[:, :3]), lift))
 
 
 def shaking(vibration: Vibration, rng: np.random.Generator) -> Shaking | None:
-    """The shaking of one drive; None when there is none."""
+    """Vibration of one drive, drawn at random; None when there is none."""
     if not (vibration.angle_deg or vibration.height_mm):
         return None
     rms = np.array([*[np.radians(vibration.angle_deg)] * 3, vibration.height_mm * 1e-3])

@@ -1,4 +1,4 @@
-"""What a LiDAR makes of rays that meet a scene: noise, resolution, losses, intensity."""
+"""LiDAR measurement model: rays that meet a scene become points with noise, resolution, losses and intensity."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ BODY_STEP = 0.004  # s between the poses of a moving body
 
 @dataclass(frozen=True)
 class Roof:
-    """The roof under a LiDAR, level in its frame, m: behind, ahead, to either side, and how far below.
+    """Roof of the vehicle below the LiDAR, level in its frame: extents behind, ahead, to either side, and depth below, m.
 
-    returns : whether it is seen, or what it is in the way of is only missing, as where its returns are cut off
+    returns : whether the roof gives points, or only occludes the ground
     """
 
     behind: float
@@ -92,10 +92,10 @@ class Roof:
 
 @dataclass(frozen=True)
 class MovingMesh:
-    """A body that moves while rays fly: its scene in its own frame, T_city_body at times (M,), s, and a circle round it.
+    """Body that moves during a scan: its mesh in its own frame, T_city_body at times (M,), s, and a bounding sphere.
 
-    radius : of a sphere round the body's origin that holds all of it, m; speed : the most it gets on, m/s
-    centre : (3,) of its origin at the stamp of the scan, in the city
+    radius : of a sphere round the body's origin that holds all of it, m; speed : largest, m/s
+    centre : (3,) its origin at the stamp of the scan, in the city frame, m
     """
 
     scene: RayScene
@@ -119,22 +119,20 @@ def trace(
     returns: Returns | None = None,
     compensated: bool | None = None,
 ) -> Scan:
-    """One scan of `model`.
+    """Simulate one scan of `model`.
 
     Parameters
     ----------
     T_city_lidar : (4, 4) one pose for all rays (a motion-compensated scan, without times), or (columns, 4, 4) the pose at
         each firing (a distorted scan: points in the LiDAR frame of their own instant, times from 0 to `period` s)
     rng : source of noise and losses
-    bodies : what moves, each ray meets it where it is when that ray is fired (at `stamp_ns` in a compensated scan)
+    bodies : moving ones; a ray meets them at their places when it is fired (at `stamp_ns` in a compensated scan)
     glass : share of the rays on a pane that pass it and go on to what is behind
     roof : of the vehicle that carries the LiDAR, which is in the way of the ground
     returns : what real surfaces and beams add; None for clean, sharp ones
     compensated : whether all rays are fired at `stamp_ns`, whatever the poses; None: when there is one pose
 
-    Returns
-    -------
-    The points that came back, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
+    Returns ------- The measured points, with intensity 0..1 in steps of 0.01, rings, classes and, for distorted scans, times.
     """
     # A stream of its own: without these effects every scan stays as it is.
     extra = rng.spawn(1)[0] if returns is not None else rng
@@ -164,7 +162,7 @@ def trace(
 
 @dataclass(frozen=True)
 class _Meeting:
-    """Whom the rays of a scan may meet: what stands, what moves about `stamp`, s, and leaves, of some `extinction`."""
+    """Objects that the rays of a scan may hit: static ones, those that move about `stamp`, s, and leaves of some `extinction`."""
 
     scene: RayScene
     bodies: Sequence[MovingMesh]
@@ -173,7 +171,7 @@ class _Meeting:
     rng: np.random.Generator
 
     def meet(self, rays: Rays, rings: int = 1) -> Hits:
-        """First hits on what stands and what moves; the rays come in columns of `rings`."""
+        """First hits on static and moving objects; the rays come in columns of `rings`."""
         mesh = self.scene.mesh
         distance, face = self.scene.cast(rays.origins, rays.directions)
         cosine = np.abs(np.einsum("ij,ij->i", mesh.normals[face], rays.directions))
@@ -186,7 +184,7 @@ class _Meeting:
 
 
 def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hits, stamp: float) -> None:
-    """Put hits on what moves into `hits` where they are nearer; `stamp`, s, is that of the bodies' centres."""
+    """Replace `hits` by hits on moving bodies where these are nearer; `stamp`, s, is that of the bodies' centres."""
     centres = np.stack([body.centre for body in bodies])
     lasting = float(rays.fired.max()) - stamp
     # Body and LiDAR both move while the sweep lasts; a millimetre for the rounding.
@@ -206,11 +204,11 @@ def _meet_bodies(bodies: Sequence[MovingMesh], rays: Rays, rings: int, hits: Hit
 
 
 def _by_column(centres: Floats, swept: Floats, rays: Rays, rings: int) -> Iterator[NDArray[np.intp]]:
-    """For each body, within `swept` (B,), m, of its centre (B, 3), the rays of a scan that may meet it."""
+    """For each body, the rays of a scan that may hit it: those within `swept` (B,), m, of its centre (B, 3)."""
     # Bearings of whole columns first: a body is met by few of them, and then by few of their rings.
     bearing = portable.arctan2(rays.directions[:, 1], rays.directions[:, 0]).reshape(-1, rings)
     middle = bearing[:, rings // 2]
-    spread = np.abs(_turned(bearing - middle[:, None])).max(axis=1)
+    spread = np.abs(_wrap_angle(bearing - middle[:, None])).max(axis=1)
     climb = rays.directions[:, 2].reshape(-1, rings)
     apart = sum(float(np.ptp(axis)) for axis in rays.origins.T)
     to = centres - rays.origins[len(rays.fired) // 2]
@@ -222,7 +220,7 @@ def _by_column(centres: Floats, swept: Floats, rays: Rays, rings: int) -> Iterat
         if level[i] <= reach[i]:
             yield np.arange(len(rays.fired))
             continue
-        columns = np.flatnonzero(np.abs(_turned(middle - towards)) <= aside[i] + spread)
+        columns = np.flatnonzero(np.abs(_wrap_angle(middle - towards)) <= aside[i] + spread)
         upright = climb[columns]
         at, ring = np.nonzero((upright >= lowest[i]) & (upright <= highest[i]))
         yield columns[at] * rings + ring
@@ -247,7 +245,7 @@ def _by_ray(centres: Floats, swept: Floats, rays: Rays, hits: Hits) -> Iterator[
 
 
 def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits, stamp: float) -> None:
-    """The rays `which` against the body where it is when each of them is fired."""
+    """Intersect the rays `which` with a body at its place when each of them is fired."""
     # Between instants of a few milliseconds it moves on evenly, to micrometres; they do not hang on which rays are tried.
     share = (rays.fired - stamp) / BODY_STEP
     at = share.astype(np.intp)
@@ -268,7 +266,7 @@ def _meet_body(body: MovingMesh, which: NDArray[np.intp], rays: Rays, hits: Hits
 
 
 def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.float32], hits: Hits) -> None:
-    """Put hits on the own roof into `hits`, or nothing where it does not show; rays in the LiDAR's frame."""
+    """Replace `hits` by hits on the own roof, or by none if it gives no points; rays in the LiDAR's frame."""
     reach = roof.reach(directions, heights)
     met = np.flatnonzero(np.isfinite(reach))
     hits.distance[met] = reach[met] if roof.returns else np.inf
@@ -277,15 +275,15 @@ def _meet_roof(roof: Roof, directions: NDArray[np.float32], heights: NDArray[np.
     hits.face[met] = -1
 
 
-def _turned(angle: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Angles within half a turn of zero."""
+def _wrap_angle(angle: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Angles wrapped to half a turn about zero, rad."""
     return np.asarray(angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi)), np.float32)
 
 
 def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: Bools, returns: Returns | None) -> None:
-    """Some rays on panes are mirrored, and what they meet seems to lie behind the pane; of the others the `lucky` pass it.
+    """Mirror some of the rays that hit panes, and let the `lucky` of the others pass.
 
-    They go on to what stands or moves there; a second pane stops them.
+    A mirrored ray measures a point behind the pane. A passing ray hits the next object; a second pane stops it.
     """
     off = np.zeros(0, np.intp)
     if returns is not None and returns.mirror > 0:
@@ -312,7 +310,7 @@ def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: Bools, return
 def _directions(
     model: LidarModel, rng: np.random.Generator, index: int, period: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(columns * rings, 3) unit rays in the LiDAR frame, column after column: as it reports them, and as they fly."""
+    """(columns * rings, 3) unit rays in the LiDAR frame, column after column: nominal ones, and those with angular errors."""
     azimuth, elevation = model.beams(index, period)
     noise = rng.standard_normal((2, model.columns, model.rings), np.float32) * np.float32(
         np.radians(model.angle_noise_deg)
@@ -336,7 +334,7 @@ def _into_city(
     period: float,
     fired: Floats,
 ) -> Rays:
-    """Rays of the LiDAR's frame (N, 3), fired from one pose (4, 4) or from a pose (columns, 4, 4) for every column."""
+    """Rays (N, 3) from the LiDAR's frame to the city frame, by one pose (4, 4) or a pose (columns, 4, 4) per column."""
     by_column = directions.reshape(model.columns, model.rings, 3)
     lift = np.outer(model.heights, [0, 0, 1]).astype(np.float32)
     R, t = poses[..., :3, :3].astype(np.float32), poses[..., :3, 3].astype(np.float32)
@@ -353,14 +351,14 @@ def _into_city(
 
 
 def _on(steps: Floats) -> NDArray[np.float32]:
-    """Steps from each pose to the next, the last one once more."""
+    """Transforms from each pose to the next; the last one is repeated."""
     return np.concatenate([steps, steps[-1:]]).astype(np.float32)
 
 
 def _detect(
     model: LidarModel, hits: Hits, rng: np.random.Generator, returns: Returns | None, wrong: Errors | None
 ) -> tuple[Bools, NDArray[np.float32], NDArray[np.float32]]:
-    """Which rays return, their measured ranges and intensities.
+    """Returning rays, their measured ranges, m, and intensities.
 
     The echo's peak is that of a diffuse surface: reflectivity times the cosine of incidence over the range squared. The
     intensity is that of the whole echo, which a slanted surface stretches, without the range: what drivers report.

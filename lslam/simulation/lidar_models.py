@@ -1,4 +1,4 @@
-"""LiDARs by their data sheets: spinning ones, and one whose pattern does not repeat."""
+"""LiDAR models by their data sheets: spinning ones, and one with a non-repetitive pattern."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lslam.core.types.arrays import Floats
 
 @dataclass(frozen=True)
 class Rosette:
-    """Two prisms that turn against each other draw flowers that never close: a little more of the view with every scan.
+    """Two counter-rotating prisms whose pattern never closes: every scan covers a little more of the view.
 
     half_view_deg : from the middle to the rim; turns : of the two prisms per scan, incommensurable
     """
@@ -43,11 +43,11 @@ class LidarModel:
     elevations_deg : of each ring, from the top ring (0) downwards; columns : firings per scan, a revolution
     range_min, range_max : m; range_noise : standard deviation, m; range_step : resolution, m
     angle_noise_deg : standard deviation of azimuth and elevation
-    range_10pct : m at which a surface of 10 % reflectivity, met squarely, is seen 94 % of the time
+    range_10pct : m at which a surface of 10 % reflectivity, at normal incidence, is detected in 94 % of cases
     dropout : share of returns lost for no reason; order : of the points, ring after ring or column after column
     start_deg : azimuth of the first column, 0 forward, counter-clockwise; clockwise : sense of turning, from above
-    rosette : when given, it does not spin but looks forward through two turning prisms
-    ring_bias, ring_tilt_deg : standard deviations over the rings of what calibration missed: range, m, and elevation
+    rosette : if set, the LiDAR does not spin but looks forward through two rotating prisms
+    ring_bias, ring_tilt_deg : standard deviations over the rings of calibration errors: range, m, and elevation
     firing_us : microseconds from the start of a column until each ring fires, shorter than a column lasts; empty: all at once
     ring_heights : m of each laser above the LiDAR's origin; empty: all rays leave from there
     """
@@ -115,7 +115,7 @@ class LidarModel:
 
     @cached_property
     def ring_errors(self) -> tuple[Floats, Floats]:
-        """What calibration missed, of each ring and for good: range (rings,), m, and elevation (rings,), rad."""
+        """Constant calibration errors of each ring: range (rings,), m, and elevation (rings,), rad."""
         bias, tilt = np.random.default_rng(self.rings).standard_normal((2, self.rings))
         return self.ring_bias * bias, np.radians(self.ring_tilt_deg) * tilt
 
@@ -194,7 +194,7 @@ LIDARS = {
 
 
 class LidarMount(Section):
-    """A LiDAR beside the leading one, in whose frame it sits.
+    """Further LiDAR on the vehicle, placed in the frame of the leading one.
 
     name : of its folder; lidar : a name of `LIDARS`, by default the leading one's
     place : x, y, z, m; rpy_deg : roll, pitch, yaw; offset_ms : its sweeps begin so much after those of the leading one
@@ -208,12 +208,12 @@ class LidarMount(Section):
 
     @property
     def T_lidar_other(self) -> Floats:
-        """(4, 4) from its frame to that of the leading LiDAR."""
+        """(4, 4) transform from its frame to that of the leading LiDAR, m."""
         return se3.make(so3.from_euler_rpy(np.radians(self.rpy_deg)), np.array(self.place))
 
 
 def lidar_named(name: str) -> LidarModel:
-    """The ready model called `name`. Raises UsageError naming the nearest one."""
+    """Model called `name`. Raises UsageError naming the nearest one."""
     if name not in LIDARS:
         raise UsageError(f"no LiDAR {name!r}; {nearest(name, LIDARS)}")
     return LIDARS[name]

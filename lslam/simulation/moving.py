@@ -1,4 +1,4 @@
-"""Moving cars and pedestrians: where each of them is at any instant, and what the LiDAR may meet of them."""
+"""Moving cars and pedestrians: their poses over time, and those within range of the LiDAR."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ NEAREST = 2.3  # m that the middle of anything moving keeps from the LiDAR's lin
 
 @dataclass(frozen=True)
 class Mover:
-    """A body on a street: `begin` m along at 0 s, `speed` m/s along it (negative: against it), `offset` m to the left.
+    """Body that moves on a street: at `begin` m along it at 0 s, `speed` m/s (negative: against it), `offset` m to the left.
 
-    On a closed street it goes round and round; an open one it enters and leaves, and where it is not, it is far below.
-    start : s and m/s2, when it drives off and how it gains its speed; None: it has it from the first
+    On a closed street it drives laps. On an open one it enters and leaves, and outside it is placed far below the ground.
+
+    start : time, s, and acceleration, m/s2, of driving off; None: it has its speed from the beginning
     """
 
     scene: RayScene
@@ -43,7 +44,7 @@ class Mover:
     start: tuple[float, float] | None = None
 
     def along(self, times: NDArray[Any]) -> Floats:
-        """(M,) m along the street at `times` (M,), s."""
+        """(M,) distance along the street at `times` (M,), s, m."""
         t = np.asarray(times, np.float64)
         if self.start is None:
             return self.begin + self.speed * t
@@ -76,13 +77,13 @@ def add_traffic(
     pavement: float,
     speed: float,
 ) -> list[Mover]:
-    """Cars and people on `streets`; none comes within `NEAREST` m of the LiDAR's `line` on its way.
+    """Cars and pedestrians on `streets`; none comes within `NEAREST` m of the LiDAR's `line`.
 
     Parameters
     ----------
     line : (M, 4, 4) T_city_lidar at times (M,), s, from 0 to `duration`
     lanes : offsets of the lanes, m to the left of the middle; a car in a lane on the left comes towards us
-    pavement : offset of those who walk, m, on either side; speed : of the cars, m/s, about
+    pavement : offset of the pedestrians, m, on either side; speed : mean of the cars, m/s
     """
     cars = [RayScene(furniture.parked_car(rng)) for _ in range(MODELS if cars_per_km else 0)]
     people = [RayScene(pedestrian(rng)) for _ in range(MODELS if people_per_km else 0)]
@@ -101,7 +102,7 @@ def add_traffic(
 def add_queue(
     streets: list[RouteCurve], terrain: Terrain, T_city_lidar: Floats, starts: float, rng: np.random.Generator
 ) -> list[Mover]:
-    """Two buses beside a LiDAR at (4, 4) and a truck ahead of it, that drive off `starts` s later, within half a second."""
+    """Two buses beside a LiDAR at (4, 4) and a truck ahead, which drive off within half a second from `starts` s on."""
     place = T_city_lidar[:2, 3]
 
     def nearest(street: RouteCurve) -> tuple[float, float]:
@@ -127,7 +128,7 @@ def add_queue(
 
 
 def bus(rng: np.random.Generator) -> SceneMesh:
-    """A bus or a truck along x, a box on wheels that are not seen."""
+    """A bus or a truck along x: a box; the wheels are not modelled."""
     length, width, height = np.array(BUS) * rng.uniform([0.9, 0.95, 0.9], [1.1, 1.05, 1.1])
     builder = MeshBuilder()
     builder.add_box([-length / 2, -width / 2, 0.3], [length / 2, width / 2, height], Surface.CAR)
@@ -135,7 +136,7 @@ def bus(rng: np.random.Generator) -> SceneMesh:
 
 
 def pedestrian(rng: np.random.Generator) -> SceneMesh:
-    """Somebody in the middle of a step along +x."""
+    """A pedestrian in mid-step along +x."""
     builder = MeshBuilder()
     height, stride = rng.uniform(1.55, 1.9), rng.uniform(0.15, 0.3)
     hip, shoulder = 0.5 * height, 0.83 * height
@@ -150,7 +151,7 @@ def pedestrian(rng: np.random.Generator) -> SceneMesh:
 
 
 def moving_meshes(movers: list[Mover], position: NDArray[Any], time: float, reach: float) -> list[MovingMesh]:
-    """Those of `movers` within `reach` m of `position` (3,) at `time` s, where they are then."""
+    """Those of `movers` within `reach` m of `position` (3,) at `time`, s, with their poses then."""
     centres = _centres(movers, time)
     near = np.linalg.norm(centres - position, axis=1) < reach + np.array([mover.radius for mover in movers])
     return [
@@ -160,7 +161,7 @@ def moving_meshes(movers: list[Mover], position: NDArray[Any], time: float, reac
 
 
 def _centres(movers: list[Mover], time: float) -> Floats:
-    """(N, 3) where the movers are at `time` s, those of a street together."""
+    """(N, 3) positions of the movers at `time`, s; those of one street are computed together."""
     streets: dict[tuple[int, int], list[int]] = {}
     for i, mover in enumerate(movers):
         streets.setdefault((id(mover.street), id(mover.terrain)), []).append(i)
@@ -186,7 +187,7 @@ def _on_street(
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """As `np.cross` of (M, 3), in a third of its time for a few."""
+    """As `np.cross` of (M, 3), three times as fast for small M."""
     return np.stack([a[:, i] * b[:, j] - a[:, j] * b[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""A city raised from the buildings of a map, on uneven ground, with roads and what stands beside them."""
+"""A city built from the buildings of a map, on uneven ground, with roads and street furniture."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FLAT = ("flat", "skillion", "round", "dome")
 
 @dataclass(frozen=True)
 class OsmCity(City):
-    """A `City` that knows its buildings; x is east and y north of the extract's origin.
+    """A `City` with its buildings; x is east and y north of the extract's origin.
 
     buildings : as built, every one with a height; attribution : what outputs made from it must carry (ODbL), if anything
     source : the file it was made from
@@ -54,11 +54,11 @@ def build_osm_city(
     attribution: str | None = None,
     source: str = "a map",
 ) -> OsmCity:
-    """Raise `buildings` (m, x east, y north) on `terrain`. The same generator state gives the same city.
+    """Build the city of `buildings` (m, x east, y north) on `terrain`. The same generator state gives the same city.
 
-    A building looks the same whichever others stand around it. Heights that the map does not know are drawn.
-    `streets` : middles of the roads to pave and furnish by `layout`, the main one first; without, all ground is lawn.
-    Raises InputError when there are no buildings.
+    A building's look does not depend on its neighbours. Heights that the map lacks are drawn at random. `streets` : middles
+    of the roads to pave and furnish by `layout`, the main one first; without, all ground is lawn. Raises InputError when
+    there are no buildings.
     """
     if not buildings:
         raise InputError("a city needs at least one building: the OpenStreetMap extract gives none here")
@@ -106,7 +106,7 @@ def _add_ground(
     band: float,
     rng: np.random.Generator,
 ) -> None:
-    """A grid of grass under everything and round it, lower where a road covers it; cells grow under a whole district."""
+    """Add a grid of grass, lower where a road covers it, with larger cells under a whole district."""
     places = [footprint.outer for building in buildings for footprint in building.footprints]
     places += [street.position(street.sample(2.0)) for street in (network.streets if network else ())]
     everything = np.concatenate(places)
@@ -130,7 +130,7 @@ def _furnish(
     layout: Layout,
     rng: np.random.Generator,
 ) -> None:
-    """Roads with kerbs, and beside them cars, trees, poles and bins wherever no building is in the way."""
+    """Add roads with kerbs, and beside them cars, trees, poles and bins wherever no building is in the way."""
     for street in network.streets:
         add_road(builder, street, network, terrain, layout, rng)
     allowed = _Gaps(network, layout, [outer for outer, _ in outlines])
@@ -144,7 +144,7 @@ def _furnish(
 
 
 class _Gaps:
-    """Whether a place beside a road is free of other roads, of what stands there already, and of walls."""
+    """Test of free places beside a road: clear of other roads, of objects there and of walls."""
 
     def __init__(self, network: Network, layout: Layout, outlines: list[Floats]) -> None:
         from shapely import Polygon, STRtree
@@ -176,7 +176,7 @@ class _FacadeStyle:
 
 
 def likely_height(building: Building, rng: np.random.Generator) -> float:
-    """A height, m, for a building whose tags give none: small ones are garages, large ones have more storeys."""
+    """Plausible height, m, for a building without height tags: small ones are garages, large ones have more storeys."""
     if building.area < 45:
         return round(float(rng.uniform(2.4, 3.0)), 1)
     return STOREY * float(rng.integers(2, 4 if building.area < 250 else 6))
@@ -220,14 +220,14 @@ def extrude(builder: MeshBuilder, building: Building, low: float, high: float, r
 def _facade(
     builder: MeshBuilder, style: _FacadeStyle, start: Floats, end: Floats, levels: tuple[float, float, float]
 ) -> None:
-    """One wall from `start` to `end` (2,), outside to its right, from bottom over the ground floor to the top (`levels`)."""
+    """Add a wall from `start` to `end` (2,), its outside to the right, with the heights `levels` from bottom to top."""
     bottom, floor, top = levels
     length = float(portable.norm(end - start))
     along = (end - start) / length
     outward = np.array([along[1], -along[0]])
 
     def quads(u0: Any, u1: Any, z: tuple[Any, Any, Any, Any], in0: Any, in1: Any) -> Floats:
-        """(N, 4, 3) between u0 and u1 m along the wall, at heights z round the quad; insets of its two ends, m."""
+        """(N, 4, 3) quads between u0 and u1, m along the wall, at heights z of the corners, inset at both ends, m."""
         u0, u1, *rest = np.broadcast_arrays(u0, u1, *z, in0, in1)
         z0, z1, z2, z3, i0, i1 = (np.ravel(v) for v in rest)
 
@@ -263,14 +263,14 @@ def _facade(
 
 @dataclass(frozen=True)
 class _Gable:
-    """Four corners of a nearly rectangular outline, the two short sides 0-1 and 2-3, and how high the ridge is above them."""
+    """Roof of a nearly rectangular outline: four corners, with short sides 0-1 and 2-3, and the ridge's height above them, m."""
 
     corners: Floats
     rise: float
 
 
 def _gable(building: Building, footprint: Footprint, style: _FacadeStyle) -> _Gable | None:
-    """The gabled roof of a building that can carry one, None for a flat roof."""
+    """Gabled roof of a building with a suitable outline, None for a flat roof."""
     shape = building.tags.get("roof:shape", "")
     if footprint.holes or shape in FLAT or not (shape in GABLED or style.likes_gables):
         return None
@@ -288,7 +288,7 @@ def _gable(building: Building, footprint: Footprint, style: _FacadeStyle) -> _Ga
 
 
 def _gabled_roof(builder: MeshBuilder, gable: _Gable, eaves: float) -> None:
-    """Two slopes that reach over the walls and two gables above the short sides."""
+    """Add two slopes that overhang the walls and two gables above the short sides."""
     a, b, c, d = gable.corners
     ridge = np.array([(a + b) / 2, (c + d) / 2])
     top = eaves + gable.rise
@@ -306,7 +306,7 @@ def _gabled_roof(builder: MeshBuilder, gable: _Gable, eaves: float) -> None:
 
 
 def _level(builder: MeshBuilder, footprint: Footprint, z: float) -> None:
-    """The footprint as a level surface at height `z`."""
+    """Add the footprint as a level surface at height `z`, m."""
     from shapely import constrained_delaunay_triangles, get_coordinates
 
     triangles = constrained_delaunay_triangles(footprint_polygon(footprint))
@@ -316,7 +316,7 @@ def _level(builder: MeshBuilder, footprint: Footprint, z: float) -> None:
 
 
 def _canopy(builder: MeshBuilder, footprint: Footprint, bottom: float, top: float) -> None:
-    """A slab on posts, open on all sides."""
+    """Add a slab on posts, open on all sides."""
     for z in (top - SLAB, top):
         _level(builder, footprint, z)
     for ring in footprint.rings:

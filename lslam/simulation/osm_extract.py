@@ -1,4 +1,4 @@
-"""The OpenStreetMap extract of a scene: exact, and a perturbed copy as real maps are, with what was done to it on record."""
+"""OpenStreetMap extracts of a scene: an exact one, and one perturbed like real maps, with a record of the changes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROADSIDE = 7.0  # m from the middle of a street that stay free of houses not yet
 
 @dataclass(frozen=True)
 class Extracts:
-    """What was written: the two maps, the record, and the perturbation itself."""
+    """Paths of the two maps and the record, and the perturbation itself."""
 
     exact: Path
     perturbed: Path
@@ -78,7 +78,7 @@ def write_extracts(
 
 
 def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attribution: str | None) -> OsmData:
-    """An extract of `buildings` (local frame at `origin`), degrees rounded to 7 decimals: what a file of it reads back as.
+    """Extract of `buildings` (local frame at `origin`), degrees rounded to 7 decimals as in a file.
 
     Nodes, and rings of multipolygons, get negative numbers, which no element of OpenStreetMap has.
     """
@@ -93,7 +93,7 @@ def osm_from_buildings(buildings: Sequence[Building], origin: NDArray[Any], attr
 
 
 def city_buildings(city: City) -> list[Building]:
-    """The buildings of a city, m in its frame; those of a generated one get numbers below zero and heights to 0.1 m."""
+    """Buildings of a city, m, in its frame; those of a generated one get negative numbers and heights rounded to 0.1 m."""
     from shapely import Polygon
 
     if isinstance(city, OsmCity):
@@ -107,13 +107,13 @@ def city_buildings(city: City) -> list[Building]:
 
 
 def _places(ring: Floats, origin: NDArray[Any]) -> list[Place]:
-    """Corners (K, 2), m, in degrees as a file has them."""
+    """Corners (K, 2), m, as degrees rounded as in a file."""
     fixes = from_local(np.column_stack([ring, np.zeros(len(ring))]), origin)
     return [(round(lat, DECIMALS), round(lon, DECIMALS)) for lat, lon, _ in fixes.tolist()]
 
 
 def _written_tags(building: Building) -> dict[str, str]:
-    """The building's tags, its height among them where the tags say another or none."""
+    """Tags of a building; its height is added where the tags lack it or differ."""
     tags = {"building": "yes", **building.tags}
     if building.height is not None and height_of(tags) != building.height:
         tags["height"] = f"{building.height:.10g}"
@@ -121,7 +121,7 @@ def _written_tags(building: Building) -> dict[str, str]:
 
 
 def _streets(city: City) -> Any:
-    """The ground of all streets, None where there are none."""
+    """Area of all streets, None where there are none."""
     from shapely import LineString, union_all
 
     streets = city.streets or ([] if city.street is None else [city.street])

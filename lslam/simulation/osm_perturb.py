@@ -1,4 +1,4 @@
-"""A perturbed map from an exact one: buildings moved, simplified, merged, missing or not yet built, on record as JSON."""
+"""Perturbation of an exact map: buildings shifted, simplified, merged, missing or only planned, recorded as JSON."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCHEMA = "lslam-osm-perturbation-1"
 
 @dataclass(frozen=True)
 class Change:
-    """What happened to one building of the exact map, in this order; the common shift of the map comes last.
+    """Changes of one building of the exact map, in the order of application; the common shift of the map comes last.
 
     missing : it is left out; merged_into : it became part of that building; merged_with, gap_m : its outline was joined
     with those, across gaps up to gap_m; simplify_m : tolerance of Douglas-Peucker; turn_rad : counter-clockwise about the
@@ -40,7 +40,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Perturbation:
-    """All that was done to an exact map: `shift_m` of the whole, one `Change` per building, buildings not yet built.
+    """All changes of an exact map: `shift_m` of the whole, one `Change` per building, and planned buildings.
 
     attribution : what outputs made from the map must carry (ODbL), if anything
     """
@@ -52,10 +52,7 @@ class Perturbation:
 
 
 def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[Building]:
-    """The perturbed map from the exact one.
-
-    Raises ValueError when the two do not belong together.
-    """
+    """Apply a perturbation to the exact map. Raises ValueError when map and perturbation do not belong together."""
     known = {b.osm_id: b for b in buildings}
     if set(known) != {c.id for c in perturbation.changes}:
         raise ValueError("the perturbation was drawn for other buildings than these")
@@ -77,7 +74,7 @@ def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[B
 
 
 def join_outlines(building: Building, change: Change, known: dict[str, Building]) -> Building:
-    """The building with the outlines of those merged into it, gaps closed; `known` has all buildings by number."""
+    """Building with the outlines of those merged into it, gaps closed; `known` holds all buildings by number."""
     from shapely import union_all
 
     if not change.merged_with:
@@ -93,7 +90,7 @@ def join_outlines(building: Building, change: Change, known: dict[str, Building]
 
 
 def simplify_outlines(building: Building, tolerance: float) -> Building:
-    """The building with fewer corners, none more than `tolerance` m off (Douglas-Peucker)."""
+    """Building with fewer corners, the outline changed by at most `tolerance` m (Douglas-Peucker)."""
     shapes = (footprint_polygon(f).simplify(tolerance) for f in building.footprints)
     return replace(building, footprints=tuple(f for shape in shapes for f in footprints_of(shape)))
 
@@ -116,7 +113,7 @@ def write_perturbation(path: Path, perturbation: Perturbation) -> None:
 
 
 def read_perturbation(path: Path) -> Perturbation:
-    """Read what `write_perturbation` wrote. Raises InputError naming the file."""
+    """Read a file of `write_perturbation`. Raises InputError naming the file."""
     try:
         tree = parse_json(path.read_bytes())
         if tree["schema"] != SCHEMA:
@@ -141,7 +138,7 @@ def _pair(values: Any) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class MapFaults:
-    """How wrong the map is. Shares are of all buildings, at least one of each where there are eight or more.
+    """Size of the errors of a map. Shares are of all buildings, at least one of each kind where there are eight or more.
 
     offset : m, shift of the whole map; shifted, turned, simplified, merged, missing : shares of buildings so changed
     new : not yet built buildings, as a share of the others; shift, turn, tolerance : greatest sizes, m, rad, m
@@ -167,9 +164,9 @@ class MapFaults:
 def draw_perturbation(
     buildings: Sequence[Building], faults: MapFaults, rng: np.random.Generator, keep_clear: Any = None
 ) -> Perturbation:
-    """Draw what is wrong with a map of `buildings`. The same generator state gives the same faults.
+    """Draw random errors for a map of `buildings`. The same generator state gives the same errors.
 
-    keep_clear : shapely geometry, m, where nobody would build (the streets)
+    keep_clear : shapely geometry, m, without planned buildings (the streets)
     """
     heading = rng.uniform(0, 2 * np.pi)
     common = (float(faults.offset * portable.cos(heading)), float(faults.offset * portable.sin(heading)))
@@ -199,7 +196,7 @@ def draw_perturbation(
 
 
 def _some(rng: np.random.Generator, count: int, share: float) -> list[int]:
-    """That share of 0..count-1, in order; at least one of eight or more."""
+    """Random indices of 0..count-1, a `share` of them, in order; at least one if count is eight or more."""
     wanted = max(round(share * count), 1 if count >= 8 and share > 0 else 0)
     return _pick(rng, list(range(count)), wanted)
 
@@ -216,7 +213,7 @@ def _draw_merges(
     rng: np.random.Generator,
     changes: list[Change],
 ) -> set[int]:
-    """Pairs of near neighbours whose outlines become one; marks `changes`, returns those swallowed."""
+    """Merge pairs of close neighbours: marks `changes`, returns the buildings that were merged into others."""
     known = {b.osm_id: b for b in buildings}
     gone: set[int] = set()
     used: set[int] = set()
@@ -237,7 +234,7 @@ def _draw_merges(
 
 
 def _radius(building: Building) -> float:
-    """From the middle to the farthest corner, m."""
+    """Distance from the middle to the farthest corner, m."""
     corners = np.concatenate([footprint.outer for footprint in building.footprints])
     return float(np.linalg.norm(corners - building.middle, axis=1).max())
 

@@ -1,4 +1,4 @@
-"""A scenario in a real place: the line through an OpenStreetMap extract, the city along it, and what may move there."""
+"""A scenario in a real place: path through an OpenStreetMap extract, city along it, and moving objects."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ ROUNDING = 3.0  # m, of the corners of ways
 
 @dataclass(frozen=True)
 class MapExtract:
-    """An OpenStreetMap file as read: everything in it, and its buildings in the local frame at their origin."""
+    """Content of an OpenStreetMap file, and its buildings in the local frame at their origin."""
 
     data: OsmData
     buildings: BuildingExtract
@@ -81,7 +81,7 @@ def read_extract(path: Path, origin: NDArray[Any] | None = None) -> MapExtract:
 
 
 def route_in_map(scenario: Scenario, extract: MapExtract, way_points: WayPoints | None) -> Route:
-    """The line through the extract: `way_points`, a shape laid where it fits, or along the streets of the map.
+    """Path through the extract: `way_points`, a shape fitted into free space, or along the streets of the map.
 
     Raises UsageError when there is nothing to drive along, or no room for the shape.
     """
@@ -96,7 +96,7 @@ def route_in_map(scenario: Scenario, extract: MapExtract, way_points: WayPoints 
 def city_of_map(
     scenario: Scenario, extract: MapExtract, terrain: Terrain, rng: np.random.Generator, route: Route | None
 ) -> OsmCity:
-    """The city within 150 m of `route`, or the whole extract; raises InputError when no building is that near."""
+    """City within 150 m of `route`, or of the whole extract. Raises InputError when no building is that near."""
     found, layout, flies = extract.buildings, scenario.layout, scenario.carrier == "drone"
     buildings = found.buildings
     if route is not None:
@@ -116,7 +116,7 @@ def city_of_map(
 
 
 def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: float) -> list[Building]:
-    """The buildings that come within `reach` m of one of the `positions` (N, 2), m in the extract's frame.
+    """Buildings within `reach` m of one of the `positions` (N, 2), m, in the extract's frame.
 
     Raises InputError saying how far away the extract is when there are none.
     """
@@ -136,7 +136,7 @@ def buildings_near(extract: BuildingExtract, positions: NDArray[Any], reach: flo
 
 
 def keep_out_of_walls(movers: list[Mover], city: OsmCity, duration: float) -> list[Mover]:
-    """Those of `movers` that meet no wall from 0 to `duration` s: the map's houses know nothing of our pavements."""
+    """Those of `movers` that hit no wall from 0 to `duration` s: pavements are generated without regard to the map's houses."""
     from shapely import contains_xy
 
     solid = solid_ground(city.buildings, 0.4)
@@ -145,7 +145,7 @@ def keep_out_of_walls(movers: list[Mover], city: OsmCity, duration: float) -> li
 
 
 def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Route:
-    """Right of the middle of the longest street there is."""
+    """Path along the longest street, right of its middle."""
     lane, kinds = scenario.path.lane, WALKABLE if scenario.carrier == "walker" else DRIVABLE
     radius = TIGHTEST[scenario.carrier] + lane + 1.0
     if scenario.carrier == "drone":
@@ -164,7 +164,7 @@ def _along_streets(scenario: Scenario, extract: MapExtract, margin: float) -> Ro
 
 
 def fit_shape(shape: WayPoints, buildings: Sequence[Building], margin: float, source: str) -> WayPoints:
-    """The shape turned and shifted so that all of it keeps `margin` m from walls, with walls along as much as possible.
+    """The shape rotated and shifted so that it keeps `margin` m from walls, and walls are near as much of it as possible.
 
     Of equally good places the first in a fixed order is taken. Raises UsageError when there is none.
     """
@@ -192,7 +192,7 @@ def fit_shape(shape: WayPoints, buildings: Sequence[Building], margin: float, so
 
 
 def _dense(shape: WayPoints) -> Floats:
-    """The line (N, 2) every 2 m."""
+    """The line (N, 2), m, sampled every 2 m."""
     line = shape.points[:, :2]
     line = np.concatenate([line, line[:1]]) if shape.closed else line
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
@@ -201,7 +201,7 @@ def _dense(shape: WayPoints) -> Floats:
 
 
 def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float32]]:
-    """Distance to the nearest wall on a raster from `low` (2,), m; 0 inside of buildings."""
+    """Distance to the nearest wall, m, on a raster from `low` (2,), m; 0 inside of buildings."""
     from scipy.ndimage import distance_transform_edt
     from shapely import contains_xy
 
@@ -213,7 +213,7 @@ def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float3
 
 
 def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margin: float) -> tuple[Floats, Longs]:
-    """Shifts (M, 2) on a grid that bring all of `line` (N, 2) on free ground, and how many of its points see walls there."""
+    """Shifts (M, 2) on a grid that keep all of `line` (N, 2) on free ground, and how many of its points are near walls then."""
     size = CELL * np.array(distance.shape)
     x, y = (np.arange(low[k], low[k] + size[k], SHIFT) for k in (0, 1))
     shifts = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -234,7 +234,7 @@ def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margi
 def highways(data: OsmData, origin: NDArray[Any], kinds: Iterable[str]) -> list[tuple[tuple[int, ...], Floats]]:
     """Ways of the given `kinds` of highway on open ground: node numbers and corners (N, 2), m from `origin`.
 
-    Left out are tunnels, bridges, what is underground, indoors or an area; a way with missing nodes falls into its parts.
+    Tunnels, bridges, areas, and underground or indoor ways are left out. A way with missing nodes is split there.
     """
     wanted = frozenset(kinds)
     runs: list[tuple[int, ...]] = []
@@ -249,7 +249,7 @@ def highways(data: OsmData, origin: NDArray[Any], kinds: Iterable[str]) -> list[
 
 
 def solid_ground(buildings: Iterable[Building], margin: float) -> Any:
-    """The ground (a shapely geometry) that buildings with walls take, `margin` m of air around them included."""
+    """Area (a shapely geometry) of all buildings with walls, grown by `margin` m."""
     from shapely import prepare, union_all
 
     solid = (b for b in buildings if not is_canopy(b) and b.base < HEADROOM)
@@ -261,10 +261,10 @@ def solid_ground(buildings: Iterable[Building], margin: float) -> Any:
 def find_route(
     ways: Sequence[tuple[tuple[int, ...], Floats]], buildings: Sequence[Building], margin: float, radius: float
 ) -> Floats | None:
-    """The middle (N, 2), m, of a street to drive: as long as there is one through the built-up ground, at most 1.5 km.
+    """Middle (N, 2), m, of a street to drive: the longest one in the built-up area, at most 1.5 km.
 
-    It is the longest shortest way between two crossings, cut to its longest part that keeps `margin` m from walls and whose
-    bends have at least `radius` m; None where there are not 50 m of such a street.
+    It is the longest of the shortest paths between two crossings. It is cut to its longest part that keeps `margin` m from
+    walls and whose bends have a radius of at least `radius` m. None where that is less than 50 m.
     """
     from shapely import distance, points
 
@@ -289,7 +289,7 @@ def find_route(
 def side_roads(
     ways: Sequence[tuple[tuple[int, ...], Floats]], solid: Any, along: RouteCurve | None, apart: float, reach: float
 ) -> list[RouteCurve]:
-    """The other roads: `ways` outside of `solid` ground, within `reach` m of the line `along`, more than `apart` m off it."""
+    """Other roads: `ways` outside of `solid` ground, within `reach` m of the line `along`, more than `apart` m off it."""
     from shapely import LineString, line_merge, union_all
 
     if not ways:
@@ -322,7 +322,7 @@ def _known_runs(nodes: Sequence[int], data: OsmData) -> list[tuple[int, ...]]:
 def _longest_way(
     ways: Sequence[tuple[tuple[int, ...], Floats]], buildings: Sequence[Building], solid: Any
 ) -> Floats | None:
-    """Corners (N, 2) of the longest shortest way over the largest network, by going to the far end twice."""
+    """Corners (N, 2), m, of the longest shortest path over the largest network, found by going to the far end twice."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components, dijkstra
     from shapely import LineString, STRtree, intersects, points

@@ -1,4 +1,4 @@
-"""How a vehicle moves: along a curve, over the ground, at a speed profile. Poses are exact at any instant."""
+"""Motion of a vehicle along a curve, over the ground, by a speed profile; poses are exact at any instant."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lslam.simulation.terrain import Terrain
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """What limits a vehicle: cruising speed and the speed at the start, m/s; accelerations along and across, m/s2; jerk, m/s3.
+    """Limits of a vehicle: cruising and initial speed, m/s; accelerations along and across, m/s2; jerk, m/s3.
 
-    The defaults are what passengers of a car find comfortable.
+    The defaults are comfortable for passengers of a car.
     """
 
     cruise: float
@@ -30,13 +30,13 @@ class SpeedProfile:
 
     @property
     def easing(self) -> float:
-        """Seconds it takes to go over from the strongest acceleration to the strongest braking."""
+        """Time from the strongest acceleration to the strongest braking, s, at the largest jerk."""
         return (self.acceleration + self.braking) / self.jerk
 
 
 @dataclass(frozen=True)
 class Suspension:
-    """Small rolling, pitching and heaving over time: K sines on each of (roll, pitch, heave), rad and m.
+    """Small oscillations of roll, pitch and heave: K sines each, rad and m.
 
     amplitudes, phases : (K, 3); frequencies : (K,) Hz
     """
@@ -92,17 +92,17 @@ class VehiclePath:
 def drive(
     curve: RouteCurve, terrain: Terrain, speed: SpeedProfile, distance: float, height: float, shaking: Suspension
 ) -> VehiclePath:
-    """Drive `distance` m along `curve`, lap after lap on a closed one."""
+    """Path along `distance` m of `curve`, lap after lap on a closed one."""
     s = np.linspace(0, distance, int(np.ceil(distance / 0.25)) + 1)
     v = _speeds(curve, s, speed)
     t = np.concatenate([[0.0], np.cumsum(2 * np.diff(s) / (v[:-1] + v[1:]))])
-    times, travelled = _eased(t, s, v, speed.easing if speed.start > 0 else -speed.easing)
+    times, travelled = _ease(t, s, v, speed.easing if speed.start > 0 else -speed.easing)
     duration = float(np.interp(distance, travelled, times))
     return VehiclePath(curve, terrain, interpolating_spline(times, travelled), duration, height, shaking)
 
 
 def _speeds(curve: RouteCurve, s: Floats, speed: SpeedProfile) -> Floats:
-    """Speed at each distance: the cruise, less in bends, reached with bounded acceleration and braking."""
+    """Speed at each distance, m/s: cruising, lower in bends, with bounded acceleration and braking."""
     bend = np.maximum(np.abs(curve.curvature(s)), 1e-9)
     v = np.minimum(speed.cruise, np.sqrt(speed.lateral / bend))
     step, half = s[1] - s[0], speed.easing / 2
@@ -121,8 +121,8 @@ def _speeds(curve: RouteCurve, s: Floats, speed: SpeedProfile) -> Floats:
     return np.asarray(held)
 
 
-def _eased(t: Floats, s: Floats, v: Floats, easing: float) -> tuple[Floats, Floats]:
-    """Times from 0 in even steps and distances there: `s` over `t`, averaged over `easing` s, so that no acceleration steps.
+def _ease(t: Floats, s: Floats, v: Floats, easing: float) -> tuple[Floats, Floats]:
+    """Times in even steps from 0 and distances there: `s` over `t` smoothed over `easing` s, so that acceleration is continuous.
 
     A negative `easing` begins half of it earlier, standing at the start.
     """

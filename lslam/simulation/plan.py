@@ -1,4 +1,4 @@
-"""The plan of a scene: a top view with a metric grid, from which way-points can be read."""
+"""Plan of a scene: a top view with a metric grid, for picking way-points."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ class ScenePlan:
     has_path: bool
 
     def marks(self, axis: int) -> list[tuple[int, int]]:
-        """Metres and pixels, from the west or the south, of the darker lines of the grid along an axis."""
+        """Coordinates of the darker grid lines along an axis, m and pixels, from the west or the south."""
         lines = _lines(float(self.low[axis]), self.image.shape[1 - axis], self.pixel, COARSE)
         return [(int(metre), int(at)) for metre, at in zip(*lines, strict=True)]
 
 
 def plan_of(scene: RayScene, city: City, line: Floats) -> ScenePlan:
-    """The top view of `city` with the path `line` (M, 3), m, in the city frame, or none (0, 3)."""
+    """Top view of `city` with the path `line` (M, 3), m, in the city frame; (0, 3) for none."""
     low, high = _extent(city, line)
     pixel = max(float((high - low).max()) / LARGEST, FINEST)
     image, surfaces = _view(scene, low, high, pixel)
@@ -80,7 +80,7 @@ def _extent(city: City, line: Floats) -> tuple[Floats, Floats]:
 
 
 def _view(scene: RayScene, low: Floats, high: Floats, pixel: float) -> tuple[Image, tuple[Surface, ...]]:
-    """What rays from far above meet, lit from the north-west; row 0 is the north; with the surfaces that they met."""
+    """Image of the scene from above, lit from the north-west, row 0 at the north; and the visible surfaces."""
     width, height = (int(n) for n in np.ceil((high - low) / pixel))
     image = np.full((height, width, 3), 255, np.uint8)
     x = (low[0] + (np.arange(width) + 0.5) * pixel).astype(np.float32)
@@ -101,7 +101,7 @@ def _view(scene: RayScene, low: Floats, high: Floats, pixel: float) -> tuple[Ima
 
 
 def _lines(low: float, count: int, pixel: float, every: int) -> tuple[Longs, Longs]:
-    """Metres and pixels of the grid lines along one axis."""
+    """Coordinates of the grid lines along one axis, m and pixels."""
     first = int(np.ceil(low / every)) * every
     metres = np.arange(first, low + count * pixel, every).astype(np.int64)
     return metres, np.clip(np.floor((metres - low) / pixel), 0, count - 1).astype(np.int64)

@@ -1,4 +1,4 @@
-"""A simulated drive on disk, in KITTI's odometry layout with `sequence.toml`; written whole or not at all."""
+"""Recording of a simulated drive in KITTI's odometry layout with `sequence.toml`; written whole or not at all."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ _SIDES, _HOUSE = 80e3, 4e3  # bytes beside the scans: per second of readings and
 
 
 def write_manifest(folder: Path, drive: SimulatedDrive, command: str, points: int, size: int) -> Path:
-    """Write `manifest.json` into `folder`, the finished sequence, atomically: where it is, everything else is whole.
+    """Write `manifest.json` into `folder`, atomically and last: its presence marks a complete sequence.
 
-    command : what was typed; points : of all scans; size : bytes on disk of all other files
+    command : command line; points : of all scans; size : bytes on disk of all other files
 
     Raises OutputError when it cannot be written.
     """
@@ -65,7 +65,7 @@ def write_manifest(folder: Path, drive: SimulatedDrive, command: str, points: in
 
 
 def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
-    """What decides a simulation and what it holds. It names neither time nor machine: same seed, same bytes."""
+    """Parameters and content of a simulation, without time or machine, so the same seed gives the same bytes."""
     truth, sensors = drive.ground_truth, drive.readings
     assert truth is not None
     attribution = drive.city.attribution if isinstance(drive.city, OsmCity) else None
@@ -106,7 +106,7 @@ def _further(drive: SimulatedDrive) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """The same as JSON has it: arrays as lists, what is not finite (no limit at all) as null."""
+    """Plain values for JSON: arrays as lists, infinite and NaN values (no limit) as null."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
@@ -119,7 +119,7 @@ def _plain(value: Any) -> Any:
 
 
 def fingerprint(drive: SimulatedDrive) -> str:
-    """What decides the bytes of a recording, as one digest: an unfinished one goes on only with the same."""
+    """Digest of all parameters of a recording; an unfinished one can be resumed only with the same digest."""
     said = {
         "version": __version__,
         "scenario": drive.scenario.model_dump(mode="json"),
@@ -137,7 +137,7 @@ def fingerprint(drive: SimulatedDrive) -> str:
 
 
 def read_mark(folder: Path) -> str | None:
-    """The fingerprint of the recording that was begun in `folder`; None when there is none that could go on."""
+    """Fingerprint of the unfinished recording in `folder`; None when there is none to resume."""
     try:
         tree = parse_json((folder / MARK).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -147,12 +147,12 @@ def read_mark(folder: Path) -> str | None:
 
 
 def write_mark(folder: Path, drive: SimulatedDrive) -> None:
-    """Note in `folder` which recording is begun there."""
+    """Write the fingerprint of the recording that begins in `folder`."""
     write_text(folder / MARK, json.dumps({"fingerprint": fingerprint(drive)}))
 
 
 def lidars_of(drive: SimulatedDrive, folder: Path) -> list[tuple[SimulatedDrive, Path]]:
-    """The LiDARs of a drive and the folders of their scans: the leading one's `folder`, and in it those of the others."""
+    """LiDARs of a drive with the folders of their scans: the leading one in `folder`, the others in subfolders."""
     mounts = zip(drive.further, drive.scenario.lidars, strict=True)
     return [(drive, folder), *((other, folder / mount.name) for other, mount in mounts)]
 
@@ -160,10 +160,10 @@ def lidars_of(drive: SimulatedDrive, folder: Path) -> list[tuple[SimulatedDrive,
 def write_scans(
     drive: SimulatedDrive, folder: Path, on_scan: Callable[[int], None] | None = None, is_labelled: bool = False
 ) -> int:
-    """Write every scan that is not in `folder` yet, as KITTI's .bin with times and rings beside; the number of points of all.
+    """Write the scans missing in `folder` as KITTI's .bin with times and rings beside. Returns the number of points of all.
 
     is_labelled : with the classes of points
-    `on_scan` is called with the index of every scan, in order, when it is on disk, and those of further LiDARs beside it.
+    `on_scan` is called with the index of every scan, in order, once the scans of all LiDARs are on disk.
     """
     jobs = [
         (lidar, index, place)
@@ -175,7 +175,7 @@ def write_scans(
     def is_there(place: Path, index: int) -> bool:
         return scan_files(place, index)[1].is_file() and (not is_labelled or label_file(place, index).is_file())
 
-    fresh = _traced([(lidar, index) for lidar, index, place in jobs if not is_there(place, index)])
+    fresh = _trace_scans([(lidar, index) for lidar, index, place in jobs if not is_there(place, index)])
     total = 0
     for (_, index, place), following in zip(jobs, [*jobs[1:], None], strict=True):
         if is_there(place, index):
@@ -192,8 +192,8 @@ def write_scans(
     return total
 
 
-def _traced(jobs: Iterable[tuple[SimulatedDrive, int]]) -> Iterator[Scan]:
-    """Scans in order, a few of them traced ahead; each has its own seed, so the order of tracing changes nothing."""
+def _trace_scans(jobs: Iterable[tuple[SimulatedDrive, int]]) -> Iterator[Scan]:
+    """Simulate scans in order, a few ahead in parallel; each has its own seed, so the order of work changes nothing."""
     waiting: deque[Future[Scan]] = deque()
     pool = ThreadPoolExecutor(TRACERS, thread_name_prefix="trace")
     try:
@@ -209,7 +209,7 @@ def _traced(jobs: Iterable[tuple[SimulatedDrive, int]]) -> Iterator[Scan]:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was written: the sequence folder, its poses, the number of points and of bytes."""
+    """Result of `record`: the sequence folder, its poses, numbers of points and bytes."""
 
     sequence: Path
     poses: Path
@@ -274,7 +274,7 @@ def record(
 
 
 def _check_space(out: Path, part: Path, drive: SimulatedDrive) -> None:
-    """Say how much disk it takes, and refuse at once what will not fit, instead of failing hours later."""
+    """Log the disk space needed. Raises OutputError if the disk is too small."""
     lidars = lidars_of(drive, part)
     left = [len(lidar) - sum(1 for _ in (place / PER_POINT).glob("*.npz")) for lidar, place in lidars]
     rays = sum(lidar.lidar.rays for lidar, _ in lidars)
@@ -294,7 +294,7 @@ def _size(amount: float) -> str:
 
 
 def _keep_what_is_worth_it(out: Path, part: Path) -> None:
-    """Whole scans stay for --resume; where there are none, nothing is left behind, so that the command can be given again."""
+    """Keep complete scans for --resume. If there are none, remove the folder, so that the command can be repeated."""
     with contextlib.suppress(OSError):
         kept = sum(1 for _ in (part / PER_POINT).glob("*.npz"))
         if kept and read_mark(part) is not None:
@@ -307,7 +307,7 @@ def _keep_what_is_worth_it(out: Path, part: Path) -> None:
 
 
 def _write_sides(drive: SimulatedDrive, folder: Path) -> None:
-    """Everything beside the scans."""
+    """Write all files beside the scans."""
     _write_texts(drive, folder)
     write_readings(folder, drive.readings)
     if drive.city.footprints:
@@ -316,7 +316,7 @@ def _write_sides(drive: SimulatedDrive, folder: Path) -> None:
 
 
 def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
-    """times.txt, calib.txt and sequence.toml, of further LiDARs in their folders."""
+    """Write times.txt, calib.txt and sequence.toml, for further LiDARs in their folders."""
     info = replace(
         _info(drive),
         ground_truth=f"../../poses/{NUMBER}.txt",
@@ -336,7 +336,7 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
 
 
 def _info(drive: SimulatedDrive) -> SequenceInfo:
-    """What the scans of a LiDAR are."""
+    """Facts for `sequence.toml` about the scans of a LiDAR."""
     return SequenceInfo(
         name=drive.name,
         sensor=f"simulated {drive.lidar.name}",

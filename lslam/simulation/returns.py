@@ -1,4 +1,4 @@
-"""What real surfaces and real optics do to a return: grass, texture, a beam with a width, mixed pixels, biases, losses.
+"""Effects of real surfaces and optics on returns: grass, texture, beam width, mixed pixels, biases, losses.
 
 Everything here acts on arrays of one scan, after the rays are cast. A beam of divergence g (full angle at 1/e2 of the middle's
 light) lights a spot whose standard deviation at r is r g / 4.
@@ -38,7 +38,7 @@ _TEXTURED = {
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays in the city: origins and unit directions (N, 3), m, and when each is fired (N,), s."""
+    """Rays in the city frame: origins, m, and unit directions (N, 3), and firing times (N,), s."""
 
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
@@ -48,7 +48,7 @@ class Rays:
         return Rays(self.origins[which], self.directions[which], self.fired[which])
 
     def with_more(self, others: Rays) -> Rays:
-        """These rays, then `others`."""
+        """These rays, followed by `others`."""
         return Rays(
             np.concatenate([self.origins, others.origins]),
             np.concatenate([self.directions, others.directions]),
@@ -56,15 +56,15 @@ class Rays:
         )
 
     def after(self, distance: NDArray[np.float32]) -> Rays:
-        """The same rays from `distance` (N,), m, on."""
+        """Rays that start `distance` (N,), m, further on."""
         return Rays(self.origins + distance[:, None] * self.directions, self.directions, self.fired)
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What rays meet first: distance (N,), m, inf for nothing; cosine of incidence (N,); surface (N,).
+    """First hits of rays: distance (N,), m, inf for none; cosine of incidence (N,); surface class (N,).
 
-    face : (N,) of the scene that stands, below 0 for nothing, a leaf, or what moves
+    face : (N,) of the static scene, below 0 for no hit, a leaf, or a moving body
     """
 
     distance: NDArray[np.float32]
@@ -76,7 +76,7 @@ class Hits:
 def penetrate(
     cast: Cast, mesh: SceneMesh, rays: Rays, hits: Hits, extinction: NDArray[np.float32], rng: np.random.Generator
 ) -> None:
-    """Let the rays whose `hits` are surfaces of volumes end at a leaf in them, or at what is in or behind them.
+    """Let rays that hit volumes of leaves end at a leaf inside, or at the first object in or behind the volume.
 
     cast : first hits of rays on `mesh`, whose volumes are wound outwards; extinction : (surfaces,) 1/m, of volumes
 
@@ -115,12 +115,12 @@ def penetrate(
 
 
 def _enters(mesh: SceneMesh, face: NDArray[np.int32], directions: NDArray[np.float32]) -> Bools:
-    """Whether rays go into a volume, not out of it, at its faces (N,)."""
+    """(N,) whether a ray enters a volume at its face, rather than leaving it."""
     return np.asarray(np.einsum("ij,ij->i", mesh.normals[face], directions) < 0)
 
 
 def _leaf(hits: Hits, which: NDArray[np.intp], at: NDArray[np.float32], facing: NDArray[np.float32]) -> None:
-    """Leaves face every way alike: the cosine of incidence is uniform."""
+    """Set hits on leaves at random orientations: the cosine of incidence is uniform."""
     hits.distance[which] = at
     hits.cosine[which] = facing[which]
     hits.surface[which] = Surface.FOLIAGE
@@ -137,7 +137,7 @@ def _solid(
 
 
 class Returns(Section):
-    """How returns differ from those of clean, sharp surfaces; everything is off by default.
+    """Deviations of returns from those of clean, sharp surfaces; all are off by default.
 
     crown_extinction, hedge_extinction : of beams in leaves, 1/m, where `layout.volumes` makes crowns and hedges volumes: half
         the leaf area in a cubic metre (Beer and Lambert's law with leaves facing every way, Ross 1981)
@@ -170,12 +170,12 @@ class Returns(Section):
 
     @property
     def is_on(self) -> bool:
-        """Whether anything differs from clean surfaces and sharp beams."""
+        """Whether any effect is on."""
         return self != Returns()
 
     @property
     def extinction(self) -> Array:
-        """(surfaces,) of beams behind each surface, 1/m; 0 where nothing goes on."""
+        """(surfaces,) extinction of beams in the volume behind each surface, 1/m; 0 for opaque surfaces."""
         table = np.zeros(len(Surface), np.float32)
         table[Surface.CROWN], table[Surface.HEDGE] = self.crown_extinction, self.hedge_extinction
         return table
@@ -183,14 +183,14 @@ class Returns(Section):
 
 @dataclass(frozen=True)
 class Errors:
-    """What happens to the echoes of N rays: m by which each is measured too long, and the share of its light left."""
+    """Errors of the echoes of N rays: range error of each, m, and remaining share of its light."""
 
     late: Array
     gain: Array
 
 
 def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.random.Generator) -> Errors:
-    """Errors of what `rays` of one scan, column after column, meet."""
+    """Errors of the hits of `rays` of one scan, column after column."""
     cosine: Array = np.clip(hits.cosine, np.float32(FLATTEST), np.float32(1)).astype(np.float32)
     distance: Array = np.where(np.isfinite(hits.distance), hits.distance, 0).astype(np.float32)
     slant: Array = (np.sqrt(1 - cosine**2) / cosine).astype(np.float32)
@@ -217,13 +217,13 @@ def errors(returns: Returns, model: LidarModel, rays: Rays, hits: Hits, rng: np.
 
 
 def range_walk(returns: Returns, brightness: Array) -> Array:
-    """(N,) m by which surfaces of some `brightness` (N,), the share of light they return, are measured too long."""
+    """(N,) range error, m, of surfaces of some `brightness` (N,), the share of light that they return."""
     dimmer = portable.log(np.float32(REFERENCE) / np.clip(brightness, np.float32(0.02), np.float32(1))) / np.log(2)
     return np.asarray(np.float32(returns.walk) * dimmer, np.float32)
 
 
 def texture(places: Array) -> Array:
-    """(N,) standard normal bumps at (N, 3) places, m: one of every cell of `CELL` m, the same whenever it is seen."""
+    """(N,) standard normal surface heights at (N, 3) places, m: one per cell of `CELL` m, the same on every visit."""
     cell = np.floor(places / np.float32(CELL)).astype(np.int32)
     # Teschner et al. 2003, a hash of cells in space; int32 wraps.
     mix = cell[:, 0] * np.int32(73856093) ^ cell[:, 1] * np.int32(19349663) ^ cell[:, 2] * np.int32(83492791)
@@ -236,7 +236,7 @@ def _bumps() -> Array:
 
 
 def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rng: np.random.Generator) -> Array:
-    """(N,) m by which beams that straddle an edge are measured too long.
+    """(N,) range error, m, of beams that straddle an edge.
 
     An edge somewhere between two columns is within the spot of one of the two rays beside it with the probability of the
     spot's width over the columns' spacing. Most of that ray's light, half at least, is on its own side, and the one echo of
@@ -261,7 +261,7 @@ def mixed(returns: Returns, model: LidarModel, distance: Array, slant: Array, rn
 
 
 def mirrored(returns: Returns, hits: Hits, normals: Array, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Which rays a pane of the static scene mirrors; `normals` (F, 3) of its faces."""
+    """Indices of the rays that a pane of the static scene mirrors; `normals` (F, 3) of its faces."""
     panes = np.flatnonzero(is_glass(hits.surface) & np.isfinite(hits.distance) & (hits.face >= 0))
     share = returns.mirror + (1 - returns.mirror) * portable.power(1 - hits.cosine[panes], 5)
     lucky = rng.random(len(panes), np.float32) < share
@@ -270,7 +270,7 @@ def mirrored(returns: Returns, hits: Hits, normals: Array, rng: np.random.Genera
 
 
 def reflect(rays: Rays, distance: Array, normals: Array) -> Rays:
-    """Rays (N,) that go on from `distance` (N,), m, mirrored by faces with `normals` (N, 3)."""
+    """Rays (N,) reflected at `distance` (N,), m, by faces with `normals` (N, 3)."""
     along = np.einsum("ij,ij->i", rays.directions, normals)
     directions = rays.directions - 2 * along[:, None] * normals
     return Rays(rays.origins + distance[:, None] * rays.directions, directions, rays.fired)

@@ -1,4 +1,4 @@
-"""The line that a LiDAR takes and the street it belongs to: a scenario's own shape, or given way-points."""
+"""Paths of a LiDAR and their streets: a scenario's own shape, or given way-points."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONGEST_STEP_M = 50_000.0  # m between neighbours
 
 @dataclass(frozen=True)
 class Route:
-    """The middle of a street, the line along it, and heights of way-points over the distance along the line, if they have any."""
+    """Middle of a street, path along it, and heights of way-points over the distance along the path, if any."""
 
     street: RouteCurve
     line: RouteCurve
@@ -56,7 +56,7 @@ class Visit:
     shift: float = 0.0
 
     def seeds(self, seed: int) -> tuple[int, ...]:
-        """What seeds all that differs from visit to visit, in the town of `seed`."""
+        """Seeds of everything that differs between visits, in the town of `seed`."""
         return (seed, self.number) if self.number else (seed,)
 
 
@@ -64,9 +64,9 @@ FIRST_VISIT = Visit()
 
 
 def visited(route: Route, scenario: Scenario, visit: Visit) -> Route:
-    """The route as a visit takes it; the street, and with it the town, stays.
+    """Route of a visit; the street, and with it the town, is unchanged.
 
-    Raises UsageError for a shift beyond the line, and for what no other visit can take: a line in three dimensions.
+    Raises UsageError for a shift beyond the line, and for a line in three dimensions, which has no other visit.
     """
     if not visit.is_reversed and visit.shift == 0:
         return route
@@ -87,12 +87,12 @@ def visited(route: Route, scenario: Scenario, visit: Visit) -> Route:
 
 
 def speed_profile(scenario: Scenario) -> SpeedProfile:
-    """What limits a car in this scenario."""
+    """Limits of a car in this scenario."""
     return SpeedProfile(scenario.speed, scenario.start_speed, lateral=scenario.lateral)
 
 
 def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = None) -> Route:
-    """The scenario's own street and line, scaled to its length; an out-and-back is made long enough for `scans` in motion."""
+    """Scenario's own street and path, scaled to its length; an out-and-back is made long enough for `scans` in motion."""
     path = scenario.path
     if path.shape == "block":
         return _block(rng)
@@ -125,7 +125,7 @@ def own_route(scenario: Scenario, rng: np.random.Generator, scans: int | None = 
 
 
 def given_route(scenario: Scenario, way_points: WayPoints) -> Route:
-    """A line through way-points, in metres as they are, and a street on its left."""
+    """Path through way-points, m, unscaled, and a street on its left."""
     points = way_points.points
     line = smooth_curve(points[:, :2], way_points.closed, scenario.path.smoothing)
     street = beside(line, scenario.path.lane)
@@ -143,14 +143,14 @@ def beside(curve: RouteCurve, offset: float) -> RouteCurve:
 
 
 def _block(rng: np.random.Generator) -> Route:
-    """Round one block counter-clockwise, right of the middle of the street."""
+    """Path round one block counter-clockwise, right of the middle of the street."""
     size = rounded_rectangle(35.5 + rng.uniform(-0.5, 0.5), 28.0 + rng.uniform(-0.5, 0.5), 11.0)
     street = smooth_curve(size, closed=True)
     return Route(street, smooth_curve(street.beside(street.sample(0.5), -0.8), closed=True))
 
 
 def _street(rng: np.random.Generator) -> Route:
-    """Along a winding street, changing sides of the lane now and then."""
+    """Path along a winding street that changes lanes at times."""
     street = smooth_curve(winding_line(rng, 320 + 2 * SPARE), closed=False)
     s = np.arange(SPARE, street.length - SPARE, 1.0)
     sway = -0.4 + 0.5 * portable.sin(2 * np.pi * s / rng.uniform(80, 120) + rng.uniform(0, 2 * np.pi))
@@ -158,7 +158,7 @@ def _street(rng: np.random.Generator) -> Route:
 
 
 def _out_and_back(scenario: Scenario, scans: int | None) -> Route:
-    """As long as the scenario says, or as it takes to reach the speed, hold it and brake for the turn, or as `scans` last."""
+    """Path of the scenario's length, or long enough to reach the speed and brake for the turn, or for `scans`."""
     profile, path = speed_profile(scenario), scenario.path
     slow = min(profile.cruise, float(np.sqrt(profile.lateral * TURN)))
     speeding = (profile.cruise**2 - profile.start**2) / (2 * profile.acceleration)
@@ -182,7 +182,7 @@ class WayPoints:
     """Points (N, 2) or (N, 3), m, x and y level and z up when it is given; a closed line does not repeat its first point.
 
     origin : (3,) lat, lon (deg), height (m) of x = y = 0 where the points are positions on the Earth
-    is_placed : False for a mere shape, which may be turned and shifted
+    is_placed : False for a shape that may be rotated and shifted
     """
 
     points: Floats
@@ -212,7 +212,7 @@ def read_way_points(path: Path, origin: NDArray[Any] | None = None) -> WayPoints
         found = _from_geojson(path, origin)
     else:
         found = _from_trajectory(path)
-    return _checked(path, found)
+    return _require_usable(path, found)
 
 
 def _text(path: Path) -> str:
@@ -244,7 +244,7 @@ def _rows(path: Path) -> list[list[str]]:
 
 
 def _is_table(path: Path) -> bool:
-    """Two or three columns: way-points; trajectories have more."""
+    """Whether rows have two or three columns, as way-points do; trajectories have more."""
     rows = _rows(path)
     return not rows or len(rows[0]) <= 3
 
@@ -327,7 +327,8 @@ def _array(path: Path, values: Any) -> Floats:
     return points
 
 
-def _checked(path: Path, found: WayPoints) -> WayPoints:
+def _require_usable(path: Path, found: WayPoints) -> WayPoints:
+    """Way-points unchanged. Raises InputError if they are too few, too close or too short."""
     points = found.points
     ring = np.concatenate([points, points[:1]]) if found.closed else points
     steps = np.linalg.norm(np.diff(ring[:, :2], axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""Scenarios as TOML: those that ship with the package, by name, files of one's own, and what `--set` changes in them."""
+"""Scenarios as TOML: those that ship with the package, by name, files of one's own, and overrides by `--set`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _WALK = [(0, 0), (38, 2), (52, 24), (36, 48), (4, 44), (-10, 20)]
 
 
 def rounded(corners: Sequence[tuple[float, float]], radius: float, closed: bool) -> Floats:
-    """(N, 2) points along straight lines between `corners`, m, with arcs of `radius` m in them.
+    """(N, 2) points of a polygon through `corners`, m, rounded by arcs of `radius` m.
 
     An arc takes at most 0.45 of the shorter of its two sides, so the radius shrinks where corners are close.
     """
@@ -79,7 +79,7 @@ def _arc(corner: Floats, a: Floats, b: Floats, half: float, reach: float) -> Flo
 
 
 def eight(width: float, depth: float, radius: float) -> Floats:
-    """Closed (N, 2): up a street, round the block to its right, up it again, round the block to its left.
+    """Closed line (N, 2), m: up a street, round the block to its right, up it again, round the block to its left.
 
     Blocks measure `width` x `depth` m between the middles of the streets.
     """
@@ -91,13 +91,13 @@ def eight(width: float, depth: float, radius: float) -> Floats:
 
 
 def _until_shared(line: Floats) -> Floats:
-    """Without the way along the shared street that the other half goes again."""
+    """Half of an eight without the street that it shares with the other half."""
     far = np.flatnonzero(np.abs(line[:, 0]) > 1e-6)[-1]
     return line[: far + 1]
 
 
 def spiral(approach: float, radius: float, turns: float) -> Floats:
-    """(N, 2): a straight approach along +x, then `turns` left turns at a nearly constant radius."""
+    """Line (N, 2), m: a straight approach along +x, then `turns` left turns at a nearly constant radius."""
     angle = np.linspace(0, 2 * np.pi * turns, int(2 * np.pi * turns * radius / STEP))
     # The radius shrinks a little, so that it is nearly but not quite a helix.
     r = radius * (1 - 0.06 * angle / angle[-1])
@@ -107,7 +107,7 @@ def spiral(approach: float, radius: float, turns: float) -> Floats:
 
 
 def out_and_back(length: float, radius: float) -> Floats:
-    """(N, 2): along +x, round a U-turn to the left of `radius` m, and back beside; `length` m in all, 10 m of it straight."""
+    """Line (N, 2), m: along +x, a left U-turn of `radius` m, and back; `length` m in all, 10 m of it straight."""
     straight = max(0.5 * (length - np.pi * radius), 5.0)
     angle = np.linspace(-np.pi / 2, np.pi / 2, max(int(np.pi * radius / STEP), 8) + 1)
     turn = np.array([straight, radius]) + radius * np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
@@ -141,7 +141,7 @@ INDOORS = {"stairwell": "stairs", "hall": "eights", "room": "room"}
 
 
 class PathSection(Section):
-    """The line that is driven or flown.
+    """Path that is driven or flown.
 
     shape : a name of `LINES`, scaled to `length` m when that is given (of an out-and-back the least); smoothing : of
         its corners, m
@@ -162,7 +162,7 @@ class PathSection(Section):
 
 
 class WorldSection(Section):
-    """The place: its kind, side streets (see `build_town`), the share of rays that pass a pane.
+    """Place: its kind, side streets (see `build_town`), and the share of rays that pass a pane.
 
     relief, swell : m up and down over m; unevenness : m of bumps; slope : least and greatest fall of the whole ground, m/m
     roughness : standard deviation of the surface itself, m, of a car park
@@ -199,7 +199,7 @@ class TrafficSection(Section):
 
 
 class Scenario(Section):
-    """A kind of place and a way to move through it.
+    """A kind of place and a motion through it.
 
     carrier : what carries the LiDAR; speed, start_speed : m/s, the latter of a drone nothing or all; lateral : greatest
         acceleration in bends, m/s2, to which a car and a walker slow down and which a drone must not exceed, of eights the
@@ -234,7 +234,7 @@ class Scenario(Section):
 
     @property
     def real_returns(self) -> Returns | None:
-        """What surfaces and beams do to returns; None for clean, sharp ones."""
+        """Deviations of returns from clean, sharp surfaces; None without any."""
         return self.returns if self.returns.is_on or self.layout.volumes else None
 
     @model_validator(mode="after")
@@ -266,7 +266,7 @@ def scenario_names() -> tuple[str, ...]:
 
 
 def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
-    """The ready scenario `name`, or that of the file `name`.toml, with `settings` ("speed=8", "world.relief=1") applied.
+    """Ready scenario `name`, or that of the file `name`.toml, with overrides `settings` ("speed=8", "world.relief=1").
 
     Raises
     ------
@@ -279,7 +279,7 @@ def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
 
 
 def scenario_text(scenario: Scenario) -> str:
-    """The scenario as TOML with every key, as a file that `scenario_named` reads back."""
+    """Scenario as TOML with every key; `scenario_named` reads it back."""
 
     return toml_text(scenario.model_dump(mode="json", exclude={"name"}, exclude_none=True))
 
@@ -300,7 +300,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = (), where: str | None = None) -> Scenario:
-    """The scenario of a TOML tree, which may stand on a ready one, `base = "urban"`, and say only what differs.
+    """Scenario of a TOML tree; with `base = "urban"` only differences from a ready scenario are needed.
 
     Raises ConfigError naming `where` it was found, the key and the nearest known one.
     """
@@ -325,7 +325,7 @@ def parse_scenario(name: str, tree: dict[str, Any], settings: Iterable[str] = ()
 
 
 def _on_its_base(tree: dict[str, Any], where: str) -> dict[str, Any]:
-    """What a tree says, over what its base says; a base may have one of its own."""
+    """Tree merged over its base, recursively."""
     own = dict(tree)
     base = own.pop("base", None)
     merged: dict[str, Any] = {} if base is None else _on_its_base(_ready(str(base)), f"scenario {base!r}")

@@ -1,4 +1,4 @@
-"""Scenarios by name, and the simulated drive: a Sequence whose scans are traced when they are asked for."""
+"""Scenarios by name, and the simulated drive: a Sequence whose scans are simulated on demand."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _MOUNT_SEED = 2**32 - 17  # of those of further LiDARs
 
 @dataclass(frozen=True)
 class Mounted:
-    """The motion of what sits at `T_lidar_other` (4, 4) of the LiDAR that `motion` moves."""
+    """Motion of a sensor at `T_lidar_other` (4, 4) from the LiDAR with motion `motion`."""
 
     motion: Motion
     T_lidar_other: Floats
@@ -123,10 +123,10 @@ class SimulatedDrive(Scans):
         return self._motion.poses(self.stamps_ns / 1e9)
 
     def _beside(self, mount: LidarMount, number: int) -> SimulatedDrive:
-        """The same drive as another LiDAR sees it, which has noise of its own and no roof in its way."""
+        """The drive as another LiDAR sees it, with noise of its own and without the roof."""
         other, T, late_ns = copy.copy(self), mount.T_lidar_other, round(1e6 * mount.offset_ms)
         other.name, other.path = f"{self.name}-{mount.name}", Path(f"{self.name}-{mount.name}")
-        other.lidar = self.lidar if mount.lidar is None else _calibrated(lidar_named(mount.lidar), self.scenario)
+        other.lidar = self.lidar if mount.lidar is None else _with_ring_errors(lidar_named(mount.lidar), self.scenario)
         # A last sweep that begins late would end after the drive.
         other.stamps_ns = self.stamps_ns[: len(self) - (late_ns > 0)] + late_ns
         if not len(other.stamps_ns):
@@ -211,7 +211,7 @@ def simulate(
     """
     chosen = scenario_named(scenario, settings) if isinstance(scenario, str) else scenario
     model = chosen.lidar if lidar is None else lidar
-    model = _calibrated(lidar_named(model) if isinstance(model, str) else model, chosen)
+    model = _with_ring_errors(lidar_named(model) if isinstance(model, str) else model, chosen)
     cruise = chosen.speed if speed is None else speed
     begin = (
         (cruise if chosen.carrier == "drone" and chosen.start_speed else min(chosen.start_speed, cruise))
@@ -251,7 +251,7 @@ def simulate(
 
 
 def checked_origin(origin: Iterable[float]) -> Floats:
-    """(3,) lat, lon (deg), height (m) of two or three numbers; raises UsageError when they are no place on the Earth."""
+    """(3,) lat, lon (deg), height (m) of two or three numbers. Raises UsageError when they are no position on the Earth."""
     values = [float(value) for value in origin]
     if len(values) not in (2, 3) or not np.isfinite(values).all():
         raise UsageError(f"--origin {','.join(f'{v:g}' for v in values)}: expected LAT,LON or LAT,LON,HEIGHT")
@@ -264,15 +264,15 @@ def checked_origin(origin: Iterable[float]) -> Floats:
 
 
 def kitti_like_cam0() -> Floats:
-    """(4, 4) T_cam0_lidar: camera 0 looks ahead (x right, y down, z forward), turned by under a degree, as on KITTI's car."""
+    """(4, 4) T_cam0_lidar as on KITTI's car: x right, y down, z forward, and a misalignment below one degree."""
     axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
     return se3.make(
         portable.product(so3.from_euler_rpy(np.radians([0.45, -0.4, 0.02])), axes), np.array([-0.012, -0.06, -0.28])
     )
 
 
-def _calibrated(model: LidarModel, scenario: Scenario) -> LidarModel:
-    """The model with the errors that calibration leaves in a scenario."""
+def _with_ring_errors(model: LidarModel, scenario: Scenario) -> LidarModel:
+    """LiDAR model with the calibration errors of a scenario."""
     share = scenario.returns.calibration
     return replace(model, ring_bias=share * model.ring_bias, ring_tilt_deg=share * model.ring_tilt_deg)
 

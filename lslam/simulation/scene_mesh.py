@@ -15,7 +15,7 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 
 
 class Surface(IntEnum):
-    """What a face is made of: the LiDAR's intensity and losses follow from it."""
+    """Class of a face's surface; it determines the LiDAR's intensity and losses."""
 
     ROAD = 0
     PAVEMENT = 1
@@ -60,7 +60,7 @@ class SceneMesh:
 
 
 class MeshBuilder:
-    """Collects parts in one frame; `build` joins them."""
+    """Collects meshes in one frame; `build` joins them."""
 
     def __init__(self) -> None:
         self._vertices: list[NDArray[Any]] = []
@@ -87,7 +87,7 @@ class MeshBuilder:
         self.add(*box(low, high), surface)
 
     def add_mesh(self, mesh: SceneMesh, position: Any = (0, 0, 0), yaw: float = 0.0) -> None:
-        """Add a mesh turned by `yaw` (rad, about z) and moved to `position` (3,)."""
+        """Add a mesh rotated by `yaw` (rad, about z) and moved to `position` (3,), m."""
         c, s = portable.cos(yaw), portable.sin(yaw)
         turned = portable.product(mesh.vertices, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
         self.add(turned + np.asarray(position, np.float64), mesh.faces, mesh.surfaces)

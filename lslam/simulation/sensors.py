@@ -1,4 +1,4 @@
-"""What rides along with the LiDAR: an IMU and a satellite receiver, where they sit, and what they recorded."""
+"""Sensors beside the LiDAR: an IMU and a satellite receiver, their mounting, and their readings."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ class GnssModel:
 
     @property
     def sigma(self) -> float:
-        """The one-sigma error a fix states, of east and of north, m."""
+        """Stated one-sigma error of a fix, east and north, m."""
         return float(portable.hypot(self.white, self.slow))
 
 
 @dataclass(frozen=True)
 class SimulatedGnss:
-    """What was measured, and the truth behind it.
+    """Fixes of a receiver, and the truth behind them.
 
     stream : the fixes; antenna : (M, 3) true positions in the city frame, m; error : (M, 3) east, north, up, m
     T_lidar_gnss : (4, 4) where the antenna sits
@@ -124,7 +124,7 @@ def _errors(model: GnssModel, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True)
 class Mounts:
-    """Where sensors sit on a carrier, in the LiDAR frame, (4, 4)."""
+    """Mounting of sensors on a carrier, (4, 4) in the LiDAR frame."""
 
     T_lidar_imu: Floats
     T_lidar_antenna: Floats
@@ -140,7 +140,7 @@ MOUNTS = {
 
 @dataclass(frozen=True)
 class Sensors:
-    """Which sensors ride along; None for one that does not. Raises UsageError for an impossible one."""
+    """Sensors of a drive; None for one that is absent. Raises UsageError for an impossible one."""
 
     imu: ImuModel | None = None
     gnss: GnssModel | None = None
@@ -152,7 +152,7 @@ class Sensors:
 
 @dataclass(frozen=True)
 class Readings:
-    """What the sensors recorded, with the truth behind it; origin : (3,) lat, lon (deg), height (m) of the city's origin."""
+    """Readings of the sensors with the truth behind them; origin : (3,) lat, lon (deg), height (m) of the city's origin."""
 
     imu: SimulatedImu | None
     gnss: SimulatedGnss | None
@@ -162,7 +162,7 @@ class Readings:
 def read_sensors(
     motion: Motion, sensors: Sensors, carrier: str, end: float, seeds: tuple[int, ...], origin: Floats = ORIGIN
 ) -> Readings:
-    """Let `sensors` record from 0 to `end` s of `motion`, each with a generator of its own.
+    """Simulate the readings of `sensors` from 0 to `end` s of `motion`, each with a generator of its own.
 
     carrier : a key of `MOUNTS`, which says where they sit
     """
@@ -177,7 +177,7 @@ def read_sensors(
 
 
 def write_readings(folder: Path, readings: Readings) -> None:
-    """Write `imu.csv` and `gnss.csv` of the sensors that rode along."""
+    """Write `imu.csv` and `gnss.csv` of the sensors of the drive."""
     if readings.imu is not None:
         write_imu_csv(folder / IMU_FILE, readings.imu.stream)
     if readings.gnss is not None:
@@ -185,7 +185,7 @@ def write_readings(folder: Path, readings: Readings) -> None:
 
 
 def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float, readings: Readings) -> None:
-    """Write the exact truth into `folder`: nothing that reads the sequence needs it.
+    """Write the exact truth into `folder`; readers of the sequence do not need it.
 
     The world is the LiDAR at the first scan. `trajectory.tum` holds the LiDAR's poses at the scans' starts,
     `trajectory_100hz.tum` at 100 Hz from 0 to `end` s; `kinematics.csv` its velocity in the world (m/s) and its rate in its own

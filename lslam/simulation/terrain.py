@@ -1,4 +1,4 @@
-"""Gently uneven ground: a fall and a sum of plane waves, so that height and slope are exact everywhere."""
+"""Gently uneven ground: a slope and a sum of plane waves, so height and gradient are exact everywhere."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rolling(
 ) -> Terrain:
     """Uneven ground: about `relief` m up and down over about `swell` m, bumps of about `unevenness` m over 7 to 20 m.
 
-    slope : the least and the greatest fall of the whole, m/m, towards any side
+    slope : least and greatest slope of the whole, m/m, in a random direction
     """
     lengths = np.concatenate([rng.uniform(0.6, 1.4, 4) * swell, rng.uniform(7, 20, 5)])
     amplitudes = np.concatenate([rng.uniform(0.4, 1.0, 4) * relief, rng.uniform(0.4, 1.0, 5) * unevenness])

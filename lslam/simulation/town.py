@@ -1,4 +1,4 @@
-"""A town of many streets round a given line: side streets that join, crossings with open kerbs, rows of houses along all."""
+"""A town of many streets round a given line: side streets, crossings with open kerbs, and rows of houses."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CAR_LENGTH = 5.2  # m kept between the middles of parked cars
 
 
 class Network:
-    """The middles of all roads, to ask how far a place is from the nearest."""
+    """Middles of all roads, for distances to the nearest one."""
 
     def __init__(self, streets: list[RouteCurve]) -> None:
         from scipy.spatial import cKDTree
@@ -40,7 +40,7 @@ class Network:
         self._tree = cKDTree(np.concatenate([street.position(street.sample(0.25)) for street in streets]))
 
     def distance(self, xy: NDArray[Any]) -> Floats:
-        """Distance of (..., 2) places to the nearest middle of a road, m, shape (...)."""
+        """Distance of places (..., 2) to the nearest middle of a road, m, shape (...)."""
         return np.asarray(self._tree.query(xy)[0])
 
 
@@ -69,7 +69,7 @@ def build_town(
         add_road(builder, street, network, terrain, layout, rng)
     # Grass closes the dead ends: their last metres do not count as road.
     add_ground(
-        builder, [_shortened(street, layout.band) for street in streets], terrain, layout, rng, 0.75 * layout.pavement
+        builder, [_shorten(street, layout.band) for street in streets], terrain, layout, rng, 0.75 * layout.pavement
     )
     lots = Lots(streets, layout)
     for first in (True, False):
@@ -85,14 +85,14 @@ def build_town(
 
 
 class Places:
-    """Whether a place beside a street is free: not on another road, and not where something stands already."""
+    """Test of free places beside a street: off other roads, and clear of earlier objects."""
 
     def __init__(self, network: Network, layout: Layout) -> None:
         self._network, self._road = network, layout.road
         self._taken = np.zeros((0, 2))
 
     def __call__(self, xy: Floats, offset: float, yaw: float) -> bool:
-        """Take the place (2,) of a thing `offset` m from the middle of its street, unless it is not free."""
+        """Take the place (2,) of an object `offset` m from the middle of its street, if it is free; whether it was."""
         is_car = offset < self._road
         if self._network.distance(xy) < offset - (0.15 if is_car else 0.05):
             return False
@@ -107,8 +107,8 @@ class Places:
         return True
 
 
-def _shortened(street: RouteCurve, by: float) -> RouteCurve:
-    """An open street without its first and last metres; too short a one as it is."""
+def _shorten(street: RouteCurve, by: float) -> RouteCurve:
+    """Open street without its first and last metres; returned unchanged if it is too short."""
     if street.closed or street.length < 2 * by + SHORTEST / 2:
         return street
     s = np.linspace(by, street.length - by, max(int(street.length), 12))
@@ -118,7 +118,7 @@ def _shortened(street: RouteCurve, by: float) -> RouteCurve:
 def _side_streets(
     main: list[RouteCurve], streets: list[RouteCurve], layout: Layout, spacing: float, rng: np.random.Generator
 ) -> list[RouteCurve]:
-    """Streets off `main` on both sides, each until it meets one of `streets` and those before it, or its own end."""
+    """Streets off `main` on both sides. Each ends at one of `streets` or at an earlier side street, or at its own length."""
     from scipy.spatial import cKDTree
 
     taken = np.concatenate([street.position(street.sample(0.5)) for street in streets])
@@ -143,7 +143,7 @@ def _side_streets(
 
 
 def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: Layout) -> RouteCurve | None:
-    """A straight street from `start` along `ray` (2,) until it meets another; None when it would run too near to one."""
+    """Straight street from `start` along `ray` (2,) until it meets another; None when it would run too close to one."""
     steps = np.arange(0.0, length, 0.5)
     points = start + steps[:, None] * ray
     away = np.asarray(taken.query(points)[0])
@@ -168,7 +168,7 @@ def add_road(
     layout: Layout,
     rng: np.random.Generator,
 ) -> None:
-    """Road, kerbs and pavements as one strip along the street; no kerb where another road passes."""
+    """Add road, kerbs and pavements as one strip along the street; no kerb where another road crosses."""
     s = street.sample(0.75)
     if street.closed:
         s = np.append(s, 0.0)

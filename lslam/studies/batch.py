@@ -25,10 +25,10 @@ from lslam.studies.variants import WITH_IMU, Variant, find_variants, free_name, 
 
 @dataclass(frozen=True)
 class RunLine:
-    """One `lslam run`, resolved: what it reads, how, and where it is written.
+    """One `lslam run` with its options resolved: input, configuration and output.
 
     words : of its command line; label, path, digest : of the recording; imu : digest of its IMU, empty when it is not used
-    reading : what else it is opened with; folder : None to choose; refusal : why it cannot be read, empty when it can
+    reading : further options of `open_sequence`; folder : None to choose; refusal : why it cannot be read, empty when it can
     """
 
     words: str
@@ -51,7 +51,7 @@ def opened_line(
     folder: Path | None,
     reading: dict[str, Any],
 ) -> RunLine:
-    """Of a recording that is open. Raises InputError when it cannot be listed."""
+    """Run of a recording that is open. Raises InputError when its files cannot be listed."""
     imu = imu_digest(sequence) if config.imu.use else ""
     return RunLine(
         words, file_safe(sequence.name), sequence.path.absolute(), input_digest(sequence, truth), imu, config, truth, folder,
@@ -60,17 +60,19 @@ def opened_line(
 
 
 def listed_line(words: str, path: Path, config: Config, folder: Path | None, reading: dict[str, Any]) -> RunLine:
-    """Of a recording in storage, which its run alone opens. Raises InputError when it cannot be listed."""
+    """Run of a recording in storage, which only the run itself opens. Raises InputError when its files cannot be listed."""
     return RunLine(words, label_of(path), path, listing_digest(path), "", config, None, folder, reading)
 
 
 def refused_line(words: str, path: Path, config: Config, folder: Path | None, refusal: str) -> RunLine:
-    """Of a recording that cannot be read: its run fails with `refusal`."""
+    """Run of an unreadable recording: it will fail with `refusal`."""
     return RunLine(words, label_of(path), path, "", "", config, None, folder, refusal=refusal)
 
 
 def expand_batch(batch: BatchConfig, output: OutputOptions, settings: Sequence[str] = ()) -> ExpandedStudy:
-    """All runs of a batch file; `settings` ("a.b=v") beat what it says. Runs of a recording that cannot be read will fail.
+    """All runs of a batch file; `settings` ("a.b=v") override it.
+
+    Unreadable recordings give runs that will fail.
 
     Raises ConfigError, UsageError or InputError for methods and scenarios that make no sense, and when no recording can be
     read; OutputExistsError when it is to go on in the folder of another list.
@@ -142,7 +144,7 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
 
 
 def _names(tree: dict[str, Any]) -> list[str]:
-    """What the content of BATCH goes by: its lines, or each recording and scenario of its jobs with each method."""
+    """Names of the content of BATCH: its lines, or each recording and scenario of its jobs with each method."""
     lines = tree.get("lines")
     if isinstance(lines, list) and lines:
         return [str(line) for line in lines]

@@ -1,4 +1,4 @@
-"""Runs on a Dask cluster: workers need lslam and the recordings, or simulate scenarios by themselves; run folders come home."""
+"""Runs on a Dask cluster: workers need lslam, and the recordings or scenarios; run folders are sent back."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ALONE = threading.Lock()
 
 @contextmanager
 def connected(scheduler: str | None, local: str | None, title: str, *, is_persistent: bool = True) -> Iterator[Cluster]:
-    """The cluster of a scheduler "tcp://host:port", or one of this machine, "local:N"; `is_persistent` as of the cluster.
+    """Cluster of a scheduler "tcp://host:port", or a local one of N workers, "local:N"; `is_persistent` as in `Cluster`.
 
     Raises UsageError when Dask is missing or `local` is no number of workers; InputError when the scheduler does not answer.
     """
@@ -84,9 +84,9 @@ def _client(scheduler: str) -> Any:
 
 @dataclass
 class Cluster:
-    """The workers of a scheduler.
+    """Workers of a Dask scheduler.
 
-    is_here : they share this machine's disk; is_persistent : they keep data read from run to run, and no keyframes
+    is_here : workers share this machine's disk; is_persistent : workers cache sequences between runs, and delete keyframes
     """
 
     client: Any
@@ -97,11 +97,11 @@ class Cluster:
 
     @property
     def at_once(self) -> int:
-        """One run per worker."""
+        """Number of runs at once: one per worker."""
         return max(1, len(self._workers()))
 
     def prepare(self, jobs: Sequence[Job], progress: StudyProgress) -> None:
-        """See whether the workers can do it, and simulate here what they all can read here.
+        """Check that the workers can make the runs; simulate here the scenes that all workers can read here.
 
         Raises InputError naming the worker that lacks lslam, this version of it, or a recording; RunFailedError without any.
         """
@@ -111,7 +111,7 @@ class Cluster:
             raise RunFailedError(
                 f"the scheduler {self.address} has no workers: start some, `dask worker {self.address} --nthreads 1`"
             ) from None
-        paths = _seen(job.path for job in jobs if job.scene is None)
+        paths = _paths_to_check(job.path for job in jobs if job.scene is None)
         for worker, answer in self.client.run(_inspect, paths, on_error="return").items():
             if isinstance(answer, BaseException):
                 raise InputError(f"worker {worker} cannot run lslam: {answer}; install it there")
@@ -126,9 +126,9 @@ class Cluster:
             simulate_scenes(jobs, self.at_once, progress)
 
     def run(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> None:
-        """Make every run on some worker; the scheduler begins anew what a worker that died had in hand.
+        """Make every run on some worker. The scheduler restarts runs of a worker that died.
 
-        What a scheduler that went away had in hand is begun anew when it is back. Raises RunFailedError when it stays away.
+        Runs are also restarted after a lost scheduler is back. Raises RunFailedError when it stays away.
         """
         if not jobs:
             return
@@ -142,7 +142,7 @@ class Cluster:
             self._reconnect(len(jobs) - len(left), len(jobs))
 
     def _attempt(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> list[Job]:
-        """Make the runs; those that are left when the scheduler goes away."""
+        """Make the runs. Returns those left over if the scheduler is lost."""
         from distributed import as_completed
 
         for job in jobs:
@@ -191,9 +191,9 @@ class Cluster:
 
 
 def perform(job: Job, context: WorkerContext) -> bytes:
-    """On a worker: make the run in a folder of the worker's, which comes home as an archive with its state.
+    """On a worker: make the run in a local folder. Returns it as an archive, with the run's state.
 
-    A run folder in storage is uploaded by the worker, state and all, and nothing comes home.
+    A run folder in storage is uploaded by the worker with its state, and the archive is empty.
     """
     from distributed import get_worker
 
@@ -213,14 +213,14 @@ def perform(job: Job, context: WorkerContext) -> bytes:
 
 
 def _forget_samples(worker: Any) -> None:
-    """Dask samples the stack of every worker and keeps an hour of it, 0.3 MB for each second of short runs."""
+    """Clear the stack samples of a worker: Dask keeps an hour of them, 0.3 MB for each second of short runs."""
     for name in ("profile_history", "profile_keys_history"):
         with contextlib.suppress(AttributeError):
             getattr(worker, name).clear()
 
 
 def pack(folder: Path) -> bytes:
-    """All files of a folder as one archive."""
+    """Archive of all files of a folder."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as archive:
         for path in sorted(folder.rglob("*")):
@@ -229,7 +229,7 @@ def pack(folder: Path) -> bytes:
 
 
 def unpack(archive: bytes, job: Job) -> None:
-    """Run folder and state to where the job has them, the state last; raises OutputError."""
+    """Unpack run folder and state to the job's paths, the state last. Raises OutputError."""
     part = job.folder.with_name(f"{job.folder.name}.part")
     try:
         shutil.rmtree(part, ignore_errors=True)
@@ -247,12 +247,12 @@ def unpack(archive: bytes, job: Job) -> None:
 
 
 def _inspect(paths: list[str]) -> tuple[str, list[str]]:
-    """On a worker: its version of lslam, and which paths it does not have."""
+    """On a worker: its version of lslam, and the paths that are missing there."""
     return __version__, [path for path in paths if not as_path(path).exists()]
 
 
-def _seen(paths: Iterable[Path]) -> list[str]:
-    """Those that each worker shall look for: all on disks, and one of each folder in storage, where all or none can be had."""
+def _paths_to_check(paths: Iterable[Path]) -> list[str]:
+    """Paths that each worker shall look for: all on disks, and one of each folder in storage."""
     found = {path.parent if isinstance(path, RemotePath) else path: str(path) for path in paths}
     return sorted(found.values())
 

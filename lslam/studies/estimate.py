@@ -1,4 +1,4 @@
-"""How long a study will take: from runs of it that are finished, or from short pilot runs at a few points of its parameters."""
+"""Duration of a study, estimated from its finished runs, or from short pilot runs at a few points of its parameters."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ _SIMULATED = 160
 
 @dataclass(frozen=True)
 class Guess:
-    """seconds : of everything; pilots : runs it was made from; around_s : of the seconds, those before and after the runs."""
+    """Estimated duration.
+
+    seconds : of everything; pilots : number of runs behind it; around_s : part of the seconds before and after the runs
+    """
 
     seconds: float
     pilots: int
@@ -40,13 +43,13 @@ class Guess:
 
     @property
     def text(self) -> str:
-        """For people."""
+        """Text of the estimate."""
         return lasting(self.seconds)
 
 
 @dataclass(frozen=True)
 class _PilotRecording:
-    """A recording for pilots; `whole` : scans of the one the study uses; simulation_s : of all its scans."""
+    """Recording for pilots; `whole` : scans of the study's recording; simulation_s : time to simulate all its scans, s."""
 
     path: Path
     scans: int
@@ -56,7 +59,7 @@ class _PilotRecording:
 
 @dataclass(frozen=True)
 class _Pilot:
-    """A run of the first `scans` scans it uses."""
+    """Pilot run of the first `scans` used scans of a recording."""
 
     job: Job
     scans: int
@@ -64,7 +67,7 @@ class _Pilot:
 
 @dataclass(frozen=True)
 class _Group:
-    """Runs that differ in parameters and seeds alone.
+    """Runs that differ only in parameters and seeds.
 
     names : of their variants; X : (names, K) where they lie; chosen : those with pilots; pilots : a short and a long one each
     """
@@ -78,9 +81,9 @@ class _Group:
 
 
 def from_finished(jobs: Sequence[Job], left: Sequence[Job], variants: dict[str, Variant], at_once: int) -> Guess | None:
-    """Time that the `left` of a study's `jobs` will take, from what its finished runs took, even if made anew; None without any.
+    """Time for the `left` of a study's `jobs`, s, from the times of its finished runs; None without any.
 
-    A run takes as long as those of its sequence and method did in the mean, or as all did where none of these is finished.
+    A run is taken to last as long as the mean of its sequence and method, or of all runs where none of these is finished.
     """
     taken: dict[object, list[float]] = {}
     for job in jobs:
@@ -100,11 +103,11 @@ def estimate(
     progress: StudyProgress | None = None,
     own_s: float = 0.0,
 ) -> Guess:
-    """Time that `jobs` will take with `at_once` together; pilots and their report go to a temporary folder.
+    """Time for `jobs` with `at_once` together; pilots and their report go to a temporary folder.
 
-    own_s : what the caller took until here and will take again
+    own_s : time of the caller until here, s, which recurs in the study
 
-    Raises RunFailedError naming a pilot that does not come to its end, and what simulating raises.
+    Raises RunFailedError naming a pilot that fails, and the errors of simulating.
     """
     progress = progress or StudyProgress()
     seconds, warming_s, start_s = 0.0, 0.0, 0.0
@@ -134,12 +137,12 @@ def _group(members: list[Job], recording: _PilotRecording, variants: dict[str, V
     names = list(dict.fromkeys(job.method for job in members))
     first = {job.method: job for job in members}
     X = _coordinates([variants[name] for name in names])
-    chosen = _chosen(X)
+    chosen = _pilot_points(X)
     return _Group(members, recording, names, X, chosen, [_pilots(first[names[k]], recording) for k in chosen])
 
 
 def _seconds(group: _Group, base: Floats, per_scan: Floats) -> float:
-    """Of all runs of the group, from what its pilots cost."""
+    """Time for all runs of the group, s, extrapolated from its pilots."""
     first = {job.method: job for job in group.members}
     seconds = 0.0
     for name, cost in zip(group.names, _at(group.X, group.X[group.chosen], base, per_scan), strict=True):
@@ -149,7 +152,7 @@ def _seconds(group: _Group, base: Floats, per_scan: Floats) -> float:
 
 
 def _groups(jobs: Sequence[Job], variants: dict[str, Variant]) -> list[list[Job]]:
-    """Runs that differ in parameters and seeds alone."""
+    """Groups of runs that differ only in parameters and seeds."""
     groups: dict[object, list[Job]] = {}
     for job in jobs:
         groups.setdefault(_kind(job, variants), []).append(job)
@@ -157,13 +160,13 @@ def _groups(jobs: Sequence[Job], variants: dict[str, Variant]) -> list[list[Job]
 
 
 def _kind(job: Job, variants: dict[str, Variant]) -> object:
-    """What runs of a study that differ in parameters and seeds alone have in common."""
+    """Key of a run's group: everything but parameters and seeds."""
     c = variants[job.method]
     return job.sequence, c.method, c.uses_imu, c.is_beside
 
 
 def _to_simulate(jobs: Sequence[Job]) -> list[Job]:
-    """One job per scene that is not there yet."""
+    """One job per scene that is not simulated yet."""
     return list({job.path: job for job in jobs if job.scene is not None and not job.path.is_dir()}.values())
 
 
@@ -190,7 +193,7 @@ def _places(jobs: Sequence[Job], folder: Path, progress: StudyProgress) -> dict[
 
 
 def _coordinates(points: Sequence[Variant]) -> Floats:
-    """(P, K) studied values from 0 to 1; of what is no number, its place in the list."""
+    """(P, K) studied values scaled to 0..1; a value that is no number gives its place in the list."""
     columns = []
     for key in points[0].parameters:
         values = [point.parameters.get(key, 0) for point in points]
@@ -201,14 +204,14 @@ def _coordinates(points: Sequence[Variant]) -> Floats:
     return np.column_stack(columns) if columns else np.zeros((len(points), 0))
 
 
-def _chosen(X: Floats) -> list[int]:
-    """Points nearest to the corners and the middle, each once."""
+def _pilot_points(X: Floats) -> list[int]:
+    """Indices of the points nearest to the corners and the middle, without repetitions."""
     wanted = [*product((0.0, 1.0), repeat=X.shape[1]), (0.5,) * X.shape[1]]
     return list(dict.fromkeys(int(np.argmin(np.sum((X - np.array(w)) ** 2, axis=1))) for w in wanted))
 
 
 def _pilots(job: Job, recording: _PilotRecording) -> list[_Pilot]:
-    """The short one and the long one."""
+    """Short and long pilot of each chosen point."""
     most = used(recording.scans, job.config.input)
     long = min(_LONG, most)
     pilots = []
@@ -219,7 +222,7 @@ def _pilots(job: Job, recording: _PilotRecording) -> list[_Pilot]:
 
 
 def _run(pilots: Sequence[_Pilot], folder: Path, progress: StudyProgress) -> tuple[list[Job], list[float]]:
-    """The runs, in one process, and the seconds of each; the first one pays for what is loaded."""
+    """Seconds of each run, made in one process; the first one includes loading."""
     jobs = [replace(p.job, folder=folder / f"{k}-{p.scans}") for k, p in enumerate(pilots)]
     Local(title="pilot runs").run(jobs, progress, lambda job: None)
     seconds = []
@@ -233,7 +236,7 @@ def _run(pilots: Sequence[_Pilot], folder: Path, progress: StudyProgress) -> tup
 
 
 def _report_s(folder: Path, pilots: Sequence[Job], variants: dict[str, Variant]) -> float:
-    """Seconds of a report, tried on the pilots, which are of every sequence and every parameter."""
+    """Time of a report, s, measured on the pilots."""
     results = Results("pilots", folder, pilots, variants)
     results.add(pilots)
     began = time.monotonic()
@@ -252,7 +255,7 @@ def _costs(made: Sequence[Sequence[_Pilot]], times: Sequence[float]) -> tuple[Fl
 
 
 def _at(X: Floats, known: Floats, base: Floats, per_scan: Floats) -> Floats:
-    """(N, 2) costs at points X, linear in the studied values and within what was measured."""
+    """(N, 2) costs at points X, linear in the studied values and clipped to the measured range."""
     values = np.column_stack([base, per_scan])
     ones = [np.column_stack([np.ones(len(x)), x]) for x in (known, X)]
     fitted = ones[1] @ np.linalg.lstsq(ones[0], values, rcond=None)[0]

@@ -1,4 +1,4 @@
-"""Every run of a sweep or a batch, made in order: keep what is finished, simulate, run, and write each row as it comes."""
+"""All runs of a sweep or a batch: keeps finished ones, simulates, makes the others, and writes each row as a run ends."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lslam.studies.variants import Variant
 
 @dataclass(frozen=True)
 class ExpandedStudy:
-    """Every run, and what its variants stand for, by name.
+    """All runs of a study, and the meaning of its variants, by name.
 
     name : of the study or batch, which `text` in the file `mark` describes; what : the word for it
     metric : the error it judges by
@@ -39,10 +39,13 @@ class ExpandedStudy:
 def check_same(
     output: OutputOptions, mark: str, what: str, text: str, names_of: Callable[[dict[str, Any]], Sequence[str]]
 ) -> None:
-    """What changed since reuses its runs by digest; rows of two studies or batches in one table are of no use to either.
+    """Check that the output folder is of this study or batch, when it is to be resumed.
 
-    text : for the file `mark`; names_of : what its content goes by, the same if what is there and `text` share a name
-    Raises OutputExistsError when it is to go on in the folder of another one; ConfigError for a damaged `mark`.
+    A changed study may continue in its folder, since runs are reused by digest.
+
+    text : for the file `mark`; names_of : names of the content of such a text, of which both must share one
+
+    Raises OutputExistsError for a folder of another study; ConfigError for a damaged `mark`.
     """
     if not output.resume or not (output.out / mark).is_file():
         return
@@ -55,7 +58,7 @@ def check_same(
 
 
 def left_to_do(output: OutputOptions, jobs: Sequence[Job]) -> list[Job]:
-    """Those that are not finished, or all unless `output.resume`."""
+    """Runs that are not finished, or all unless `output.resume`."""
     kept = finished(jobs) if output.resume else set()
     return [replace(job, goes_on=output.resume) for job in jobs if job.folder not in kept]
 
@@ -111,7 +114,7 @@ def make_runs(
 
 
 def _check_folders(jobs: Sequence[Job], output: OutputOptions) -> None:
-    """Raise OutputExistsError for a run that was given a folder of its own, which no run of this output wrote."""
+    """Raise OutputExistsError if a run's own folder exists and is not of this study."""
     for job in jobs:
         may_replace = output.overwrite or (output.resume and job.state_file.is_file())
         if output.out not in job.folder.parents and job.folder.exists() and not may_replace:

@@ -1,4 +1,4 @@
-"""A comparison of methods from Python, as `lslam compare` makes it."""
+"""Comparison of methods from Python, like `lslam compare`."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from lslam.studies.variants import Imu, find_variants
 
 @dataclass(frozen=True)
 class Compared:
-    """What `compare` gives: all numbers, and the folder of the runs with the page `compare.html`."""
+    """Result of `compare`: all numbers, and the folder of the runs with the page `compare.html`."""
 
     comparison: Comparison
     folder: Path
 
     def table(self, style: str = "text") -> str:
-        """The tables as `text`, `md`, `csv` (a row per run) or `tex`."""
+        """Tables as `text`, `md`, `csv` (a row per run) or `tex`."""
         return compare_table.render(self.comparison, style)
 
     def __str__(self) -> str:
-        """The tables as text."""
+        """Tables as text."""
         return self.table()
 
     def _repr_html_(self) -> str:

@@ -1,4 +1,4 @@
-"""The grid of a study: cells of recordings and simulations, x methods x seeds, as jobs."""
+"""Grid of a study as jobs: cells (recordings and simulations) x methods x seeds."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cell:
-    """One recording of a study: of a subject, and of a seed when it was simulated with one.
+    """One recording of a study: a subject, with a seed if it is simulated.
 
-    seed : of the simulation, None for a recording; truth : what replaces the recording's own ground truth
+    seed : of the simulation, None for a recording; truth : replaces the recording's own ground truth
     digest : of the input; imu : likewise of its IMU, empty when no run asks for it
     data_root : where the IMU of a KITTI odometry sequence is looked for
-    scene : what is simulated with `seed` when nothing lies in `path` yet; range : which scans are used, over the configuration
-    refusal : why the recording cannot be read: its runs fail with that
+    scene : simulated with `seed` if `path` does not exist yet; range : scans used, overriding the configuration
+    refusal : why the recording cannot be read: the error of its runs
     """
 
     sequence: str
@@ -51,11 +51,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class Job:
-    """One run: what a process needs to make it, and `state_file`, where it leaves how it ended.
+    """One run: all that a process needs to make it.
 
     method : the variant's name, the method of `config` or a preset that says more than a method
-    digest : two jobs of one digest have the same result; scene : as of the cell; reading : what else `open_sequence` is given
-    goes_on : where a run was begun and not finished, it is gone on with
+    digest : two jobs of one digest have the same result; scene : as of the cell; reading : further options of `open_sequence`
+    goes_on : resume an unfinished run
     refusal : why the recording cannot be read, empty when it can
     """
 
@@ -76,26 +76,26 @@ class Job:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Display name."""
         return f"{self.sequence} {self.method} seed {self.seed}"
 
     @property
     def state_file(self) -> Path:
-        """Beside the run folder, because it outlives a run that could not even make its folder."""
+        """State file beside the run folder, which exists even if the run could not make its folder."""
         return self.folder.with_name(f"{self.folder.name}.json")
 
 
 def run_folder(out: Path, sequence: str, method: str, seed: int) -> Path:
-    """Where a run of the study lies."""
+    """Folder of a run of the study."""
     return out / "runs" / sequence / f"{method}-s{seed}"
 
 
 def expand(
     cells: Sequence[Cell], variants: Sequence[Variant], seeds: Sequence[int], out: Path, command: str
 ) -> list[Job]:
-    """All jobs, methods innermost, so that what slows the machine for a while meets all methods alike.
+    """All jobs, methods innermost, so that a slow phase of the machine affects all methods alike.
 
-    A recording is run once per seed by a method that draws, and once by one that does not; a simulated cell has its seed.
+    A recording is run once per seed by a random method, and once by a deterministic one. A simulated cell has its seed.
     """
     jobs = []
     for cell in cells:
@@ -128,7 +128,7 @@ def recorded_cell(
     data_root: Path | None = None,
     own: ScanRange = AS_CONFIGURED,
 ) -> Cell:
-    """A recording that is there; `own` : which of its scans are used.
+    """Cell of an existing recording; `own` : its ranges of scans.
 
     Raises InputError when it cannot be opened, or has no IMU and some run asks for one; UsageError when it ends before `own`.
     """
@@ -139,12 +139,12 @@ def recorded_cell(
 
 
 def label_of(path: Path) -> str:
-    """What a recording goes by that is not opened: the name of its file or folder."""
+    """Label of a recording that is not opened: the name of its file or folder."""
     return file_safe(stem_of(path))
 
 
 def scene_cell(scene: Scene, seed: int, parent: Path, own: ScanRange = AS_CONFIGURED) -> Cell:
-    """A simulation that may still have to be made, below `parent`; its digest says what it will hold, IMU included.
+    """Cell of a simulation below `parent` that may still have to be made; its digest covers the future content and the IMU.
 
     Raises UsageError, ConfigError or InputError for a scenario that is none.
     """
@@ -152,9 +152,9 @@ def scene_cell(scene: Scene, seed: int, parent: Path, own: ScanRange = AS_CONFIG
 
 
 def fitted_scene(scene: Scene, needed: int | None, own: ScanRange, seeds: Sequence[int]) -> Scene:
-    """The scene with the scans that are needed, unless it says how many; all of its way where skipping leads beyond it.
+    """Scene with the number of scans that the study needs, unless it states one; its whole path if skipping needs more.
 
-    own : which scans are used, over the configurations; seeds : of the simulations, whose ways differ a little
+    own : ranges of scans, overriding the configurations; seeds : of the simulations, whose paths differ a little
     Raises UsageError when the scenario ends before them.
     """
     if scene.scans is not None:

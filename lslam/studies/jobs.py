@@ -1,4 +1,4 @@
-"""Jobs of a grid as tasks: those that are finished are kept, the others run and leave a state, whatever happens to them."""
+"""Jobs of a grid as tasks: finished ones are kept, the others run, and each leaves a state even if it crashes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ASKED = 32
 
 
 def finished(jobs: Sequence[Job]) -> set[Path]:
-    """Folders of the jobs that were run before by the same configuration, input and version."""
+    """Folders of the jobs that were finished before by the same configuration, input and version."""
     # Of storage, where each answer takes its time, many are asked for together.
     with ThreadPoolExecutor(_ASKED if any(isinstance(job.folder, RemotePath) for job in jobs) else 1) as pool:
         known = pool.map(lambda job: is_reusable(job.state_file, job.folder, job.digest), jobs)
@@ -35,7 +35,7 @@ def finished(jobs: Sequence[Job]) -> set[Path]:
 
 
 def pool_of(most_at_once: int, count: int, *, is_persistent: bool = False, tries: int = 1) -> WorkerPool:
-    """Who makes `count` runs when the user asks for `most_at_once`: no more than there are cores."""
+    """Worker pool for `count` runs, of at most `most_at_once` at once and no more than there are cores."""
     cores = os.cpu_count() or 1
     at_once = max(1, min(most_at_once, cores, count))
     if most_at_once > cores:
@@ -53,10 +53,10 @@ def run_jobs(
     on_done: Callable[[Job], None] = lambda job: None,
     work: Callable[[Job, WorkerContext], None] = execute,
 ) -> None:
-    """Run jobs in processes beside this one; on_done(job) is called here once per job, when its state is there.
+    """Run jobs in worker processes; on_done(job) is called in this process once per job, when its state file exists.
 
-    Several at once begin with those that use most scans. Every job then has a state file; one whose process died is
-    `crashed`. KeyboardInterrupt ends all that run.
+    With several at once, the longest jobs begin. A job whose process died has the state `crashed`. KeyboardInterrupt ends all
+    running jobs.
     """
     if not jobs:
         return
@@ -84,13 +84,13 @@ def run_jobs(
 
 
 def said_file(folder: Path) -> Path:
-    """Where what a process prints is kept that makes the run in `folder`: beside it, on this machine."""
+    """File for the output of the process of the run in `folder`, beside it, on this machine."""
     place = spool_of(folder) if isinstance(folder, RemotePath) else folder
     return place.with_name(f"{place.name}.out")
 
 
 def ensure_state(job: Job, cause: str, context: WorkerContext) -> None:
-    """See to it that a job that was run has a state, and say so when it went wrong."""
+    """Write a state for a job that left none, and log its failure."""
     state = read_state(job.state_file)
     if state is None:
         reason = cause or "the process left no result"
@@ -101,14 +101,14 @@ def ensure_state(job: Job, cause: str, context: WorkerContext) -> None:
 
 
 def clear_attempt(job: Job) -> None:
-    """What an earlier attempt left may be no run at all: a folder without a manifest must not stand in the way."""
+    """Remove remains of an earlier attempt: a folder without a manifest would block the run."""
     if not isinstance(job.folder, RemotePath) and job.folder.is_dir() and not (job.folder / "manifest.json").is_file():
         shutil.rmtree(job.folder, ignore_errors=True)
     job.state_file.unlink(missing_ok=True)
 
 
 class Engine(Protocol):
-    """Makes runs somewhere, `at_once` of them together."""
+    """Interface for making runs, `at_once` of them together."""
 
     @property
     def at_once(self) -> int:
@@ -116,19 +116,19 @@ class Engine(Protocol):
         ...
 
     def prepare(self, jobs: Sequence[Job], progress: StudyProgress) -> None:
-        """Do what several jobs need, once."""
+        """Do work that several jobs need, once."""
         ...
 
     def run(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> None:
-        """Make every run; on_done(job) is called here, once per job, when its state is beside its folder on this machine."""
+        """Make every run; on_done(job) is called here once per job, when its state file is on this machine."""
         ...
 
 
 @dataclass(frozen=True)
 class Local:
-    """Processes of this machine, `most_at_once` of them and no more than there are cores.
+    """Engine of worker processes on this machine, at most `most_at_once` and no more than there are cores.
 
-    is_persistent : they go on with one run after the other, with kernels compiled, data read and one thread
+    is_persistent : processes make several runs, with kernels compiled, data cached and one thread
     title : of the progress bar
     """
 
@@ -138,15 +138,15 @@ class Local:
 
     @property
     def at_once(self) -> int:
-        """As many as are asked for and there are cores."""
+        """Number of worker processes."""
         return min(self.most_at_once, os.cpu_count() or 1)
 
     def prepare(self, jobs: Sequence[Job], progress: StudyProgress) -> None:
-        """Simulate what is not there yet, scenarios side by side."""
+        """Simulate the missing scenes, in parallel."""
         simulate_scenes(jobs, self.most_at_once, progress)
 
     def run(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> None:
-        """As `run_jobs`; a run whose process died is begun once more."""
+        """As `run_jobs`; a run whose process died is tried once more."""
         run_jobs(
             jobs,
             pool_of(self.most_at_once, len(jobs), is_persistent=self.is_persistent, tries=2),
@@ -157,9 +157,9 @@ class Local:
 
 
 def simulate_scenes(jobs: Sequence[Job], most_at_once: int, progress: StudyProgress) -> None:
-    """Simulate the scenes of jobs that are not there yet, each in a process of its own.
+    """Simulate the missing scenes of jobs, each in a process of its own.
 
-    What cannot be simulated is tried again by its runs, which then say why they failed.
+    A failed simulation is tried again by its runs, which then report the reason.
     """
     missing = {job.path: job for job in jobs if job.scene is not None and not job.path.is_dir()}
     if not missing:

@@ -1,4 +1,4 @@
-"""The output folder of a comparison, study or batch: where runs go, and how the folder is taken and left."""
+"""Output folder of a comparison, study or batch: options, locking and cleaning up."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ COMPARISON, STUDY, BATCH = "compare.json", "study.toml", "batch.toml"
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Where runs go.
+    """Options of the output folder.
 
     overwrite : run everything anew; resume : keep finished runs, go on with the others
     scenes : where simulations lie, None for a folder in `out`; studies of the same scenarios can share them
@@ -31,7 +31,7 @@ class OutputOptions:
 
 
 def lock_output(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> None:
-    """Take the output folder, or raise as `require_free`; the file `mark` tells `what` it is, and is the caller's to write."""
+    """Make the output folder, or raise as `require_free`; the caller writes the file `mark`, which identifies `what` it holds."""
     require_free(out, mark, what, overwrite, resume)
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -40,7 +40,7 @@ def lock_output(out: Path, mark: str, what: str, overwrite: bool, resume: bool) 
 
 
 def require_free(out: Path, mark: str, what: str, overwrite: bool, resume: bool) -> None:
-    """Raise OutputExistsError for a file, a folder of something else, or one that holds runs and may not be gone on with.
+    """Raise OutputExistsError for a file, a foreign folder, or one with runs that may not be resumed.
 
     UsageError for `overwrite` and `resume` at once; OutputError when it cannot be read.
     """
@@ -62,7 +62,7 @@ def require_free(out: Path, mark: str, what: str, overwrite: bool, resume: bool)
 
 
 def release_output(out: Path, mark: str) -> None:
-    """Leave nothing behind when nothing was begun, so that the command can be given again."""
+    """Remove an output folder that holds nothing but its `mark`, so that the command can be repeated."""
     with contextlib.suppress(OSError):
         inside = [path.name for path in out.iterdir()]
         if inside == [mark]:

@@ -1,4 +1,4 @@
-"""Over seeds and sequences: means with their spread, and methods against a reference pair by pair."""
+"""Statistics over seeds and sequences: means with their spread, and paired comparisons with a reference."""
 
 from __future__ import annotations
 
@@ -70,6 +70,7 @@ def compare_pairs(
 
 
 def _run_of(table: dict[tuple[str, str, int], RunScore], sequence: str, method: str, seed: int) -> RunScore | None:
+    """Run of a method with this seed, or its only run on the sequence, which stands for all seeds."""
     own = table.get((sequence, method, seed))
     if own is not None:
         return own
@@ -99,7 +100,7 @@ def _judge(method: str, reference: str, pairs: list[tuple[RunScore, RunScore]]) 
 
 
 def _errors(a: RunScore, b: RunScore) -> tuple[float, float] | None:
-    """ATE rmse of both under the first alignment that both have; None without ground truth."""
+    """ATE rmse of both, m, under the first alignment that both have; None without ground truth."""
     for name in ALIGNMENTS:
         key = f"ate.{name}"
         if key in a.values and key in b.values:
@@ -108,7 +109,7 @@ def _errors(a: RunScore, b: RunScore) -> tuple[float, float] | None:
 
 
 def _signed_rank(logs: np.ndarray) -> tuple[float, str]:
-    """Two-sided p of the log ratios being symmetric about zero; nan with the reason when there are too few pairs."""
+    """Two-sided p-value that the log ratios are symmetric about zero; nan, with the reason, for too few pairs."""
     if len(logs) < FEWEST_PAIRS:
         return float("nan"), "n too small"
     if not np.any(logs):

@@ -1,4 +1,4 @@
-"""What a comparison compares, checked before anything runs."""
+"""Plan of a comparison, checked before anything runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ONE_TRUTH = "--gt belongs to one recorded sequence: a scenario has its own, and 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be compared.
+    """Sequences, methods and options of a comparison.
 
     truth : replaces the ground truth of the only sequence; jobs : runs at once, with more than one times cannot be compared
     crop : (x, y, size) of the map crop, m, None to choose; overwrite : run everything anew; resume : keep finished runs, go
@@ -49,7 +49,7 @@ class Plan:
 
 
 def check_plan(plan: Plan) -> None:
-    """Raise UsageError for what cannot be compared."""
+    """Raise UsageError for a plan that cannot be run."""
     if not plan.variants:
         raise UsageError("no method is named")
     if not plan.subjects:
@@ -62,7 +62,7 @@ def check_plan(plan: Plan) -> None:
 
 
 def check_numbers(seeds: Sequence[int], jobs: int, crop: tuple[float, float, float] | None) -> None:
-    """Raise UsageError for what of a plan makes no sense by itself."""
+    """Raise UsageError for numbers of a plan that are out of range."""
     if len(set(seeds)) < len(seeds) or not seeds or min(seeds) < 0:
         raise UsageError(f"--seeds {','.join(map(str, seeds))}: different whole numbers from 0, for example 0,1,2")
     if jobs < 1:

@@ -1,4 +1,4 @@
-"""The rows of a study on their way to results.csv and results.parquet."""
+"""Rows of a study, collected from its runs for results.csv and results.parquet."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _MANY, _PARTS = 1000, 10
 
 
 def collect_run(job: Job, is_reused: bool = False) -> RunScore:
-    """The score of a job that has ended, whatever it ended with; what cannot be read is a failure with its reason."""
+    """Score of a job that has ended in any way; unreadable results give a failure with the reason."""
     state = read_state(job.state_file)
     if state is None:
         return RunScore(job.sequence, job.method, job.seed, job.folder, "crashed", "the process left no state behind")
@@ -58,12 +58,13 @@ def collect_run(job: Job, is_reused: bool = False) -> RunScore:
     if state.status not in FINAL:
         return score  # what lies in the folder may be an earlier run's
     try:
-        return _filled(score, state)
+        return _with_values(score, state)
     except (InputError, KeyError, TypeError) as error:
         return replace(score, status="failed", reason=f"its results cannot be read: {error}")
 
 
-def _filled(score: RunScore, state: State) -> RunScore:
+def _with_values(score: RunScore, state: State) -> RunScore:
+    """Score of a usable run with its numbers, times and machine."""
     manifest = _read_json(score.folder / "manifest.json")
     timing = read_timing(score.folder / "timing.csv")
     values = {key: float(n) for key, n in manifest["counts"].items()} | _times(timing)
@@ -91,7 +92,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _times(timing: Timing) -> dict[str, float]:
-    """Milliseconds per scan; the factor is recorded time over processing time."""
+    """Times per scan, ms, and the real-time factor: recorded time over processing time."""
     values = {"time.total": 1e3 * timing.total.median, "time.p95": 1e3 * timing.total.p95}
     values |= {"time.mean": 1e3 * timing.total.mean, "time.max": 1e3 * timing.total.max}
     for name, stage in timing.stages.items():
@@ -104,7 +105,7 @@ def _times(timing: Timing) -> dict[str, float]:
 
 
 def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) -> str:
-    """Errors of evaluation.json into `values`; the reason when there are none."""
+    """Add the errors of evaluation.json to `values`. Returns the reason when there are none."""
     score = _read_json(path) if path.is_file() else {}
     for key in ("entropy", "plane_variance"):
         if score.get("map", {}).get(key) is not None:
@@ -123,7 +124,7 @@ def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) 
 
 
 def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[Metric]:
-    """Every number the runs may have, in the order of the table; those for programs alone come last."""
+    """All numbers that the runs may have, in the order of the table; those for programs alone come last."""
     errors = [metric for entry in METRICS for metric in entry.compared(configs)]
     stages = list(dict.fromkeys(name for run in runs for name in run.stages))
     return [
@@ -148,7 +149,7 @@ def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[
 
 
 def _more(key: str, unit: str, group: Group) -> Metric:
-    """What stands in CSV and JSON only."""
+    """Numbers that only CSV and JSON show."""
     return Metric(key, key, unit, group, is_main=False)
 
 
@@ -168,16 +169,16 @@ class Results:
 
     @property
     def rows(self) -> list[StudyRow]:
-        """Of all runs that have ended."""
+        """Rows of all runs that have ended."""
         return [self._rows[k] for k in sorted(self._rows)]
 
     def check(self) -> None:
-        """Raise InputError when the files are there and another version of lslam wrote them."""
+        """Raise InputError when the files exist and are of another version of lslam."""
         if (self.out / RESULTS).is_file():
             read_study_csv(self.out / RESULTS)
 
     def add(self, jobs: Sequence[Job]) -> None:
-        """Take up the runs of jobs that have ended and write the files; raises OutputError."""
+        """Add the runs of jobs that have ended and write the files. Raises OutputError."""
         for job in jobs:
             self._rows[self._order[job.folder]] = self._row(job)
         self._is_behind = True
@@ -185,7 +186,7 @@ class Results:
             self.flush()
 
     def flush(self) -> None:
-        """Write what the files are behind; raises OutputError."""
+        """Write rows that are not in the files yet. Raises OutputError."""
         if not self._is_behind:
             return
         began = time.monotonic()
@@ -234,12 +235,12 @@ class Results:
 
 
 def _seen_from(out: Path, folder: Path) -> str:
-    """The folder of a run as a reader of the table finds it: relative where both are of one storage or this machine's."""
+    """Folder of a run for a reader of the table: relative if both are on one disk or in one storage."""
     if isinstance(folder, RemotePath) or isinstance(out, RemotePath):
         return folder.relative_to(out).as_posix() if folder.is_relative_to(out) else str(folder.absolute())
     return Path(os.path.relpath(folder, out)).as_posix()
 
 
 def is_comparable(state: State) -> bool:
-    """Whether the times of a run are its own: a core to itself, which nobody else took away."""
+    """Whether a run's times can be compared: it had a core to itself, without other load."""
     return state.is_alone and state.waited <= _MOST_WAITED

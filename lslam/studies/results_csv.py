@@ -1,4 +1,4 @@
-"""results.csv, one row per run of a study, and how each of its jobs ended, in a small file beside its run folder.
+"""results.csv, one row per run of a study; and the state file of each job, beside its run folder.
 
 The first column is the version of the file. Studied parameters are columns named by their configuration key, `input.skip_frames`;
 stages are columns `stage_ms.NAME`. An empty cell is a number that is not there, or a parameter that the run was not given.
@@ -66,7 +66,7 @@ def read_state(path: Path) -> State | None:
 
 
 def is_reusable(path: Path, folder: Path, digest: str) -> bool:
-    """Whether the job was finished before, by the same configuration, input and version, and its folder is still there."""
+    """Whether the job has finished with the same configuration, input and version, and its folder exists."""
     state = read_state(path)
     return (
         state is not None and state.digest == digest and state.status in FINAL and (folder / "manifest.json").is_file()
@@ -84,7 +84,7 @@ _PLAIN = {f.name: str(f.type) for f in fields(StudyRow) if f.name not in ("param
 
 
 def study_columns(rows: Sequence[StudyRow]) -> dict[str, list[Value | None]]:
-    """The table by column, parameters after `method` and stages last; None where a cell is empty."""
+    """Columns of the table by name, parameters after `method` and stages last; None where a cell is empty."""
     parameters = list(dict.fromkeys(key for row in rows for key in row.parameters))
     stages = list(dict.fromkeys(key for row in rows for key in row.stages_ms))
     names = list(_PLAIN)
@@ -95,7 +95,7 @@ def study_columns(rows: Sequence[StudyRow]) -> dict[str, list[Value | None]]:
     for name in parameters:
         table[name] = [row.parameters.get(name) for row in rows]
     for name in (*names[place:], *DERIVED):
-        table[name] = [_known(getattr(row, name)) for row in rows]
+        table[name] = [_none_if_nan(getattr(row, name)) for row in rows]
     for name in stages:
         table[STAGE + name] = [row.stages_ms.get(name) for row in rows]
     return table
@@ -151,7 +151,7 @@ def _row(cells: dict[str, str]) -> StudyRow:
     return StudyRow(**values, parameters=parameters, stages_ms=stages)
 
 
-def _known(value: Value) -> Value | None:
+def _none_if_nan(value: Value) -> Value | None:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
@@ -162,6 +162,7 @@ def _text(value: Value | None) -> str:
 
 
 def _truth(text: str) -> bool:
+    """Boolean in a cell, `true` or `false`. Raises ValueError for another text."""
     if text not in ("true", "false"):
         raise ValueError(f"{text!r} is neither true nor false")
     return text == "true"
@@ -172,7 +173,7 @@ def _number(text: str) -> float:
 
 
 def _value(text: str) -> Value:
-    """A parameter as it was: a whole number stays one."""
+    """Parameter parsed from a cell: whole numbers stay int."""
     if text in ("true", "false"):
         return text == "true"
     number = _NUMBER.fullmatch(text)

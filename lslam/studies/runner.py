@@ -1,4 +1,4 @@
-"""Tasks in processes beside this one, a few at once: one that dies takes nothing with it but its task."""
+"""Tasks in worker processes, a few at once: a crash affects only its own task."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PATIENCE_S = 20.0
 
 @dataclass(frozen=True)
 class StudyProgress:
-    """How a caller follows a study: on_start(stage, steps, unit, how many are made at once), then on_step(note) per step."""
+    """Progress callbacks of a study: on_start(stage, steps, unit, number made at once), then on_step(note) per step."""
 
     on_start: Callable[[str, int, str, int], None] = lambda stage, total, unit, at_once: None
     on_step: Callable[[str], None] = lambda note: None
@@ -31,7 +31,9 @@ class StudyProgress:
 
 @dataclass(frozen=True)
 class Task:
-    """work : called without arguments in the process, so it must be picklable; said : file for what the process prints.
+    """Task for a worker.
+
+    work : called without arguments in the process, so it must be picklable; said : file for the output of the process
 
     data : what it reads, empty when a process that did something before is as good as a new one
     """
@@ -44,7 +46,7 @@ class Task:
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """Which processes do the work.
+    """How worker processes make tasks.
 
     at_once : tasks together; is_persistent : a process goes on with the next task, so that its kernels stay compiled and its data
         read, and has one thread, so that it needs one core; otherwise each task has a new process
@@ -67,7 +69,7 @@ class _Worker:
 def run_tasks(
     tasks: Sequence[Task], pool: WorkerPool, on_start: Callable[[int], None], on_end: Callable[[int, str], None]
 ) -> None:
-    """Run every task; on_start(index) and, once per task, on_end(index, how its process died or "") are called here.
+    """Run every task; on_start(index) and, once per task, on_end(index, cause of the process's death or "") are called here.
 
     They begin in order, but for a process that goes on with what it has read as long as there is such a task, and turns to
     what no other has read before it reads what another has.
@@ -106,7 +108,7 @@ def run_tasks(
 
 
 def _choice(data: Sequence[str], worker: _Worker | None, workers: Sequence[_Worker]) -> int:
-    """Which of the waiting tasks, by what they read: one whose data the worker has, else nobody, else the first."""
+    """Index of the next task: one whose data this worker has cached, else data that no worker has, else the first."""
     own = set() if worker is None else worker.has_read
     of_all = {name for other in workers for name in other.has_read}
     wanted = (name in own for name in data), (name not in of_all for name in data)
@@ -124,7 +126,7 @@ def _hire(pool: WorkerPool) -> _Worker:
 
 
 def _ending(worker: _Worker, said: Path, is_persistent: bool) -> str | None:
-    """None when the process is ready for more; otherwise it is gone, and how: empty when it came to its end."""
+    """None when the process is ready for more, else the cause of its death; empty when it ended normally."""
     try:
         worker.pipe.recv()
         if is_persistent:
@@ -141,7 +143,7 @@ def _ending(worker: _Worker, said: Path, is_persistent: bool) -> str | None:
 
 @contextlib.contextmanager
 def _thread_limits(pool: WorkerPool) -> Iterator[None]:
-    """What a process that starts now shall know before it imports anything: its share of the cores."""
+    """Environment that limits the threads of a new process to its share of the cores, read at import."""
     share = "1" if pool.is_persistent else str(max(1, (os.cpu_count() or 1) // pool.at_once))
     limits = {"NUMBA_NUM_THREADS": "1"}
     if pool.at_once > 1 or pool.is_persistent:
@@ -158,7 +160,7 @@ def _thread_limits(pool: WorkerPool) -> Iterator[None]:
 
 
 def _child(pipe: Connection) -> None:
-    """In the new process: Ctrl-C is the parent's, which then asks with SIGTERM; results on stdout are the parent's too."""
+    """Main loop of a worker process; it ignores Ctrl-C, since the parent then sends SIGTERM."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
     # A group that is ended asks twice, the system and the parent; who has no patience left kills.
@@ -186,7 +188,7 @@ def _do(task: Task) -> None:
 
 
 def _follow_parent() -> None:
-    """A study killed at once leaves nobody behind who goes on computing and holds the run folder."""
+    """End this process if the parent dies, so that none goes on computing and holding the run folder."""
     parent = parent_process()
     if parent is not None:
         parent.join()
@@ -194,7 +196,7 @@ def _follow_parent() -> None:
 
 
 def _cause(exit_code: int | None, said: Path) -> str:
-    """How the process died, in one sentence; empty when it came to its end."""
+    """Cause of the process's death in one sentence; empty when it ended normally."""
     if exit_code in (0, None):
         return ""
     assert exit_code is not None

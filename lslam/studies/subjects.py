@@ -1,4 +1,4 @@
-"""What a study runs on: recordings found on disk, and scenarios that are simulated once per seed."""
+"""Subjects of a study: recordings on disk, and scenarios that are simulated once per seed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scenario as `lslam simulate` takes it; what is None stays as the scenario says.
+    """Scenario with the options of `lslam simulate`; None keeps the scenario's own value.
 
     scans : of the recording; columns : firings per scan; speed : m/s; compensated : scans without motion in them
     """
@@ -47,7 +47,7 @@ class Scene:
 
 
 def scene_digest(scene: Scene, seed: int) -> str:
-    """Digest of all that decides the bytes of the recording, without making it.
+    """Digest of all parameters that determine the bytes of the recording, without making it.
 
     Raises UsageError, ConfigError or InputError for a scenario that is none.
     """
@@ -60,7 +60,7 @@ def scene_digest(scene: Scene, seed: int) -> str:
 
 
 def scene_folder(scene: Scene, seed: int, parent: Path) -> Path:
-    """The sequence folder of the recording below `parent`, whether it is there or not."""
+    """Sequence folder of the recording below `parent`, existing or not."""
     plain = scene == Scene(scene.scenario, scene.scans) and not scene.scenario.endswith(".toml")
     mark = "" if plain else f"-{scene_digest(scene, seed)[:8]}"
     return parent / f"{scene.name}-{seed}{'' if scene.scans is None else f'-{scene.scans}'}{mark}" / "sequences" / "00"
@@ -94,7 +94,7 @@ def simulate_once(
 
 
 def drive_of(scene: Scene, seed: int) -> SimulatedDrive:
-    """The drive with its scans still to be traced; raises what `simulate` raises."""
+    """Simulated drive whose scans are still to be made. Raises what `simulate` raises."""
     from lslam.simulation.lidar_models import lidar_named
     from lslam.simulation.scenarios import simulate
     from lslam.simulation.sensors import GnssModel
@@ -126,7 +126,7 @@ class Subject:
 def find_subjects(
     words: Iterable[str], data_root: Path | None = None, ranges: Mapping[str, ScanRange] | None = None
 ) -> list[Subject]:
-    """What the user named, in that order: paths and names of recordings, else names of scenarios.
+    """Subjects by the user's words, in that order: paths and names of recordings, else names of scenarios.
 
     ranges : which scans are used, by word, over the configuration
     Raises UsageError for what is named twice, InputError for what is neither, or cannot be opened.
@@ -165,9 +165,9 @@ def _with_unique_labels(subjects: list[Subject]) -> list[Subject]:
 
 
 def unique_labels(labels: Sequence[str], paths: Sequence[Path | None]) -> list[str]:
-    """Labels of recordings, None for a simulation; one for each path.
+    """One distinct label per path of a recording; None for a simulation.
 
-    Those of one name are told apart by the part of their paths in which all of them differ, or by a number.
+    Equal names are distinguished by the part of their paths in which all differ, or by a number.
     """
     taken: dict[str, list[Path | None]] = {}
     for label, path in zip(labels, paths, strict=True):
@@ -191,7 +191,7 @@ def unique_labels(labels: Sequence[str], paths: Sequence[Path | None]) -> list[s
 
 
 def used(scans: int, config: InputConfig) -> int:
-    """Scans of a recording that a run uses.
+    """Number of scans of a recording that a run uses.
 
     >>> used(20, InputConfig(start=1, skip_frames=4)), used(20, InputConfig(count=3))
     (5, 3)
@@ -201,12 +201,12 @@ def used(scans: int, config: InputConfig) -> int:
 
 
 def with_range(config: Config, own: ScanRange) -> Config:
-    """The configuration with the scans of one sequence."""
+    """Configuration with the range of scans of one sequence."""
     return config.model_copy(update={"input": config.input.model_copy(update=own.own)}) if own.own else config
 
 
 def check_range(name: str, own: ScanRange, scans: int) -> None:
-    """Raise UsageError when a sequence of so many scans ends before what was asked of it."""
+    """Raise UsageError when a sequence of so many scans ends before the requested range."""
     if own.own and own.last >= scans:
         said = ", ".join(f"{key} = {value}" for key, value in own.own.items())
         raise UsageError(f"sequence {name} has {scans} scans: {said} goes beyond its end")

@@ -25,7 +25,7 @@ log = logging.getLogger("lslam")
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is to be studied where; settings : "a.b=v" over what the study says."""
+    """Study, sequences and options of a sweep; settings : "a.b=v", overriding those of the study."""
 
     study: StudyConfig
     output: OutputOptions

@@ -34,7 +34,7 @@ _ALWAYS = (
 
 @dataclass(frozen=True)
 class Variant:
-    """One resolved configuration of a comparison, study or batch.
+    """Resolved configuration of a comparison, study or batch.
 
     name : for tables and folders, unique; method : of the method or preset, without its IMU
     without : name of the same variant without the IMU, where `both` were asked for

@@ -212,11 +212,13 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     stop = current()
 
     def be_gentle(stage: str, scans: int) -> None:
+        """Let a signal end the run after the scan in work, from the first stage on."""
         stop.is_gentle = True
 
     watch = Watch(be_gentle, on_end=ended.append, should_stop=stop)
 
     def make(goes_on: bool) -> None:
+        """Make the run, or resume it; a failed gate of its own does not count here."""
         # A gate of the run's own (input.strict): it is done all the same.
         with contextlib.suppress(GateError):
             run(

@@ -181,11 +181,11 @@ class ChunkFile:
             return self.read(offset, max(min(size, self.size - offset), 0))
         if not chunk.compression:
             return self.read(chunk.position + offset, max(min(size, chunk.length - offset), 0))
-        return self._unpacked(chunk, min(offset + size, chunk.length) if is_head else chunk.length)[
+        return self._decompress(chunk, min(offset + size, chunk.length) if is_head else chunk.length)[
             offset : offset + size
         ]
 
-    def _unpacked(self, chunk: Chunk, least: int) -> bytes:
+    def _decompress(self, chunk: Chunk, least: int) -> bytes:
         """Decompressed records of a chunk, at least the first `least` bytes of them."""
         kept, records = self._kept
         if kept == chunk.position and len(records) >= least:

@@ -144,7 +144,7 @@ class Bag:
         """
         recording, part, row = topic.place(k)
         data = recording.read(part, row, limit)
-        return _unpacked(recording, part, row, limit) if data[:4] == _ZSTD else data
+        return _decompress(recording, part, row, limit) if data[:4] == _ZSTD else data
 
     def each(
         self, topic: BagTopic, read: Callable[[bytes], T], problems: list[str], limit: int | None = None
@@ -181,10 +181,7 @@ class Bag:
 
 
 def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[Recording]:
-    """Open the files.
-
-    The reasons why some cannot be opened are added to `losses`. Raises InputError where none can.
-    """
+    """Open the files. The reasons why some cannot be opened are added to `losses`. Raises InputError where none can."""
     packed: list[str] = []
     recordings: list[Recording] = []
     failures: list[InputError] = []
@@ -285,10 +282,7 @@ def read_header(topic: BagTopic, data: bytes) -> Header:
 
 @cache
 def typestore(encoding: str) -> Any:
-    """Standard message types of ROS.
-
-    Their layout never changed, so the definitions stored in a bag are not needed.
-    """
+    """Standard message types of ROS. Their layout never changed, so the definitions stored in a bag are not needed."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
@@ -297,7 +291,7 @@ def typestore(encoding: str) -> Any:
     return store
 
 
-def _unpacked(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
+def _decompress(recording: Recording, topic: Topic, k: int, limit: int | None) -> bytes:
     """Decompress a message that was compressed on its own; its beginning lies in the first block."""
     packed = recording.read(topic, k, None if limit is None else _ZSTD_BLOCK)
     try:

@@ -32,7 +32,9 @@ def list_bag_files(path: Path) -> list[Path]:
         return []
     files = [p for p in path.iterdir() if suffix_of(p) and p.is_file() and not p.name.startswith(".")]
     plain = {p.name for p in files}
-    return sorted((p for p in files if p.name == _unpacked(p.name) or _unpacked(p.name) not in plain), key=_natural)
+    return sorted(
+        (p for p in files if p.name == _unpack_name(p.name) or _unpack_name(p.name) not in plain), key=_natural
+    )
 
 
 def left_out(path: Path, files: list[Path]) -> list[str]:
@@ -44,8 +46,8 @@ def left_out(path: Path, files: list[Path]) -> list[str]:
     for name in sorted(p.name for p in path.iterdir() if p.name[0] != "."):
         if name in names or name.endswith(_COMPANIONS):
             continue
-        if _unpacked(name) in names:
-            sentences.append(f"{name} is left out: {_unpacked(name)} is the same part, not compressed")
+        if _unpack_name(name) in names:
+            sentences.append(f"{name} is left out: {_unpack_name(name)} is the same part, not compressed")
         elif inner := next((s for s in SUFFIXES if f"{s}." in name.lower()), None):
             ending = name.lower().rpartition(f"{inner}.")[2]
             sentences.append(f"{name} is not read: .{ending} is no ending of a bag nor of a compression that is known")
@@ -57,7 +59,7 @@ def missing_parts(path: Path, files: list[Path]) -> list[str]:
     sentences = []
     series: dict[str, dict[int, Path]] = {}
     for file in files:
-        if (own := _numbered(file)) is not None:
+        if (own := _part_number(file)) is not None:
             series.setdefault(own[0], {})[own[1]] = file
     for name, numbers in series.items():
         have = sorted(numbers)
@@ -73,21 +75,21 @@ def missing_parts(path: Path, files: list[Path]) -> list[str]:
         first = 0 if name == path.name else 1
         if have[0] > first and (len(have) > 1 or first == 0):
             sentences.append(f"the first part in {path} is {numbers[have[0]].name}: those before it are missing")
-    return sentences + _unlisted(path, files)
+    return sentences + _missing_by_metadata(path, files)
 
 
 def parts_beside(path: Path) -> list[Path]:
     """Other parts of a split recording: files beside `path` whose names differ only in the number at the end."""
-    own = _numbered(path)
+    own = _part_number(path)
     if own is None:
         return []
     beside = (p for p in path.parent.iterdir() if suffix_of(p) and p != path and p.is_file())
-    return sorted((p for p in beside if (m := _numbered(p)) and m[0] == own[0] and m[1] != own[1]), key=_natural)
+    return sorted((p for p in beside if (m := _part_number(p)) and m[0] == own[0] and m[1] != own[1]), key=_natural)
 
 
 def suffix_of(path: Path) -> str:
     """The suffix that makes a file a bag, compressed or not, empty when it is none."""
-    name = _unpacked(path.name.lower())
+    name = _unpack_name(path.name.lower())
     return next((s for s in SUFFIXES if name.endswith(s)), "")
 
 
@@ -98,22 +100,22 @@ def packing_of(path: Path) -> str:
 
 def stem_of(path: Path) -> str:
     """Name of a file without its bag suffix and its compression suffix."""
-    return _unpacked(path.name)[: -len(suffix_of(path)) or None]
+    return _unpack_name(path.name)[: -len(suffix_of(path)) or None]
 
 
-def _unpacked(name: str) -> str:
+def _unpack_name(name: str) -> str:
     ending = next((e for e in PACKED if name.lower().endswith(e)), "")
     return name[: len(name) - len(ending)]
 
 
-def _numbered(path: Path) -> tuple[str, int] | None:
+def _part_number(path: Path) -> tuple[str, int] | None:
     """Common name of all parts of a recording, and the number of this part; None where the name has none."""
     stem = _TIME.sub("", stem_of(path))
     match = _NUMBER.search(stem)
     return None if match is None or not match[1] else (match[1].rstrip("_-"), int(match[2]))
 
 
-def _unlisted(path: Path, files: list[Path]) -> list[str]:
+def _missing_by_metadata(path: Path, files: list[Path]) -> list[str]:
     """Files that ROS 2's `metadata.yaml`, of any version, lists but that are missing; empty if it cannot be read."""
     if not path.is_dir() or not (path / METADATA).is_file():
         return []
@@ -125,8 +127,8 @@ def _unlisted(path: Path, files: list[Path]) -> list[str]:
         listed = [str(name) for name in tree["rosbag2_bagfile_information"]["relative_file_paths"]]
     except (YAMLError, LookupError, TypeError, ValueError, RecursionError, OSError):
         return []
-    names = {_unpacked(p.name) for p in files}
-    absent = [name for name in (one.rpartition("/")[2] for one in listed) if _unpacked(name) not in names]
+    names = {_unpack_name(p.name) for p in files}
+    absent = [name for name in (one.rpartition("/")[2] for one in listed) if _unpack_name(name) not in names]
     if not absent:
         return []
     are = "is" if len(absent) == 1 else "are"

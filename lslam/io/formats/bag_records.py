@@ -69,7 +69,7 @@ class ChunkedBag(ABC):
         self._file.expect(self._beside_messages)
         self._walk()
         self._find_missing_names()
-        named = self._named()
+        named = self._empty_topics()
         self.topics = [named[channel] for channel in sorted(named)]
         for channel, topic in named.items():
             if channel in self._pieces:
@@ -139,7 +139,7 @@ class ChunkedBag(ABC):
         """Store the channel, type and encoding that a record of `NAMES` states."""
 
     @abstractmethod
-    def _named(self) -> dict[int, Topic]:
+    def _empty_topics(self) -> dict[int, Topic]:
         """An empty topic for each channel whose name is known."""
 
     def _beside_messages(self) -> Iterator[tuple[int, int]]:
@@ -231,7 +231,7 @@ class ChunkedBag(ABC):
         """Look up channels without a name in the summary and, if the end of the file is lost, in the chunks."""
         for channel, pieces in self._pieces.items():
             for number in range(int(pieces[0][0, 1]), -1, -1):
-                topic = self._named().get(channel)
+                topic = self._empty_topics().get(channel)
                 if topic is not None and topic.type:
                     break
                 chunk = self._chunks[number]

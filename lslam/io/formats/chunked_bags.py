@@ -71,7 +71,7 @@ class Ros1Bag(ChunkedBag):
         topic = Topic(record.head[b"topic"].decode(errors="replace"), kind, "ros1")
         self._connections.setdefault(_number(record.head[b"conn"]), topic)
 
-    def _named(self) -> dict[int, Topic]:
+    def _empty_topics(self) -> dict[int, Topic]:
         return self._connections
 
 
@@ -145,7 +145,7 @@ class McapFile(ChunkedBag):
         name, at = _text(data, 4)
         self._channels[number] = (schema, name, _text(data, at)[0])
 
-    def _named(self) -> dict[int, Topic]:
+    def _empty_topics(self) -> dict[int, Topic]:
         return {
             channel: Topic(name, _type(self._schemas.get(schema, "")), encoding)
             for channel, (schema, name, encoding) in self._channels.items()

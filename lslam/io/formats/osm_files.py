@@ -182,7 +182,7 @@ def _xml_lines(data: OsmData) -> Iterator[str]:
     for relation in data.relations.values():
         yield f" <relation {_identity(data, 'relation', relation.id)}>\n"
         for m in relation.members:
-            yield f'  <member type="{m.kind}" ref="{m.ref}" role={_quoted(m.role)}/>\n'
+            yield f'  <member type="{m.kind}" ref="{m.ref}" role={_quote(m.role)}/>\n'
         yield from _tag_lines(relation.tags.items())
         yield " </relation>\n"
     yield "</osm>\n"
@@ -194,10 +194,10 @@ def _identity(data: OsmData, kind: str, number: int) -> str:
 
 
 def _tag_lines(tags: Iterable[tuple[str, str]]) -> Iterator[str]:
-    return (f"  <tag k={_quoted(key)} v={_quoted(value)}/>\n" for key, value in tags)
+    return (f"  <tag k={_quote(key)} v={_quote(value)}/>\n" for key, value in tags)
 
 
-def _quoted(text: str) -> str:
+def _quote(text: str) -> str:
     # XML has no way to write most control characters.
     return quoteattr("".join(c for c in text if c.isprintable() or c in "\t\n\u00a0"))
 

@@ -134,7 +134,7 @@ def name_columns(tables: Sequence[NDArray[Any]]) -> tuple[str, ...]:
     A ring is a small whole number that goes with the elevation; times run through a sweep in the order of the points; the first
     column of other values that are not negative is the intensity. Of four columns the last is the intensity where it is neither.
     """
-    scans = [_measured(np.asarray(table, np.float64)) for table in tables]
+    scans = [_valid_rows(np.asarray(table, np.float64)) for table in tables]
     names = ["x", "y", "z"]
     count = tables[0].shape[1]
     for k in range(3, count):
@@ -157,7 +157,7 @@ def _whole(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> list[Floa
     return [np.column_stack([table[str(k)].astype(np.float64) for k in range(len(record.names))]) for table in tables]
 
 
-def _measured(table: Floats) -> Floats:
+def _valid_rows(table: Floats) -> Floats:
     """Rows whose points are finite and not the origin."""
     points = table[:, :3]
     return np.asarray(table[np.isfinite(points).all(1) & (points != 0).any(1)])
@@ -181,7 +181,7 @@ def _faults(record: PointRecord, files: Sequence[NDArray[np.uint8]]) -> tuple[st
     tables = _whole(record, files)
     if not tables:
         return f"{len(files[0])} bytes are no multiple of {record.size}", ""
-    scans = [_measured(table) for table in tables]
+    scans = [_valid_rows(table) for table in tables]
     if sum(map(len, scans)) < _MIN_POINTS:
         return None
     return _impossible(record, scans), _unlikely(scans)

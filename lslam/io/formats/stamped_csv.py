@@ -70,10 +70,7 @@ def read_stamped_csv(
 
 
 def _order(stamps: Longs, values: Floats) -> NDArray[np.intp] | None:
-    """Row order by stamp, duplicates once.
-
-    None where rows are in order already, or where a clock was set back.
-    """
+    """Row order by stamp, duplicates once. None where rows are in order already, or where a clock was set back."""
     order = np.argsort(stamps, kind="stable")
     rows = np.column_stack([stamps - stamps.min(initial=0), values])[order]
     own = np.ones(len(rows), bool)

@@ -102,7 +102,7 @@ def open_sequence(
     sequence = with_streams(sequence, imu, gnss, data_root)
     if sequence.kind == "bag" or sequence.kind not in READERS:
         return sequence
-    return _merged(sequence, overrides)
+    return _merge_lidars(sequence, overrides)
 
 
 @contextmanager
@@ -114,7 +114,7 @@ def _readable(name: str | Path) -> Iterator[None]:
         raise InputError(f"{error.filename or name} cannot be read: {cause(error)}") from None
 
 
-def _merged(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
+def _merge_lidars(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
     """Sequence merged with the LiDARs in the table `lidars` of its `sequence.toml`. Raises InputError when one is missing."""
     from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo
     from lslam.io.readers.sidecars import read_info

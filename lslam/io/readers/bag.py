@@ -123,10 +123,7 @@ _Lidar = tuple[ScanIndex, BagSequence, Opened | None]
 
 
 def locate(path: Path) -> tuple[Path, str] | None:
-    """Bag at or in `path`, and the reason why it is one.
-
-    None when there is none, or when it lies in one of KITTI's layouts.
-    """
+    """Bag at or in `path`, and the reason why it is one. None when there is none, or when it lies in one of KITTI's layouts."""
     if path.is_dir() and any((path / name).is_dir() for name in _LAYOUTS):
         return None
     files = list_bag_files(path)

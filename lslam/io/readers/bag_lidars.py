@@ -82,7 +82,7 @@ def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voi
     changes = [k for k, (a, b) in enumerate(pairwise(names), 1) if a != b]
     first, *others = (name for name, _ in counts.most_common())
     if wanted not in (None, ALL):
-        chosen = _wished(topic, counts, str(wanted))
+        chosen = _parse_frames(topic, counts, str(wanted))
     elif len(changes) < len(counts):
         if changes:
             voice.problems.append(
@@ -102,7 +102,8 @@ def choose_lidars(topic: BagTopic, names: Sequence[str], wanted: str | None, voi
     return [(name, np.array(names) == name) for name in chosen]
 
 
-def _wished(topic: BagTopic, counts: Counter[str], wanted: str) -> list[str]:
+def _parse_frames(topic: BagTopic, counts: Counter[str], wanted: str) -> list[str]:
+    """Names in the option --lidar-frame, without repetitions. Raises UsageError for a name that the topic lacks."""
     chosen = [name.strip().lstrip("/") for name in wanted.split(",")]
     strange = [name for name in chosen if name not in counts]
     if strange:
@@ -181,7 +182,7 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
     if not len(a) or not len(b):
         return a if len(a) else b
     if later_ns:
-        a, b = _moved(a, 0), _moved(b, later_ns)
+        a, b = _shift_times(a, 0), _shift_times(b, later_ns)
     is_alike = (a.times is None) == (b.times is None) and (a.rings is None) == (b.rings is None)
     if not is_alike or not _is_complement(a.select(is_measured(a.points)), b.select(is_measured(b.points))):
         return None
@@ -201,7 +202,7 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
     return replace(first, clocks=tuple(clocks), **joined)
 
 
-def _moved(cloud: PointCloud, later_ns: int) -> PointCloud:
+def _shift_times(cloud: PointCloud, later_ns: int) -> PointCloud:
     """Cloud with times in ns from an earlier base."""
     clocks = (replace(clock, values=clock.values.astype(np.int64) + later_ns) for clock in cloud.clocks)
     return replace(cloud, clocks=tuple(clocks))

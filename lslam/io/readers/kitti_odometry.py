@@ -75,6 +75,7 @@ def _stamps(folder: Folder) -> tuple[Longs, float]:
 
 
 def _tr(folder: Folder) -> Floats | None:
+    """`T_cam0_lidar` (4, 4) of `calib.txt`; None, with a note, when it is missing."""
     path = folder.path / "calib.txt"
     if not path.is_file():
         folder.voice.notes.append(f"{path} is missing: the camera's place is unknown")

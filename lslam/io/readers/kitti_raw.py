@@ -158,14 +158,14 @@ def _stamps(folder: Folder, oxts: Oxts | None, is_extract: bool) -> tuple[Longs,
         )
         return nominal_stamps(len(folder.files), rate, int(by_oxts[0]) if len(by_oxts) else 0), rate, None
     voice.notes.append("no velodyne_points/timestamps*.txt: scan i goes with OXTS sample i and takes its stamp")
-    even = by_oxts if compensated else _evened(oxts.numbers, by_oxts, folder)
+    even = by_oxts if compensated else _smooth_stamps(oxts.numbers, by_oxts, folder)
     full = np.full(int(oxts.numbers.max()) + 1, -1, np.int64)
     full[oxts.numbers] = even
     source = folder.path / "oxts" / "timestamps.txt"
     return *folder.take_rows(source, even if (full < 0).any() else full), AHEAD
 
 
-def _evened(numbers: Longs, stamps_ns: Longs, folder: Folder) -> Longs:
+def _smooth_stamps(numbers: Longs, stamps_ns: Longs, folder: Folder) -> Longs:
     """Stamps of scans `numbers` with the jitter of OXTS samples removed, since the scanner turns evenly.
 
     The scanner's rate drifts by a thousandth or so, so a line is fitted to the `_EVEN` stamps about each.

@@ -203,7 +203,7 @@ def open_velodyne(path: Path, datagrams: Packets, voice: Voice) -> Opened:
     order = in_order(times, "Velodyne packets", voice)
     which, times = which[order], times[order]
     angle = datagrams.bytes_at(which, (2, 3)).astype(np.int64) @ (1 << np.array([0, 8]))
-    azimuth, rate = _unwrapped(path, angle, times)
+    azimuth, rate = _unwrap(path, angle, times)
     per_packet = BLOCKS // 2 if mode == DUAL else BLOCKS
     end = int(azimuth[-1]) + round(rate * model.block_ns * per_packet)
     turns, counts = np.unique(azimuth // TURN, return_counts=True)
@@ -253,7 +253,7 @@ def _absolute(past_hour_us: Longs, captured_ns: Longs, voice: Voice) -> Longs:
     return within + hours * _HOUR_NS
 
 
-def _unwrapped(path: Path, angle: Longs, times_ns: Longs) -> tuple[Longs, float]:
+def _unwrap(path: Path, angle: Longs, times_ns: Longs) -> tuple[Longs, float]:
     """Azimuths from the first, unwrapped, 0.01 deg, and the rate, 0.01 deg/ns; lost packets are bridged by the rate."""
     steps, spans = np.diff(angle) % TURN, np.diff(times_ns)
     if len(spans) and float(np.abs(spans.astype(np.float64)).max()) > _LONGEST_NS:

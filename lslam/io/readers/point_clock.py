@@ -85,7 +85,7 @@ class PointClock:
             return self._by_itself(cloud, stamp_ns, f"the scan has no field {rule.field!r}, unlike the others")
         if self._is_sound(values, len(cloud)):
             return TimedCloud(cloud, *apply_rule(rule, values, stamp_ns))
-        return self._mended(cloud, values, stamp_ns)
+        return self._repair(cloud, values, stamp_ns)
 
     def first_whole(self, samples: dict[int, Sample]) -> int:
         """Number of the first sample with a sound sweep of the usual length, or else of the first."""
@@ -97,10 +97,11 @@ class PointClock:
         )
         return next(whole, next(iter(samples)))
 
-    def _mended(self, cloud: PointCloud, values: NDArray[Any], stamp_ns: int) -> TimedCloud:
+    def _repair(self, cloud: PointCloud, values: NDArray[Any], stamp_ns: int) -> TimedCloud:
+        """Times of a scan that needs repair: wrapped counters, a step of the clock, or points outside the sweep."""
         rule, width = self.rule, _WIDER * self.rule.sweep
         usable = is_usable(cloud, values)
-        values, over = _unwrapped(values, usable, width)
+        values, over = _unwrap(values, usable, width)
         good = densest(values, usable, width)
         step = _step(values, usable, good, rule.sweep)
         if step is not None:
@@ -190,7 +191,7 @@ def open_clock(
     return clock
 
 
-def _unwrapped(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[Any], int]:
+def _unwrap(values: NDArray[Any], usable: Bools, width: float) -> tuple[NDArray[Any], int]:
     """Values with wrapped counters unwrapped, integers as int64, and the number of usable values that changed."""
     if values.dtype.kind not in "iu":
         return values, 0

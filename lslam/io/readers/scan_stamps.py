@@ -83,7 +83,7 @@ def stamp_scans(
     if not clocks:
         return None
     voice.notes.append(f"scan stamps from {words or clocks[0].name.rstrip(',')}")
-    agreed, raw = _agreed(clocks, voice), clocks[0].stamps_ns
+    agreed, raw = _agreement(clocks, voice), clocks[0].stamps_ns
     for stamps in beside[:1]:
         agreed = onto(stamps, raw, agreed)
     source = clocks[0].name if clocks[0].name == str(path) else files[0].parent
@@ -107,7 +107,7 @@ def _stamps_by_name(files: list[Path], voice: Voice) -> tuple[dict[Path, int], s
     return stamps, f"the file names: {names.words}, as in {min(files, key=stamps.__getitem__).name}"
 
 
-def _agreed(clocks: list[Clock], voice: Voice) -> Stamps:
+def _agreement(clocks: list[Clock], voice: Voice) -> Stamps:
     """First clock with its faults corrected by the others; if that fails, the next one that increases."""
     first, *others = clocks
     stamps = first.stamps_ns
@@ -137,7 +137,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
     """
     count = len(files)
     counts = f"{path} has {len(stamps)} {'times' if path.stem == 'times' else 'stamps'} for {count} scans"
-    rows = _labelled(path, files, len(stamps))
+    rows = _rows_by_name(path, files, len(stamps))
     if rows is not None:
         without = np.count_nonzero(rows < 0)
         if without or len(stamps) != count:
@@ -145,7 +145,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
     elif len(stamps) == count:
         return files, stamps
     else:
-        filled = _filled_gaps(stamps, count)
+        filled = _fill_gaps(stamps, count)
         if filled is not None:
             voice.problems.append(
                 f"{counts}: the lost rows leave gaps of whole intervals, which hold just the {count - len(stamps)} scans "
@@ -164,7 +164,7 @@ def rows_of_scans(path: Path, stamps: Stamps, files: list[Path], voice: Voice) -
     return [file for file, row in zip(files, rows.tolist(), strict=True) if row >= 0], stamps[rows[rows >= 0]]
 
 
-def _labelled(path: Path, files: list[Path], count: int) -> Longs | None:
+def _rows_by_name(path: Path, files: list[Path], count: int) -> Longs | None:
     """(N,) row of each file, -1 for none, by a column that holds file names or numbers; None when there is no such column."""
     cells = [row.text.replace(",", " ").replace(";", " ").split() for row in read_rows(path)[0]][-count:]
     if len(cells) != count or min(map(len, cells)) < 2:
@@ -184,7 +184,7 @@ def _labelled(path: Path, files: list[Path], count: int) -> Longs | None:
     return None
 
 
-def _filled_gaps(stamps: Stamps, count: int) -> Stamps | None:
+def _fill_gaps(stamps: Stamps, count: int) -> Stamps | None:
     """(count,) ns: `stamps` with missing ones interpolated, if their gaps fit exactly the missing number of scans; else None."""
     steps = np.diff(stamps).astype(np.float64)
     if len(stamps) >= count or len(steps) < 2 or steps.min() <= 0:

@@ -20,7 +20,7 @@ COLUMNS = 5
 
 @inline
 def _seen_row(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
-    """Row of a key; a new row without any update, number `used`, for a key that has none."""
+    """Row of a key; for a new key the new row number `used`, without any update."""
     row = row_of(key, slots, rows, used)
     if row == used:
         rows[row, 1] = 0

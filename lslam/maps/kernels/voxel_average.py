@@ -34,14 +34,16 @@ def pack(ix: int, iy: int, iz: int) -> int:
 
 @inline
 def slot_of(key: int, mask: int) -> int:
-    """Home of a key in a table of mask + 1 slots."""
+    """First slot to try for a key in a table of mask + 1 slots."""
     mixed = key * _MIX
     return (mixed ^ (mixed >> 29) ^ (mixed >> 43)) & mask
 
 
 @inline
 def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> int:
-    """Row of a key; a new one, number `used`, for a key that has none: it is entered in `slots`, with the key alone written.
+    """Row of a key.
+
+    A new key is entered in `slots` and gets row number `used`, in which only the key is set.
 
     slots : (S,) row of each hash slot or -1, S a power of two above `used`; rows : (R, k), R > `used`
     """
@@ -60,7 +62,7 @@ def row_of(key: int, slots: NDArray[np.int32], rows: NDArray[np.int64], used: in
 
 @kernel
 def enter(slots: NDArray[np.int32], rows: NDArray[np.int64], used: int) -> None:
-    """Enter the first `used` rows into `slots`, which are all -1 and a power of two above `used`."""
+    """Enter the first `used` rows into `slots`, all -1 before; the number of slots is a power of two above `used`."""
     mask = slots.shape[0] - 1
     for row in range(used):
         slot = slot_of(rows[row, 0], mask)

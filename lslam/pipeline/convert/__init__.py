@@ -1,4 +1,4 @@
-"""Sequences, trajectories and runs in other formats; here, whether an output suits what is written there, seen early."""
+"""Conversion of sequences, trajectories and runs to other formats; here, early checks of the output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SUFFIXES = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 
 
 def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
-    """Raise UsageError when `out` does not suit `kind`, OutputExistsError when it is there already."""
+    """Raise UsageError when `out` does not suit `kind`, OutputExistsError when it exists."""
     if kind not in (*SUFFIXES, "kitti"):
         raise UsageError(f"no layout {kind!r} for sequences: {', '.join(SUFFIXES)} and kitti are")
     if is_zstd and kind in ("bag", "kitti"):
@@ -29,7 +29,7 @@ def check_output(kind: str, out: Path, is_zstd: bool, overwrite: bool) -> None:
 
 
 def check_beside(out: Path, source: Path, what: str) -> None:
-    """Raise UsageError when `out` is `source`, in words `what`, or a folder that holds it."""
+    """Raise UsageError when `out` is `source`, which messages call `what`, or a folder that holds it."""
     here, there = source.resolve(), out.resolve()
     if there == here or there in here.parents:
         raise UsageError(f"--out {out} holds {what} itself: choose another")
@@ -37,7 +37,7 @@ def check_beside(out: Path, source: Path, what: str) -> None:
 
 @contextmanager
 def staged(out: Path) -> Iterator[Path]:
-    """Where to make what becomes the file or folder `out`, in place of what is there, when the block ends well.
+    """Temporary path that replaces `out`, a file or folder, when the block ends without an error.
 
     Raises OutputError naming what cannot be written.
     """

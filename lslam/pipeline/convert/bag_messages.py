@@ -1,4 +1,4 @@
-"""Arrays to messages: what `BagWriter` is given. `store` is the writer's own, with the message types of its ROS."""
+"""Arrays as messages for `BagWriter`. `store` is the writer's own, with the message types of its ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DIAGONAL_KNOWN, _NO_COVARIANCE = 2, 0  # sensor_msgs/NavSatFix
 
 
 def cloud(store: Any, scan: Scan, frame: str) -> Any:
-    """PointCloud2 of a scan: x, y, z, and as far as they are known intensity, ring, label and `time`, s from the stamp."""
+    """PointCloud2 of a scan: x, y, z, and if known intensity, ring, label and `time`, s from the stamp."""
     columns: dict[str, NDArray[Any]] = {axis: scan.points[:, k] for k, axis in enumerate("xyz")}
     optional = {"intensity": scan.intensity, "ring": scan.rings, "time": scan.times, "label": scan.labels}
     columns |= {name: values for name, values in optional.items() if values is not None}
@@ -30,7 +30,7 @@ def cloud(store: Any, scan: Scan, frame: str) -> Any:
 def points(
     store: Any, stamp_ns: int, places: NDArray[np.floating[Any]], intensity: NDArray[np.float32] | None, frame: str
 ) -> Any:
-    """PointCloud2 of places (N, 3), m, finite, and intensities (N,) where they are known, as float32."""
+    """PointCloud2 of finite positions (N, 3), m, and optional intensities (N,), as float32."""
     columns: dict[str, NDArray[Any]] = {axis: places[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
     if intensity is not None:
         columns["intensity"] = intensity.astype(np.float32)
@@ -62,7 +62,7 @@ def _cloud(store: Any, head: Any, columns: Mapping[str, NDArray[Any]], is_dense:
 
 
 def imu(store: Any, stamp_ns: int, accel: Floats, gyro: Floats, frame: str) -> Any:
-    """Imu: specific force (3,), m/s2, and angular rate (3,), rad/s; no orientation."""
+    """Imu message: specific force (3,), m/s2, and angular rate (3,), rad/s; no orientation."""
     return store.types["sensor_msgs/msg/Imu"](
         header=header(store, stamp_ns, frame),
         orientation=_quaternion(store, [0, 0, 0, 1]),
@@ -75,7 +75,7 @@ def imu(store: Any, stamp_ns: int, accel: Floats, gyro: Floats, frame: str) -> A
 
 
 def fix(store: Any, stamp_ns: int, lat_lon_alt: Floats, sigma: float, frame: str) -> Any:
-    """NavSatFix: latitude, longitude (deg) and height (m), with a one-sigma error, m, NaN when it is unknown."""
+    """NavSatFix message: latitude, longitude (deg) and height (m), with a one-sigma error, m, NaN when it is unknown."""
     is_known = bool(np.isfinite(sigma))
     latitude, longitude, altitude = (float(v) for v in lat_lon_alt)
     return store.types["sensor_msgs/msg/NavSatFix"](
@@ -92,7 +92,7 @@ def fix(store: Any, stamp_ns: int, lat_lon_alt: Floats, sigma: float, frame: str
 def odometry(
     store: Any, stamp_ns: int, T_world_body: Floats, frame: str, body: str, covariance: Floats | None = None
 ) -> Any:
-    """Odometry: a pose (4, 4) of `body` in `frame`, without velocity.
+    """Odometry message: a pose (4, 4) of `body` in `frame`, without velocity.
 
     covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in axes of `frame`, which is how ROS has it; None where unknown
     """
@@ -108,7 +108,7 @@ def odometry(
 
 
 def path(store: Any, stamps_ns: Longs, poses: Floats, frame: str) -> Any:
-    """Path of poses (N, 4, 4) in `frame` at their stamps (N,), stamped with the last."""
+    """Path message of poses (N, 4, 4) in `frame` at their stamps (N,), with the last stamp."""
     posed = store.types["geometry_msgs/msg/PoseStamped"]
     return store.types["nav_msgs/msg/Path"](
         header=header(store, int(stamps_ns[-1]), frame),
@@ -137,12 +137,12 @@ def transforms(store: Any, stamp_ns: int, tree: Mapping[tuple[str, str], Floats]
 
 
 def text(store: Any, words: str) -> Any:
-    """String."""
+    """String message."""
     return store.types["std_msgs/msg/String"](data=words)
 
 
 def header(store: Any, stamp_ns: int, frame: str, number: int = 0) -> Any:
-    """Header with a stamp, a frame and, in ROS 1, a number."""
+    """Header with a stamp, a frame and, in ROS 1, a sequence number."""
     kind = store.types["std_msgs/msg/Header"]
     seconds, nanoseconds = divmod(int(stamp_ns), 10**9)
     stamp = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)

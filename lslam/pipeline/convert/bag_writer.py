@@ -90,7 +90,7 @@ def _writer(path: Path, kind: str, is_zstd: bool) -> Any:
 
 
 def _latched(kind: str) -> dict[str, Any]:
-    """What makes nodes that come late hear the last message of a topic."""
+    """Quality of service by which late subscribers get the last message of a topic."""
     if kind == "bag":
         return {"latching": 1}
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime

@@ -1,4 +1,4 @@
-"""A run as a bag that rviz and Foxglove show: scans where they were found, poses, path, transforms and the map."""
+"""A run as a bag for rviz and Foxglove: deskewed scans, poses, path, transforms and the map."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ PATHS = 20
 
 @dataclass(frozen=True)
 class RunBag:
-    """What was written: where, how many poses, how many clouds of scans, and how many points of the map."""
+    """Result of `convert_run`: path, and numbers of poses, clouds and map points."""
 
     path: Path
     poses: int
@@ -82,7 +82,7 @@ def convert_run(
     due, clouds = _path_ends(len(stamps)), 0
     with staged(out) as made, BagWriter(made, kind, is_zstd) as writer:
         map_points = _write_map(writer, run, int(stamps[0]))
-        for k, posed in enumerate(_posed(run, scans)):
+        for k, posed in enumerate(_scans_by_pose(run, scans)):
             _write_pose(
                 writer, int(stamps[k]), poses[k], None if covariances is None else np.nan_to_num(covariances[k])
             )
@@ -110,8 +110,8 @@ def _write_points(writer: BagWriter, stamp: int, posed: PosedScan, voxel: float)
     writer.write(POINTS_TOPIC, stamp, bag_messages.points(writer.store, stamp, points, intensity, BODY))
 
 
-def _posed(run: EarlierRun, scans: Sequence | None) -> Iterator[PosedScan | None]:
-    """One for each pose; None for a scan that was not registered or cannot be read."""
+def _scans_by_pose(run: EarlierRun, scans: Sequence | None) -> Iterator[PosedScan | None]:
+    """One deskewed scan for each pose; None for a scan that was not registered or cannot be read."""
     if scans is None:
         yield from [None] * len(run.trajectory)
         return
@@ -124,7 +124,7 @@ def _posed(run: EarlierRun, scans: Sequence | None) -> Iterator[PosedScan | None
 
 
 def _write_map(writer: BagWriter, run: EarlierRun, stamp: int) -> int:
-    """The map in the world of the poses, and of how many points; none, which is said, where the run has none."""
+    """Write the map in the world of the poses. Returns its number of points; 0, with a log message, without a map."""
     try:
         path = map_of(run.folder)
     except InputError as error:
@@ -140,12 +140,12 @@ def _write_map(writer: BagWriter, run: EarlierRun, stamp: int) -> int:
 
 
 def _path_ends(count: int) -> set[int]:
-    """After which of `count` scans the path comes: the last is one of them."""
+    """Numbers of scans, of `count`, after which the path is written; the last is among them."""
     return set(np.unique(np.ceil(np.linspace(0, count, PATHS + 1)[1:]).astype(int) - 1).tolist())
 
 
 def _spread(count: int, most: int) -> NDArray[np.intp]:
-    """At most `most` indices spread evenly over `count`, the first and the last among them."""
+    """At most `most` indices spread evenly over `count`, including the first and the last."""
     return (
         np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.intp))
         if count

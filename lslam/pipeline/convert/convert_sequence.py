@@ -1,4 +1,4 @@
-"""A sequence in another layout: to a bag of ROS 1 or ROS 2, or to KITTI's folders. What is read back is what was there."""
+"""A sequence in another layout: a bag of ROS 1 or ROS 2, or KITTI's folders. It reads back as the same sequence."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ TRUTH_FILE, IMU_FILE, GNSS_FILE = "ground_truth.tum", "imu.csv", "gnss.csv"
 
 @dataclass(frozen=True)
 class Converted:
-    """What was written: where, how many scans, and how many could not be read."""
+    """Result of `convert_sequence`: path, number of scans, and number of unreadable ones."""
 
     path: Path
     scans: int
@@ -91,7 +91,7 @@ def convert_sequence(
 
 @dataclass(frozen=True)
 class _Lidar:
-    """Scans that go to a topic of a bag, the frame of their messages, and where it sits, `T_lidar_other` (4, 4)."""
+    """LiDAR of a bag: its scans, topic and frame, and its mounting `T_lidar_other` (4, 4)."""
 
     scans: Sequence
     topic: str = "/points"
@@ -100,7 +100,7 @@ class _Lidar:
 
 
 class _Source:
-    """Scans of a sequence in order, deskewed when asked for, counted, those that are damaged left out and said.
+    """Scans of a sequence in order, deskewed on request; damaged ones are logged, counted and left out.
 
     lidars : what a bag is given, the leading one first
     """
@@ -114,7 +114,7 @@ class _Source:
             self.trajectory = self._check(trajectory)
 
     def take_apart(self, merged: MergedLidars, on_one_topic: bool) -> None:
-        """Write the scans of each LiDAR that was merged, and which of them are merged when the bag is read."""
+        """Split merged scans by LiDAR, and state which LiDARs are merged when the bag is read."""
         others = merged.further_lidars
         names = [re.sub(r"\W+", "_", other.name).strip("_") for other in others]
         if len(set(names)) < len(names):
@@ -133,7 +133,7 @@ class _Source:
         skipped = 0
         for k in range(len(lidar.scans)):
             try:
-                scan = self._deskewed(lidar.scans.scan(k))
+                scan = self._deskew(lidar.scans.scan(k))
             except InputError as error:
                 log.warning("left out: %s", error)
                 skipped += 1
@@ -146,7 +146,7 @@ class _Source:
         self.written, self.skipped = self.written + len(lidar.scans) - skipped, self.skipped + skipped
 
     def _check(self, trajectory: Trajectory) -> Trajectory:
-        """The trajectory as LiDAR poses. Raises InputError when there is nothing to deskew, or nothing to deskew along."""
+        """The trajectory as LiDAR poses. Raises InputError when scans cannot be deskewed or no trajectory is given."""
         if self.sweep is None:
             raise InputError(f"{self.sequence.path} has no per-point times: there is nothing to deskew")
         if len(trajectory) < 2 or not trajectory.has_stamps:
@@ -154,7 +154,7 @@ class _Source:
         is_known = trajectory.frame in FRAMES
         return change_frame(trajectory, "lidar", self.calibration) if is_known else trajectory
 
-    def _deskewed(self, scan: Scan) -> Scan:
+    def _deskew(self, scan: Scan) -> Scan:
         if self.trajectory is None or scan.times is None:
             return scan
         if not self.trajectory.stamps_ns[0] <= scan.stamp_ns <= self.trajectory.stamps_ns[-1]:
@@ -166,7 +166,7 @@ class _Source:
 
     @property
     def calibration(self) -> Calibration:
-        """Extrinsics that are known; those a reader had to assume are not written down as facts."""
+        """Known extrinsics; those that a reader assumed are left out."""
         known = self.sequence.calibration
         return replace(known, T_lidar_imu=None) if getattr(self.sequence, "has_assumed_extrinsics", False) else known
 
@@ -200,7 +200,7 @@ def _write_bag(source: _Source, out: Path, kind: str, is_zstd: bool) -> None:
 
 
 def _messages(source: _Source, store: Any) -> list[Iterator[tuple[int, int, str, Callable[[], Any]]]]:
-    """Per topic: stamp, rank among equal stamps, topic, and how the message is made."""
+    """Messages by topic: stamp, rank among equal stamps, topic, and the function that makes the message."""
     sequence, make = source.sequence, bag_messages
     imu, gnss, truth = sequence.imu, sequence.gnss, sequence.ground_truth
     topics: list[Iterator[tuple[int, int, str, Callable[[], Any]]]] = [
@@ -234,7 +234,7 @@ def _first_stamp(source: _Source) -> int:
 
 
 def _transforms(calibration: Calibration) -> dict[tuple[str, str], Any]:
-    """The tree of frames below the LiDAR."""
+    """Tree of frames below the LiDAR."""
     T_cam0_lidar = calibration.T_cam0_lidar
     below = {
         **calibration.frames,
@@ -257,7 +257,7 @@ def _write_kitti(source: _Source, out: Path) -> None:
 
 
 def _write_sides(source: _Source, folder: Path, poses: Path, stamps: Any) -> None:
-    """Everything beside the scans."""
+    """Write all files beside the scans."""
     sequence, calibration, info = source.sequence, source.calibration, source.info()
     write_times(folder, stamps)
     if calibration.T_cam0_lidar is not None:

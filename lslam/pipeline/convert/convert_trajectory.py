@@ -37,7 +37,7 @@ def convert_trajectory(
     frame: str | None = None,
     overwrite: bool = False,
 ) -> Trajectory:
-    """Write `trajectory` to `out` as `kind`, with poses of the body `frame`, by default the format's usual one; what was written.
+    """Write `trajectory` to `out` as `kind`, as poses of `frame`, by default the format's usual body. Returns the written one.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def convert_trajectory(
 
 
 def change_frame(trajectory: Trajectory, frame: str, calibration: Calibration) -> Trajectory:
-    """The same motion as poses of the body `frame`, by way of the LiDAR.
+    """The same motion as poses of the body `frame`.
 
     Camera poses live in the world of camera 0 at the start, T_cam0 = Tr T_world_lidar inv(Tr); IMU poses share the LiDAR's
     world, T_world_imu = T_world_lidar T_lidar_imu. Raises InputError when the extrinsic for that is unknown.
@@ -78,20 +78,21 @@ def change_frame(trajectory: Trajectory, frame: str, calibration: Calibration) -
         )
     poses = trajectory.poses
     if trajectory.frame == "cam0":
-        T = _known(calibration, "T_cam0_lidar", trajectory, frame)
+        T = _require_extrinsic(calibration, "T_cam0_lidar", trajectory, frame)
         poses = se3.inverse(T) @ poses @ T
     elif trajectory.frame == "imu":
-        poses = poses @ se3.inverse(_known(calibration, "T_lidar_imu", trajectory, frame))
+        poses = poses @ se3.inverse(_require_extrinsic(calibration, "T_lidar_imu", trajectory, frame))
     if frame == "cam0":
-        T = _known(calibration, "T_cam0_lidar", trajectory, frame)
+        T = _require_extrinsic(calibration, "T_cam0_lidar", trajectory, frame)
         poses = T @ poses @ se3.inverse(T)
     elif frame == "imu":
-        poses = poses @ _known(calibration, "T_lidar_imu", trajectory, frame)
+        poses = poses @ _require_extrinsic(calibration, "T_lidar_imu", trajectory, frame)
     log.info("poses of %s carried to %s", trajectory.frame, frame)
     return replace(trajectory, poses=se3.normalise(poses), frame=frame, covariances=None)
 
 
-def _known(calibration: Calibration, name: str, trajectory: Trajectory, frame: str) -> se3.Floats:
+def _require_extrinsic(calibration: Calibration, name: str, trajectory: Trajectory, frame: str) -> se3.Floats:
+    """Extrinsic `name` (4, 4), m. Raises InputError with the option that gives it when it is unknown."""
     T: se3.Floats | None = getattr(calibration, name)
     if T is None:
         flag = (
@@ -108,7 +109,7 @@ Place = tuple[float, float, float]
 
 
 def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
-    """Write a way of lat, lon (deg), height (m), WGS84, as a line, and as a track in time where `times` (UTC) are known.
+    """Write positions lat, lon (deg), height (m), WGS84, as a line, and as a track if `times` (UTC) are known.
 
     The line lies on the ground: KML counts heights from the sea, ours are above the ellipsoid. They stand in the coordinates.
     Raises OutputError when the file cannot be written, InputError without fastkml.
@@ -136,7 +137,7 @@ def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | N
 
 
 def write_gpx(path: Path, places: Sequence[Place], times: Sequence[datetime] | None, name: str, about: str) -> None:
-    """Write a way of lat, lon (deg), height (m), WGS84, as one segment, with `times` (UTC) where they are known.
+    """Write positions lat, lon (deg), height (m), WGS84, as one segment, with `times` (UTC) if they are known.
 
     Raises OutputError when the file cannot be written, InputError without gpxpy.
     """
@@ -159,7 +160,7 @@ TRAJECTORY, MANIFEST = "trajectory.tum", "manifest.json"
 
 
 def georeference_beside(source: Path, kind: str) -> Georeference:
-    """Where on the Earth the trajectory of a run folder, or its `trajectory.tum`, lies, as its manifest says.
+    """Georeference in the manifest of a run, by its folder or its `trajectory.tum`.
 
     Raises UsageError with the way out when that is unknown.
     """
@@ -189,7 +190,7 @@ def convert_to_earth(
     frame: str | None = None,
     overwrite: bool = False,
 ) -> Trajectory:
-    """Write the places of `trajectory` to `out` as `kind`, `kml` or `gpx`; what was written.
+    """Write the positions of `trajectory` to `out` as `kind`, `kml` or `gpx`. Returns the written ones.
 
     Degrees have 7 decimals (1 cm), heights above the WGS84 ellipsoid 3. Times are UTC, and left out where stamps are not
     Unix time.

@@ -1,4 +1,4 @@
-"""A georeferenced run as a GeoPackage: its trajectory, what became of each scan, and the buildings it corrected."""
+"""A georeferenced run as a GeoPackage: its trajectory, the status of each scan, and the corrected buildings."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _WGS84 = 4326
 
 @dataclass(frozen=True)
 class GeoLayer:
-    """One layer.
+    """One layer of a GeoPackage.
 
     shape : points at (3,), lines along (K, 3), or lists of polygons, each a list of rings (K, 2) whose last corner is the first;
         all in longitude, latitude (deg) and, of three, height (m)
@@ -48,7 +48,7 @@ class GeoLayer:
 
 
 def write_gpkg(path: Path, layers: Sequence[GeoLayer]) -> None:
-    """Write the layers to `path`, a new file whose name ends in .gpkg; whoever calls makes it appear at once.
+    """Write the layers to `path`, a new file ending in .gpkg. It is not atomic; the caller renames it.
 
     Raises OutputError when it cannot be written, InputError without fudgeo.
     """
@@ -99,12 +99,12 @@ def _type_of(values: Sequence[Value]) -> str:
 
 
 def _plain(value: Value) -> int | float | str | None:
-    """Dates as the standard has them, to the millisecond, UTC."""
+    """Values for the file; dates as the standard requires, UTC, to the millisecond."""
     return f"{value:%Y-%m-%dT%H:%M:%S}.{value.microsecond // 1000:03d}Z" if isinstance(value, datetime) else value
 
 
 def _extent(layer: GeoLayer) -> tuple[float, float, float, float]:
-    """West, south, east, north."""
+    """Limits west, south, east, north."""
     parts: list[Floats] = []
     for feature in layer.features:
         parts += (
@@ -119,7 +119,7 @@ SUFFIX = ".gpkg"
 
 
 def convert_to_gpkg(folder: Path, out: Path, *, overwrite: bool = False) -> list[GeoLayer]:
-    """Write the run in `folder` to `out`, whole or not at all; the layers that it has.
+    """Write the available layers of the run in `folder` to `out`, whole or not at all.
 
     `trajectory` is one line, `scans` a point each with number, stamp, UTC where stamps are Unix time, status and the standard
     deviation where it is largest, `buildings` and `new_walls` what the run found of OpenStreetMap. WGS84, heights in m above its
@@ -186,11 +186,11 @@ def _sigmas(covariances: Floats) -> list[float | None]:
 
 
 def _of_buildings(found: CorrectedMap) -> list[GeoLayer]:
-    """Real places, as in buildings.geojson."""
+    """Layers of buildings at their georeferenced places, as in buildings.geojson."""
     about = f"{found.attribution}; corrected by lslam" if found.attribution else "corrected by lslam"
     held, origin = found.buildings, found.origin
     polygons = [
-        [[_closed(ring, origin) for ring in footprint.rings] for footprint in c.corrected.footprints] for c in held
+        [[_close_ring(ring, origin) for ring in footprint.rings] for footprint in c.corrected.footprints] for c in held
     ]
     columns: dict[str, Any] = {
         "osm_id": [c.building.osm_id for c in held],
@@ -202,7 +202,7 @@ def _of_buildings(found: CorrectedMap) -> list[GeoLayer]:
         "height_m": [c.building.height for c in held],
         "name": [c.building.tags.get("name") for c in held],
     }
-    walls = [_placed(wall, origin) for wall in found.new_walls]
+    walls = [_to_lon_lat(wall, origin) for wall in found.new_walls]
     lengths = np.linalg.norm(found.new_walls[:, 1] - found.new_walls[:, 0], axis=1).tolist()
     return [
         GeoLayer("buildings", "polygons", polygons, columns, about),
@@ -210,10 +210,10 @@ def _of_buildings(found: CorrectedMap) -> list[GeoLayer]:
     ]
 
 
-def _placed(points: Floats, origin: Floats) -> Floats:
-    """(K, 2) m to (K, 3) longitude, latitude, height of the origin."""
+def _to_lon_lat(points: Floats, origin: Floats) -> Floats:
+    """Positions (K, 2), m, as (K, 3) longitude, latitude, height of the origin."""
     return from_local(np.column_stack([points, np.zeros(len(points))]), origin)[:, [1, 0, 2]]
 
 
-def _closed(ring: Floats, origin: Floats) -> Floats:
-    return _placed(np.concatenate([ring, ring[:1]]), origin)[:, :2]
+def _close_ring(ring: Floats, origin: Floats) -> Floats:
+    return _to_lon_lat(np.concatenate([ring, ring[:1]]), origin)[:, :2]

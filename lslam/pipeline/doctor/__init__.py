@@ -1,4 +1,4 @@
-"""What is wrong with a recording, one finding at a time, each with its way out."""
+"""Diagnosis of recordings: a list of findings, each with advice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Facts = dict[str, Any]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong.
+    """One fault of a recording.
 
     code : for scripts, for example `imu-accel-unit`; what : the fault with its numbers; way_out : what to do about it
     """
@@ -24,5 +24,5 @@ class Finding:
 
 
 def plural(count: int, noun: str, several: str = "") -> str:
-    """`1 gap`, `2 gaps`."""
+    """Count with its noun: `1 gap`, `2 gaps`."""
     return f"{count} {noun if count == 1 else several or noun + 's'}"

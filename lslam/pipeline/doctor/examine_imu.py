@@ -1,4 +1,4 @@
-"""The IMU of a recording by itself: time, units, gravity and its direction, extrinsics."""
+"""Examination of a recording's IMU: time, units, gravity and its direction, extrinsics."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _MEDIAN = 0.6745
 
 @dataclass(frozen=True)
 class Noise:
-    """Of three axes of one kind, the root of their mean square.
+    """Noise of three axes of one kind, as the root mean square over the axes.
 
     density : per sqrt(Hz); instability : of the bias, None where the sensor does not stand long enough; walk : of the bias,
         per sqrt(s), likewise, and where the Allan deviation rises at the end
@@ -41,7 +41,7 @@ class Noise:
 
 
 def examine_noise(imu: ImuStream) -> Facts | None:
-    """How noisy the IMU is and by which `method`; None for a stream of less than half a second or whose unit is unknown."""
+    """Noise of the IMU and the `method` used; None for less than half a second of data or an unknown unit."""
     rate = rate_of(imu)
     if len(imu) < max(8, 0.5 * rate) or rate <= 0:
         return None
@@ -65,7 +65,7 @@ def examine_noise(imu: ImuStream) -> Facts | None:
 
 
 def _longest_still(accel: Floats, gyro: Floats, rate: float) -> slice:
-    """The longest stretch of whole seconds in which, and from one of which to the next, rates and forces hardly vary."""
+    """Longest stretch of whole seconds at rest: rates and forces hardly vary within and between them."""
     width = max(round(rate), 2)
     count = len(gyro) // width
     if not count:
@@ -114,14 +114,14 @@ def _by_allan(values: Floats, rate: float) -> Noise:
 
 
 def _by_differences(values: Floats, rate: float) -> float:
-    """White noise from third differences, in which motion that is smooth over four samples cancels; shaking does not."""
+    """White noise from third differences: motion that is smooth over four samples cancels, vibration does not."""
     third = np.abs(np.diff(values, 3, axis=0))
     sigma = np.median(third, axis=0) / _MEDIAN / np.sqrt(_THIRD)
     return float(np.sqrt(np.mean(sigma**2) / rate))
 
 
 def imu_toml(noise: Facts, name: str) -> str:
-    """A configuration for `--config` with what was measured of the recording `name`."""
+    """Configuration for `--config` with the measured noise of the recording `name`."""
     how = (
         f"by Allan deviation over {noise['standing_s']:.0f} s of standing: a sensor that shakes has more"
         if noise["method"] == "allan"
@@ -170,7 +170,7 @@ def examine_imu(sequence: Sequence, findings: list[Finding]) -> Facts | None:
 
 
 def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: float, findings: list[Finding]) -> int:
-    """Rate, order, gaps and overlap; the number of gaps."""
+    """Check rate, order, gaps and overlap. Returns the number of gaps."""
     if median > 0 and is_slow(1 / median):
         what = f"IMU: {1 / median:.1f} Hz, too slow to see shaking within a scan ({LEAST_RATE_HZ:.0f} Hz would do)"
         findings.append(Finding("imu-rate", what, "record it faster, of KITTI raw take the `_extract` drive (100 Hz)"))
@@ -199,7 +199,7 @@ def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: flo
 
 
 def _examine_extrinsics(sequence: Sequence, findings: list[Finding]) -> None:
-    """Extrinsics that are missing, or that the reader of a bag had to assume."""
+    """Check for extrinsics that are missing, or that the reader of a bag assumed."""
     if sequence.calibration.T_lidar_imu is None:
         findings.append(
             Finding(
@@ -211,7 +211,7 @@ def _examine_extrinsics(sequence: Sequence, findings: list[Finding]) -> None:
 
 
 def _examine_gravity(imu: ImuStream, T_lidar_imu: Floats | None, findings: list[Finding]) -> Facts:
-    """Unit of the specific force, and where up is in the LiDAR's frame: +z, when unit, sign and extrinsics are right."""
+    """Check the unit of the specific force and the up direction in the LiDAR's frame, which is +z if all is right."""
     if not len(imu):
         return {"gravity_norm": 0.0, "gravity_unit": None, "up_in_lidar": None, "tilt_deg": None}
     calm, unit = gravity_unit(imu) if len(imu) > 1 else (float(np.linalg.norm(imu.accel[0])), None)
@@ -231,19 +231,20 @@ def _examine_gravity(imu: ImuStream, T_lidar_imu: Floats | None, findings: list[
     up = (np.eye(3) if T_lidar_imu is None else T_lidar_imu[:3, :3]) @ _calm_direction(imu)
     tilt = float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))
     if tilt > _TILT_DEG:
-        findings.append(_tilted(up, tilt))
+        findings.append(_tilt(up, tilt))
     return {"gravity_norm": norm, "gravity_unit": unit, "up_in_lidar": [float(v) for v in up], "tilt_deg": tilt}
 
 
 def _calm_direction(imu: ImuStream) -> Floats:
-    """Unit vector (3,) of the specific force in the calmest tenth of the seconds: bends tilt the others."""
+    """Unit vector (3,) of the specific force in the calmest tenth of the seconds, since bends tilt it."""
     means = mean_forces(imu)
     calm = np.argsort(np.linalg.norm(means, axis=1), kind="stable")[: max(1, len(means) // 10)]
     force = means[calm].mean(axis=0)
     return np.asarray(force / max(float(np.linalg.norm(force)), 1e-12))
 
 
-def _tilted(up: Floats, tilt: float) -> Finding:
+def _tilt(up: Floats, tilt: float) -> Finding:
+    """Finding about a specific force that points `tilt` deg away from up."""
     axis = int(np.argmax(np.abs(up)))
     name = ("-" if up[axis] < 0 else "+") + "xyz"[axis]
     what = f"IMU: specific force points along {name} of the LiDAR, {tilt:.0f} deg from up (+z)"

@@ -1,4 +1,4 @@
-"""Positions beside the scans of a recording: its ground truth, and its satellite fixes."""
+"""Examination of positions beside the scans: ground truth and satellite fixes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _GAP, _SCANS = 5.0, 2.5
 
 
 def examine_jumps(truth: Trajectory | None) -> list[Finding]:
-    """A finding where positions jump from one pose to the next as nothing that carries a LiDAR does."""
+    """A finding, in a list, if a step between poses differs from its neighbours by more than an acceleration explains."""
     if truth is None or len(truth) < 4:
         return []
     steps, seconds = np.diff(truth.positions, axis=0), np.diff(truth.stamps_ns)[:, None] * 1e-9
@@ -55,7 +55,7 @@ def examine_jumps(truth: Trajectory | None) -> list[Finding]:
 
 
 def examine_gaps(sequence: Sequence) -> list[Finding]:
-    """A finding where truth has no pose for a while during the scans."""
+    """A finding, in a list, if the ground truth has gaps during the scans."""
     truth, scans = sequence.ground_truth, sequence.stamps_ns
     if truth is None or not truth.has_stamps or len(truth) < 3 or len(scans) < 2:
         return []
@@ -117,7 +117,7 @@ def examine_gnss(sequence: Sequence, findings: list[Finding]) -> Facts | None:
 
 
 def _examine_jumps(fixes: Floats, stamps_ns: Longs, sigma: Floats, findings: list[Finding]) -> int:
-    """Fixes that leave the line through their neighbours by more than acceleration and their sigma explain."""
+    """Number of fixes farther off the line through their neighbours than acceleration and sigma explain; adds a finding."""
     if len(fixes) < 3:
         return 0
     xy = to_local(fixes, fixes[0])[:, :2]

@@ -1,4 +1,4 @@
-"""The IMU of a recording against its scans: unit of the rates, clock, axes and extrinsic rotation."""
+"""Comparison of a recording's IMU with its scans: unit of the rates, clock, axes and extrinsic rotation."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _HOPELESS = {"imu-accel-unit", "imu-apart", "imu-finite"}
 
 
 def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
-    """Register the first scans with `icp` and compare their turns with the gyroscope's; None without an IMU."""
+    """Register the first scans with `icp` and compare their rotations with the gyroscope's; None without an IMU."""
     imu, stamps_ns = sequence.imu, sequence.stamps_ns
     if imu is None or not len(imu) or len(sequence) < _FEWEST:
         return None
@@ -66,7 +66,7 @@ def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
 def _swept_by_imu(
     sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, first: FirstPoses, config: Config
 ) -> FirstPoses:
-    """The first scans as the IMU deskews them, where its clock seems off: constant velocity bends turns as a clock does."""
+    """First scans deskewed by the IMU if its clock seems off, since deskewing by constant velocity distorts rotations, too."""
     if first.covariances is not None:
         return first  # nothing to deskew
     try:
@@ -81,7 +81,7 @@ def _swept_by_imu(
 
 
 def compare(cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, findings: list[Finding]) -> Facts:
-    """Compare the gyroscope with the poses (N, 4, 4) of the LiDAR at `stamps_ns` (N,)."""
+    """Compare the gyroscope with the LiDAR's poses (N, 4, 4) at `stamps_ns` (N,)."""
     agreement = Agreement(False)
     refusal: ImuRefusedError | None = None
     try:
@@ -114,7 +114,7 @@ def compare(cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floa
 
 
 def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
-    """The agreement once the axes are put right: clocks cannot be told before. R may mirror."""
+    """Agreement after correcting the axes by R, which may be a reflection; before, the clock offset is unobservable."""
     T = np.eye(4)
     T[:3, :3] = R
     try:
@@ -126,7 +126,7 @@ def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: Longs, poses: Floats) -> 
 def _far_off(
     cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, near: Agreement
 ) -> Agreement | None:
-    """The agreement at an offset beyond those that a run looks at, where that is clearly better than `near`, else None."""
+    """Agreement at an offset beyond those that a run tries, if clearly better than `near`; else None."""
     best, at = 0.0, 0.0
     for offset in np.arange(-FAR_S, FAR_S, 4 * STEP_S):
         seen, felt = turns(cleaned.imu, T_lidar_imu, stamps_ns, poses, float(offset))
@@ -145,7 +145,7 @@ def _far_off(
 
 
 def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]) -> float | None:
-    """s to add to the IMU's stamps; a finding when it matters and is more than half a step of the IMU."""
+    """Time to add to the IMU's stamps, s; a finding if it matters and exceeds half a sample period."""
     if not agreement.is_judged:
         return None
     offset, sigma = float(agreement.offset_s), float(agreement.offset_sigma_s)
@@ -164,9 +164,9 @@ def _examine_clock(agreement: Agreement, rate_hz: float, findings: list[Finding]
 
 
 def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
-    """Axes swapped or the other way round, or turned by an angle, and what (3, 3) to put for `R_lidar_imu`.
+    """Check for swapped, inverted or rotated axes. Returns the `R_lidar_imu` (3, 3) to use.
 
-    seen, felt : (M, 3) rates in the IMU's axes
+    seen, felt : (M, 3) rates of the LiDAR's and the IMU's rotation, in the IMU's axes
     """
     rms = np.sqrt(np.mean(seen**2, axis=0))
     judged = rms > LEAST_TURNING
@@ -178,12 +178,12 @@ def _examine_axes(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Find
     P = _best_axes(correlation, judged)
     better = np.sum(P * correlation, axis=1)[judged]
     if given.min() < _BAD and better.min() >= _GOOD:
-        return _swapped(P, float(given.min()), float(better.min()), int(judged.sum()), R_lidar_imu), R_lidar_imu @ P
-    return _turned(seen, felt, R_lidar_imu) if judged.sum() > 1 else None
+        return _swap(P, float(given.min()), float(better.min()), int(judged.sum()), R_lidar_imu), R_lidar_imu @ P
+    return _rotation_fit(seen, felt, R_lidar_imu) if judged.sum() > 1 else None
 
 
 def _best_axes(correlation: Floats, judged: Bools) -> Floats:
-    """The signed permutation (3, 3), seen = P felt, that correlates best; as given where nothing turned."""
+    """Signed permutation (3, 3), seen = P felt, with the best correlation; identity about axes without rotation."""
     weight = correlation * judged[:, None] + 0.01 * np.eye(3)
     best, score = np.eye(3), -np.inf
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
@@ -195,7 +195,8 @@ def _best_axes(correlation: Floats, judged: Bools) -> Floats:
     return best
 
 
-def _swapped(P: Floats, before: float, after: float, judged: int, R_lidar_imu: Floats) -> Finding:
+def _swap(P: Floats, before: float, after: float, judged: int, R_lidar_imu: Floats) -> Finding:
+    """Finding about IMU axes that fit after the signed permutation P (3, 3)."""
     names = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.argmax(np.abs(row)))] for row in P)
     what = f"IMU: its axes do not fit the scans' turns, ({names}) for (x, y, z) would (correlation {after:.2f}, not {before:.2f})"
     if judged < 2:
@@ -207,8 +208,8 @@ def _swapped(P: Floats, before: float, after: float, judged: int, R_lidar_imu: F
     return Finding("imu-axes", what, way)
 
 
-def _turned(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
-    """By which rotation the felt turns would fit, when that halves what is left of them."""
+def _rotation_fit(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, Floats] | None:
+    """Rotation that fits the IMU's rates to the LiDAR's, if it halves the residuals; else None."""
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(seen.T @ seen / len(seen)), 0.0))
     if spread[1] < LEAST_TURNING:
         return None  # turns about one axis say nothing of a turn about that axis
@@ -224,7 +225,7 @@ def _turned(seen: Floats, felt: Floats, R_lidar_imu: Floats) -> tuple[Finding, F
 
 
 def _by_axis(seen: Floats, felt: Floats) -> list[float | None] | None:
-    """Correlation about x, y, z of the IMU; None about an axis that hardly turned."""
+    """Correlation about x, y, z of the IMU; None about an axis with hardly any rotation."""
     if not len(seen):
         return None
     pairs = zip(seen.T, felt.T, strict=True)

@@ -1,6 +1,6 @@
-"""Stamps and per-point times taken in the wrong unit: rates that no sensor has, and that one has in another unit.
+"""Detection of stamps and per-point times in the wrong unit: rates that are impossible, and plausible in another unit.
 
-Nothing is converted: what a file means only its owner knows.
+Nothing is converted, since only the owner knows what a file means.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def examine_units(
     sequence: Sequence, truth: Trajectory | None = None, with_imu: bool = True, with_gnss: bool = True,
     sweep: Span | None = None,
 ) -> list[Finding]:  # fmt: skip
-    """Findings about stamps of the scans, IMU, fixes and `truth`, and about per-point times, which lie within `sweep`."""
+    """Findings about stamps of the scans, IMU, fixes and `truth`, and about per-point times, which span `sweep`."""
     stamps = sequence.stamps_ns
     if len(stamps) < 2:
         return []
@@ -64,7 +64,7 @@ def examine_units(
 
 
 def _factor_of_scans(step: float, period: float) -> float:
-    """How many times too long the `step` from scan to scan is in s, 0 when it may be right.
+    """Unit factor by which the `step` between scans, s, is too long; 0 when it may be right.
 
     period : s, as stated, or of the stamps themselves where nothing is
     """
@@ -80,7 +80,7 @@ def _factor_of_scans(step: float, period: float) -> float:
 
 
 def _factor_beside(stamps: Stamps, span: float, usual: tuple[float, float]) -> float:
-    """How many times too long the time between `stamps` is, 0 when it may be right.
+    """Unit factor by which the time between `stamps` is too long; 0 when it may be right.
 
     span : s, of the scans; usual : s between two stamps of such a sensor
     """
@@ -94,7 +94,7 @@ def _factor_beside(stamps: Stamps, span: float, usual: tuple[float, float]) -> f
 
 
 def _unit(ratio: float, within: float) -> float:
-    """The factor of a unit that `ratio` is, up to `within` times; 0 when it is none."""
+    """Unit factor near `ratio`, up to `within` times; 0 when there is none."""
     return next((f for f in _factors() if 1 / within <= ratio / f <= within), 0.0)
 
 

@@ -1,4 +1,4 @@
-"""What is in a sequence, in numbers, and what is wrong with it: the facts behind `lslam info`."""
+"""Facts and faults of a sequence, in numbers, for `lslam info`."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ _BESIDE = 0.1
 
 
 def examine_bag(bag: Bag, uses: Mapping[str, str]) -> Facts:
-    """JSON-ready facts; times are those of recording.
+    """JSON-ready facts about a bag; times are those of recording.
 
-    uses : what each topic that is used is used for; `remarks` are sentences about files that were left out, lost or unpacked
+    uses : purpose of each topic in use; `remarks` are sentences about files that were left out, lost or unpacked
 
     A rate is that of the steps between the first and the last message, None below two.
     """
@@ -69,7 +69,7 @@ def examine_bag(bag: Bag, uses: Mapping[str, str]) -> Facts:
 
 
 def bag_at(name_or_path: str, data_root: Path | None) -> Facts | None:
-    """What is in the bag of this name or path, where it is one that can be opened; None where it is none."""
+    """Facts about the bag of this name or path; None where there is none that can be opened."""
     try:
         path = find_folder(name_or_path, data_root)
         return None if bag_reader.locate(path) is None else examine_bag(open_bag(path), {})
@@ -182,7 +182,7 @@ def _ground_truth(truth: Trajectory | None, stamps_ns: Longs) -> Facts | None:
 
 
 def examine_stamps(sequence: Sequence, findings: list[Finding]) -> Facts:
-    """Rate and gaps of the scans; stamps that go back were replaced by the reader, which said so."""
+    """Check rate and gaps of the scans. Stamps that go back were replaced, and reported, by the reader."""
     stamps = sequence.stamps_ns
     steps = np.diff(stamps) * 1e-9
     median = float(np.median(steps)) if len(steps) else 0.0
@@ -207,7 +207,7 @@ def examine_stamps(sequence: Sequence, findings: list[Finding]) -> Facts:
 
 
 def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Finding]) -> Facts:
-    """Statistics over the scans `indices`; those that cannot be read are counted, and the first of them named."""
+    """Statistics over the scans `indices`. Unreadable scans are counted, and the first of them named."""
     scans: list[Facts] = []
     unreadable: list[str] = []
     for index in indices:
@@ -254,7 +254,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
 
 
 def _examine_frame(directions: list[Longs], findings: list[Finding]) -> None:
-    """Whether the scans are seen from their sensor, which sees something below it, or above, wherever it goes."""
+    """Check that scans are in their sensor's frame: then the ground is always at one height below (or above) the origin."""
     shares = [emptied(directions[0], later) for later in directions[1:]]
     if len(shares) > 1 and np.median(shares) > MOST_EMPTIED:
         findings.append(
@@ -267,7 +267,7 @@ def _examine_frame(directions: list[Longs], findings: list[Finding]) -> None:
 
 
 def examine_times(sequence: Sequence, points: Facts, findings: list[Finding]) -> None:
-    """Whether scans can be deskewed, and whether per-point times fill a sweep."""
+    """Check whether scans can be deskewed, and whether per-point times fill a sweep."""
     limits = points["per_point_times"]
     if limits is None:
         if sequence.motion_compensated is not True:
@@ -294,7 +294,7 @@ def examine_times(sequence: Sequence, points: Facts, findings: list[Finding]) ->
 
 
 def rings_rule(sequence: Sequence) -> tuple[str | None, str]:
-    """How methods that need rings would find them, and a sentence; None where they could not."""
+    """Source of rings for methods that need them, and a sentence; None without one."""
     try:
         ringed = with_rings(sequence)
     except InputError as error:
@@ -337,7 +337,7 @@ def _ranges(scans: list[Facts]) -> Facts | None:
 
 
 def _limits(pairs: list[list[float] | None]) -> list[float] | None:
-    """Smallest and largest value over scans; None when half of them or more lack the field."""
+    """Smallest and largest value over scans; None when at least half of them lack the field."""
     known = [p for p in pairs if p is not None]
     if 2 * len(known) <= len(pairs):
         return None
