@@ -351,7 +351,7 @@ def _into_city(
 
 
 def _on(steps: Floats) -> NDArray[np.float32]:
-    """Transforms from each pose to the next; the last one is repeated."""
+    """Steps from one pose to the next, one per pose: the last step is repeated. Float32."""
     return np.concatenate([steps, steps[-1:]]).astype(np.float32)
 
 

@@ -357,6 +357,7 @@ def find_truth(sequence: BagSequence, links: Links, lidar: str, voice: Voice) ->
 
 
 def _find(links: Links, lidar: str, frame: str, what: str, voice: Voice) -> Floats | None:
+    """`T_lidar_frame` (4, 4) by the bag's transforms, with a note; None without a chain of them."""
     T, source = (links.find(lidar, frame) if frame else None) or (None, "")
     if T is not None:
         voice.notes.append(f"extrinsics of the {what}: T_{lidar}_{frame}, {source}")
