@@ -14,6 +14,7 @@ from lslam.core.types.scan import Span
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.initialise import FirstPoses, start
 from lslam.odometry.inertial.integrate import Increments, integrate
+from lslam.odometry.kernels import kalman
 from lslam.registration.result import RegistrationResult
 
 Floats = NDArray[np.float64]
@@ -211,6 +212,26 @@ def test_registration_on_an_older_map_has_more_weight() -> None:
         for age in (1.0, 30.0)
     ]
     assert 0 < moved[1] < 0.4 * moved[0]
+
+
+@pytest.mark.parametrize("ratio", [0.1, 1.0, 10.0])
+def test_what_poses_on_one_map_share_stays_in_the_covariance(ratio: float) -> None:
+    """The error of the map lasts for its age, that of a registration is its own; the IMU goes on from the pose before."""
+    rng, age = np.random.default_rng(5), 20.0
+    C = np.diag([1e-6] * 3 + [1e-8] * 3)
+
+    def drawn(variance: float) -> Floats:
+        return rng.multivariate_normal(np.zeros(6), variance * C)
+
+    fused, of_map, squares = np.zeros(6), drawn(1.0), []
+    for _ in range(400):
+        of_map = (1 - 1 / age) * of_map + drawn(1 - (1 - 1 / age) ** 2)
+        registered, felt = of_map + drawn(1.0), fused + drawn(ratio)
+        T = se3.make(so3.exp(registered[3:]), registered[:3])
+        pose, covariance = kalman.weighed(T, registered - felt, C, ratio * C, age)
+        fused = np.concatenate([pose[:3, 3], so3.log(pose[:3, :3])])
+        squares.append(float(fused @ np.linalg.solve(covariance, fused)) / 6)
+    assert 0.7 < np.mean(squares) < 1.6
 
 
 @pytest.mark.parametrize(
