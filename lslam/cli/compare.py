@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+from click.core import ParameterSource
 
 from lslam.cli import options
 from lslam.cli.console import log, setup_logging, show
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from lslam.core.types.trajectory import Trajectory
     from lslam.studies.plan import Plan
     from lslam.studies.subjects import Subject
+
+# Options that a comparison that ships with lslam does not have.
+_FIXED = ("preset", "config_file", "gt", "crop", "imu", "data_root")
 
 
 @click.command(
@@ -88,6 +92,8 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
         raise click.UsageError("--quick is of the comparisons of --list")
     if given["methods"] is None and not is_ready:
         raise click.UsageError("Missing option '--methods'.")
+    if is_ready:
+        _refuse_what_is_fixed(sequences[0], given)
     plan = _ready_plan(sequences[0], given) if is_ready else _plan(sequences, given)
     from lslam.cli.console import bars
     from lslam.core.errors import GateError, RunFailedError
@@ -152,6 +158,17 @@ def _print_list(as_json: bool) -> None:
         show(json.dumps({"comparisons": found}) + "\n")
         return
     show("".join(f"{name:<14}  {summary}\n" for name, summary in found.items()))
+
+
+def _refuse_what_is_fixed(name: str, given: dict[str, Any]) -> None:
+    """Raise UsageError for an option that a comparison that ships with lslam has no use for."""
+    context = click.get_current_context()
+    for option in context.command.params:
+        if option.name in _FIXED and context.get_parameter_source(option.name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(
+                f"{option.opts[0]} is not of {name}, which simulates its drives and fixes its systems: leave it out, or "
+                "compare recordings by --methods"
+            )
 
 
 def _ready_plan(name: str, given: dict[str, Any]) -> Plan:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
@@ -112,7 +111,7 @@ class ReadyComparison(Section):
         """The variants with the map of a simulated drive, its place and heading; drift is drawn by the drive's seed."""
         if not self.maps:
             return list(variants)
-        world = tomllib.loads((cell.path / "truth" / "world.toml").read_text())
+        world = parse_toml((cell.path / "truth" / "world.toml").read_text(encoding="utf-8"))
         first = np.array(world["T_enu_world"]) @ read_trajectory(cell.path / "truth" / "trajectory.tum").poses[0]
         start = geodesy.from_local(first[None, :3, 3], np.array(world["origin_lat_lon_alt"]))[0]
         place = {
@@ -137,7 +136,9 @@ class ReadyComparison(Section):
         if wanted.perturbed:
             return cell.path / PERTURBED
         path = out / MAPS / f"{cell.sequence}-{cell.seed}-{kind}.osm"
-        origin = np.array(tomllib.loads((cell.path / "truth" / "world.toml").read_text())["origin_lat_lon_alt"])
+        origin = np.array(
+            parse_toml((cell.path / "truth" / "world.toml").read_text(encoding="utf-8"))["origin_lat_lon_alt"]
+        )
         exact = read_buildings(cell.path / EXACT, origin)[1].buildings
         none = {"simplified": 0.0, "merged": 0.0, "missing": 0.0, "new": 0.0}
         turn = float(np.radians(wanted.house_deg))

@@ -145,6 +145,8 @@ def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: P
             UsageError,
             "block-0 has 95 scans: start = 95 goes",
         ),
+        (["del-tufo", "--data-root", "kitti"], click.UsageError, "--data-root is not of del-tufo"),
+        (["girolimetto", "--preset", "hdl"], click.UsageError, "--preset is not of girolimetto"),
     ],
 )
 def test_usage_errors_come_before_any_run(

@@ -164,7 +164,8 @@ def test_a_pose_is_weighed_against_another_by_both_covariances() -> None:
     pose, left = kalman.weighed(T, rest, C, P, 5.0)
     np.testing.assert_allclose(pose[:3, :3], so3.exp(d[3:]) @ T[:3, :3], atol=1e-14)
     np.testing.assert_allclose(pose[:3, 3], T[:3, 3] + d[:3], atol=1e-14)
-    np.testing.assert_allclose(left, C - K @ C, atol=1e-11)
+    L = np.eye(6) - K
+    np.testing.assert_allclose(left, L @ C + (1 - 1 / 5.0) * L @ C @ L.T, atol=1e-11)
 
 
 def test_stretches_overlap_by_more_than_an_instant() -> None:

@@ -312,7 +312,7 @@ def test_each_scan_is_read_once_in_a_pass_and_any_order_gives_the_same() -> None
     other.reads.clear()
     forwards = [sequence.scan(k) for k in range(30)]
     assert sorted(other.reads) == sorted(set(other.reads)), "no scan is decoded twice"
-    assert max(len(source.held) for source in sequence._sources) <= 4, "memory does not grow"
+    assert max(len(source.cache) for source in sequence._sources) <= 4, "memory does not grow"
     for k in (29, 3, 17, 0):
         again = sequence.scan(k)
         np.testing.assert_array_equal(again.points, forwards[k].points)
