@@ -148,8 +148,6 @@ def _evaluate_all(
     from lslam.evaluation.evaluate import evaluate
     from lslam.io.formats.calibration_files import read_transform
     from lslam.io.formats.trajectory_files import read_trajectory
-    from lslam.pipeline.rebuild import read_run
-    from lslam.pipeline.resume import open_again
 
     ground_truth = read_trajectory(truth, given["gt_format"], given["times"])
     T_est_gt = None if given["transform"] is None else read_transform(given["transform"])
@@ -157,6 +155,9 @@ def _evaluate_all(
     evaluations = []
     for path in estimates:
         if config.frame not in calibration.known() and given["calib"] is None and path.is_dir():
+            from lslam.pipeline.rebuild import read_run
+            from lslam.pipeline.resume import open_again
+
             calibration = open_again(read_run(path)).calibration
         estimate: Trajectory = read_trajectory(path, given["file_format"], given["times"])
         result = evaluate(estimate, ground_truth, config, T_est_gt=T_est_gt, calibration=calibration)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 CLASSES = {
     "unlabeled": 0, "outlier": 1, "car": 10, "bicycle": 11, "bus": 13, "motorcycle": 15, "on-rails": 16, "truck": 18,
@@ -50,6 +51,9 @@ def numbers_of(names: Iterable[str]) -> set[int]:
 
 def table_of(names: Iterable[str]) -> NDArray[np.bool_]:
     """(65536,) whether a label is one of the classes that are named."""
+    # The configuration is checked before anything heavy is imported.
+    import numpy as np
+
     table = np.zeros(_VALUES, np.bool_)
     table[sorted(numbers_of(names))] = True
     return table

@@ -109,7 +109,7 @@ def test_another_reader_finds_what_ros_expects(distorted: SimulatedDrive, tmp_pa
                 assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == stamp
             if connection.topic == "/points":
                 names = [field.name for field in message.fields]
-                assert names == ["x", "y", "z", "intensity", "ring", "time"]
+                assert names == ["x", "y", "z", "intensity", "ring", "time", "label"]
                 assert message.row_step == message.width * message.point_step == len(message.data)
         assert stamps == sorted(stamps)
         assert types["/tf_static"] == "tf2_msgs/msg/TFMessage"
