@@ -89,7 +89,7 @@ CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odo
 COSINES = {"UPRIGHT"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
 LACK = {"FORGETTING", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
-EXCESS = {"CLEARLY", "MUCH", "PILED"}
+EXCESS = {"CLEARLY", "MUCH", "MORE", "PILED"}
 FACTORS = {"half": 0.5, "double": 2.0}
 
 

@@ -12,7 +12,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import ImuDiagnostics
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
-from lslam.core.types.scan_result import SAME_M, ScanResult, StageClock, Status
+from lslam.core.types.scan_result import ScanResult, StageClock, Status
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Odometry, Resumable, Windowed
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
@@ -21,6 +21,10 @@ from lslam.odometry.scan_outcome import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.gaussian_map import FLOOR
 from lslam.registration.result import RegistrationResult
+
+# Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
+# between the prior and the first.
+SAME = 0.3
 
 
 @dataclass(frozen=True)
@@ -229,7 +233,8 @@ class Tracker(Stateful):
         fused = self._checked(odometry, scan.stamp_ns, near, expected, None, clock)
         if fused.is_accepted:
             return _both(located, fused)
-        source = located if near.ok and _apart(near.T_world_lidar, located.T_world_lidar) < SAME_M else rejected
+        apart, off = (_apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
+        source = located if near.ok and apart < SAME * off else rejected
         # Where nothing is found near by, the first registration enters with the points as they are seen from there.
         base = near
         if not near.ok:

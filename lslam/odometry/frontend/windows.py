@@ -22,7 +22,6 @@ from lslam.odometry.frontend.segments import SegmentTracker, Tracked
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import NEIGHBOURS, Course
-from lslam.odometry.inertial.gyroscope import MEMORY
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.registration.robust import is_more
 
@@ -77,8 +76,8 @@ def _is_placed(tracked: Tracked) -> bool:
     )
 
 
-# Scans, which are held in memory.
-WINDOW = MEMORY
+# Scans: two seconds, which are held in memory.
+WINDOW = 20
 
 
 class WindowTracker(Stateful):

@@ -17,9 +17,9 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
-from lslam.odometry.inertial.gyroscope import MEMORY, OUTLIER, Gyroscope
+from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
-from lslam.odometry.inertial.imu_estimate import PLACE_SIGMA, WORSE, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import WORSE, ImuEstimate
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
@@ -36,10 +36,10 @@ class InertialMotion(Stateful):
     imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
     """
 
-    # Scans over which the IMU's median prediction error is tested against constant velocity.
-    JUDGED = MEMORY
+    # Scans over which the IMU's median prediction error is tested against constant velocity, and the slack of the test.
+    JUDGED, SLACK_M = 30, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
-    COMPARED = MEMORY
+    COMPARED = 20
     # Whether it has states for the device, the rotation of its extrinsics and its clock.
     HAS_DEVICE: ClassVar[bool] = True
     STATE: ClassVar[tuple[str, ...]] = (
@@ -327,8 +327,7 @@ class InertialMotion(Stateful):
             return
         newest = np.sort(np.array(self._errors[-self.JUDGED :]), axis=0)
         own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
-        # Where both are good, the noise of registration decides.
-        if own > WORSE * (steady + PLACE_SIGMA):
+        if own > WORSE * steady + self.SLACK_M:
             self.refusal = (
                 f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
                 f"{LEVER_M:.0f} m): check its axes, T_lidar_imu and its stamps"

@@ -59,7 +59,7 @@ USUAL_NOISE = ImuNoise()
 
 # One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
 AXES_SIGMA = 0.025
-# Scans, two seconds of most sensors: so long the noise is learnt, and what is known of it and of the motion counts.
+# The noise is learnt over so many scans.
 MEMORY = 20
 # Where they are estimated, one sigma: a mounting read off a drawing or by eye, rad; the latency of a driver, s; how an offset
 # of two clocks drifts (some ppm), s per sqrt(s).

@@ -13,15 +13,15 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan_result import OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
 from lslam.odometry.integrity.directions import MOST_EMPTIED
 from lslam.odometry.integrity.pair_registration import is_within
-from lslam.registration.start_search import MUCH
 
 # Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
 LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
-# One check is enough where it says so much more, and explains `MUCH` more of the points.
+# One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.repeat([OPEN_M, OPEN_RAD], 3)
-# m/s2, five times gravity: nothing that carries a LiDAR is accelerated so, but scans out of order are.
-MOST_ACCELERATION = 50.0
+MORE = 1.15
+# m/s2, five times gravity, over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
+MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
 # Checks in a row between standing and moving: one is chance.
 OPEN_IN_A_ROW = 2
 AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
@@ -72,7 +72,7 @@ def _noise(apart: Floats) -> Floats:
 
 def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
     """Begin and end of where they say so again and again, or one of them by much, along one axis."""
-    is_better = np.array([check.agreement > MUCH * check.claimed_agreement for check in checks])
+    is_better = np.array([check.agreement > MORE * check.claimed_agreement for check in checks])
     is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * OUTLIER_SIGMAS * sigma)
     stretches = []
     for begin, end in _runs(np.where(np.abs(apart) > LEAST[axis], np.sign(apart), 0)):
@@ -218,8 +218,8 @@ def _velocity_changes(positions: Floats, steps: Floats) -> tuple[Floats, Floats]
 
 
 def _is_jump(change: Floats, between: Floats) -> Bools:
-    """Whether nothing that carries a sensor changes its velocity so much, m/s, in such a time, s, so that motions are not one."""
-    return np.asarray((change / between > MOST_ACCELERATION) & (change * between > SAME_M))
+    """Whether nothing that carries a sensor changes its velocity so much, m/s, in such a time, s."""
+    return np.asarray((change / between > MOST_ACCELERATION) & (change * between > LEAST_JERK_M))
 
 
 def _is_by_stamps(positions: Floats, steps: Floats) -> Bools:

@@ -23,11 +23,14 @@ from lslam.registration.robust import UsualAgreement
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
 LAG_S, REACH_SHARE = 0.45, 0.75
-# s; no motion is extrapolated over longer, and a longer pause between two scans is a break.
+# s; no motion is extrapolated over longer.
 MAX_EXTRAPOLATION_S = 3 * LAG_S
-# Points that make the planes of the first scan, as many as are registered, and of the last scan those that are laid on them.
-PLANE_POINTS = (PreprocessConfig().source_points_min + PreprocessConfig().source_points_max) // 2
-LAID_POINTS = 1200
+# s; a longer pause between two scans is a break.
+PAUSE_S = 1.0
+# Points that make the planes of the first scan, and of the last scan those that are laid on them.
+PLANE_POINTS, LAID_POINTS = 5000, 1200
+# Another motion than the one found from the claim must explain so many times more points.
+MORE = 1.1
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class IntegrityMonitor(Stateful):
         stamp_ns, is_ok = result.stamp_ns, result.status == "ok"
         step_s = (stamp_ns - self._last_ns) * 1e-9
         self._last_ns = stamp_ns
-        self._is_broken |= (position > 0 and step_s > MAX_EXTRAPOLATION_S) or not is_ok
+        self._is_broken |= (position > 0 and step_s > PAUSE_S) or not is_ok
         if scan is None or not is_ok or not self._is_due(position, scan, result, step_s):
             return
         now = self._view(position, scan, prepared, result, sweep)
@@ -153,7 +156,7 @@ class IntegrityMonitor(Stateful):
         is_odd = is_still(claimed) or self._usual.is_less(near_claim.agreement)
         # No vehicle comes to rest faster than by gravity, or its tyres do not hold.
         if not is_still(claimed) and (self._may_stand or self._speed < GRAVITY * seconds):
-            hypotheses.append(pair.at(np.eye(4)))
+            hypotheses.append(pair.at_rest())
         if self._motion is None:
             hypotheses.append(pair.far(np.eye(4)))
         elif (expected := self._expected(seconds)) is not None:
@@ -162,7 +165,7 @@ class IntegrityMonitor(Stateful):
                 hypotheses.append(pair.near(expected))
         if is_odd and (is_still(claimed) or self._usual.is_less(max(h.agreement for h in hypotheses))):
             hypotheses.append(pair.far(claimed))
-        best, rival = best_of(hypotheses)
+        best, rival = best_of(hypotheses, MORE)
         if best.sigma is None:
             return
         usual = self._usual.usual

@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
 from lslam.core.kernels.significance import OUTLIER_SIGMAS
@@ -24,14 +23,15 @@ from lslam.registration.residuals import PLANE
 from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import voxel_terms
-from lslam.registration.start_search import MUCH
 
 SETTINGS = RegistrationConfig(blob_weight=0.0)
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
-# room, and no smaller than the cells that each leave one point.
-EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, PreprocessConfig().map_leaf, SETTINGS.coarse_factor * SETTINGS.voxel_size
+# room, and spans several points and several sigma of their noise.
+EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, SETTINGS.coarse_factor * SETTINGS.voxel_size
 # Half of an edge is how far a plane reaches.
 CAPTURE = 0.4
+# Steps that settle a scan which lies within its noise of where it was.
+STEPS_AT_REST = 4
 
 
 @dataclass(frozen=True)
@@ -118,6 +118,11 @@ class PairRegistration:
         s = SETTINGS
         return self._lay(start, Annealing(s.coarse_kernel, s.kernel_min, s.coarse_decay, s.start_iterations))
 
+    def at_rest(self) -> MotionHypothesis:
+        """The motion that fits if the sensor stands: its points lie within their noise of where they were."""
+        s = SETTINGS
+        return self._lay(np.eye(4), Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, STEPS_AT_REST))
+
     def at(self, motion: Floats) -> MotionHypothesis:
         """How the scan fits at a motion (4, 4)."""
         s = SETTINGS
@@ -131,13 +136,13 @@ class PairRegistration:
         return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))
 
 
-def best_of(hypotheses: Sequence[MotionHypothesis]) -> tuple[MotionHypothesis, MotionHypothesis | None]:
-    """The motion with the most points, the first one unless another has `MUCH` more, and its rival.
+def best_of(hypotheses: Sequence[MotionHypothesis], more: float) -> tuple[MotionHypothesis, MotionHypothesis | None]:
+    """The motion with the most points, the first one unless another has `more` times as many, and its rival.
 
     A rival is another motion whose own points are at least half as many as those of the best.
     """
     best = max(hypotheses, key=lambda h: h.result.inliers)
-    if best.result.inliers <= MUCH * hypotheses[0].result.inliers:
+    if best.result.inliers <= more * hypotheses[0].result.inliers:
         best = hypotheses[0]
     rivals = [h for h in hypotheses if not h.is_same(best) and 2 * h.own_points(best) >= best.own_points(h)]
     return best, max(rivals, key=lambda h: h.own_points(best), default=None)

@@ -189,7 +189,7 @@ def test_wrong_extrinsics_are_refused_during_the_run() -> None:
 
 
 @pytest.mark.parametrize("velocity", ["registration", "along-x", "integrated"])
-def test_an_imu_is_refused_after_twenty_scans_by_prior_errors(velocity: str) -> None:
+def test_an_imu_is_refused_after_thirty_scans_by_prior_errors(velocity: str) -> None:
     """Not by fewer; constant velocity has something to say from the third on. Another rule is the user's wish."""
     drive = walk()
     wrong = extrinsics_of(drive) @ se3.make(so3.exp(np.array([np.pi / 2, 0, 0])), np.zeros(3))
@@ -197,7 +197,7 @@ def test_an_imu_is_refused_after_twenty_scans_by_prior_errors(velocity: str) -> 
     for stamp, pose in zip(*truth_of(drive), strict=True):
         motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))
         refused.append(bool(motion.refusal))
-    assert (refused.index(True) if any(refused) else None) == (21 if velocity == "registration" else None)
+    assert (refused.index(True) if any(refused) else None) == (31 if velocity == "registration" else None)
 
 
 def test_one_scan_in_twenty_is_compared_with_constant_velocity_unless_in_a_gap() -> None:
