@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from lslam.core.kernels import ground
 from lslam.core.labels import CLASSES
 from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.osm.walls import CELL, ROUGHNESS_M, SLOPE, THICKNESS, lowest_levels
 
 GROUND, WALL, POLE = CLASSES["other-ground"], CLASSES["building"], CLASSES["pole"]
 VEGETATION, VEHICLE, OTHER = CLASSES["vegetation"], CLASSES["car"], CLASSES["unlabeled"]
-SQUARE, SLOPE, STEP = 2.0, 0.3, 0.3  # m, m/m, m: grid, steepest and roughest ground, as for walls
-NEAR = 10.0  # m about the sensor, where the ground is surely seen
-CUBE = 0.4  # m; three of them to a side are the neighbourhood of a point
-THICKNESS = 0.1  # m; largest standard deviation across a plane, as for walls
-UPRIGHT = np.sin(np.radians(20.0))  # largest vertical component of the normal of a wall
-FEW = 5.0  # points in a neighbourhood, with fewer it has no shape
-TALLEST = 2.6  # m above the ground: vehicles, but for lorries
-LENGTHS, WIDTHS, LOWEST = (1.5, 6.5), (0.5, 2.6), 0.9  # m; of the part that is seen of a vehicle, and its least height
-MOST = 0.5  # share of the points in a column of a wall that lie on upright planes
-SMOOTH = 0.1  # share of a vehicle's points that lie on planes; leaves have hardly any
-NARROW, LEAST_POLE = 0.8, 1.2  # m; width of a pole in squares of CUBE, and its least height
+NEAR_M = 10.0  # m about the sensor, where the ground is surely seen
+CUBE_M = 0.4  # m; three of them to a side are the neighbourhood of a point
+FLATNESS = 6.0  # times the variance across a plane that it has along its narrower side, or it is a line
+UPRIGHT_SINE = np.sin(np.radians(20.0))  # largest vertical component of the normal of a wall
+LEAST_POINTS = 5.0  # points in a neighbourhood, with fewer it has no shape
+VEHICLE_HEIGHTS_M = 0.9, 2.6  # m above the ground, but for lorries
+VEHICLE_LENGTHS_M, VEHICLE_WIDTHS_M = (1.5, 6.5), (0.5, 2.6)  # m; of the visible part of a vehicle
+WALL_SHARE = 0.5  # share of the points in a column of a wall that lie on upright planes
+SMOOTH_SHARE = 0.1  # share of a vehicle's points that lie on planes; leaves have hardly any
+POLE_WIDTH_M, LEAST_POLE_HEIGHT_M = 0.8, 1.2  # m; width of a pole in squares of CUBE_M, and its least height
 
 
 def classify(points: NDArray[Any]) -> NDArray[np.uint16]:
@@ -35,7 +35,7 @@ def classify(points: NDArray[Any]) -> NDArray[np.uint16]:
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
     labels = np.full(len(cloud), GROUND, np.uint16)
     height = _heights(cloud)
-    off = np.flatnonzero(height > STEP)
+    off = np.flatnonzero(height > ROUGHNESS_M)
     if len(off):
         labels[off] = _standing(cloud[off].astype(np.float64), height[off])
     return labels
@@ -45,38 +45,36 @@ def _heights(cloud: NDArray[np.float32]) -> Floats:
     """(N,) m above the ground below each point."""
     if not len(cloud):
         return np.zeros(0)
-    half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / SQUARE)) + 1
-    lowest = ground.lowest(cloud, np.eye(3), SQUARE, half)
-    level = np.where(lowest >= 0, cloud[lowest, 2], ground.EMPTY).reshape(2 * half, 2 * half)
+    level, half = lowest_levels(cloud)
     # What panes mirror seems to lie far below: no street falls so from where the sensor is.
-    away = SQUARE * np.hypot(*(np.indices(level.shape) - (half - 0.5)))
-    here = level[(away < NEAR) & (level < ground.EMPTY)]
+    away = CELL * np.hypot(*(np.indices(level.shape) - (half - 0.5)))
+    here = level[(away < NEAR_M) & (level < ground.EMPTY)]
     if len(here):
-        level[level < np.median(here) - SLOPE * away - STEP] = ground.EMPTY
-    top = np.asarray(ground.envelope(level, SLOPE * SQUARE, STEP)).reshape(level.shape)
-    i, j = (np.floor(cloud[:, :2] / SQUARE).astype(np.int64) + half).T
+        level[level < np.median(here) - SLOPE * away - ROUGHNESS_M] = ground.EMPTY
+    top = np.asarray(ground.envelope(level, SLOPE * CELL, ROUGHNESS_M)).reshape(level.shape)
+    i, j = (np.floor(cloud[:, :2] / CELL).astype(np.int64) + half).T
     return np.asarray(cloud[:, 2] - top[i, j], np.float64)
 
 
 def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
     """Classes of points above the ground: by the shape of their cubes, then by what stands together."""
-    cells = np.floor(points / CUBE).astype(np.int64)
+    cells = np.floor(points / CUBE_M).astype(np.int64)
     keys, member = np.unique(_packed(cells), return_inverse=True)
     is_flat, is_upright, is_rough = _shapes(points, keys, member)
     flat, upright = is_flat[member], is_upright[member]
     labels = np.where(is_rough[member], VEGETATION, OTHER).astype(np.uint16)
-    labels[flat & ~upright & (height < LOWEST)] = GROUND
+    labels[flat & ~upright & (height < VEHICLE_HEIGHTS_M[0])] = GROUND
     # A wall is higher than a vehicle: as far as planes rise that stand together.
     planes = _things(cells[upright])
     rise = np.zeros(planes.max(initial=-1) + 1)
     np.maximum.at(rise, planes, height[upright])
     is_wall = upright.copy()
-    is_wall[upright] = (rise > TALLEST)[planes]
+    is_wall[upright] = (rise > VEHICLE_HEIGHTS_M[1])[planes]
     # Windows and balconies are no planes: most of what stands in their columns is.
     column = np.unique(_packed(cells * [1, 1, 0]), return_inverse=True)[1]
     share = np.bincount(column, is_wall) / np.bincount(column)
-    labels[is_wall | (share > MOST)[column] | (flat & (height > TALLEST))] = WALL
-    low = (height < TALLEST) & np.isin(labels, (OTHER, VEGETATION))
+    labels[is_wall | (share > WALL_SHARE)[column] | (flat & (height > VEHICLE_HEIGHTS_M[1]))] = WALL
+    low = (height < VEHICLE_HEIGHTS_M[1]) & np.isin(labels, (OTHER, VEGETATION))
     things = _things(cells[low])
     labels[low] = _by_size(points[low], height[low], things, labels[low], flat[low])
     return labels
@@ -101,9 +99,9 @@ def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, B
     for k, (i, j) in enumerate(pairs):
         covariance[:, i, j] = covariance[:, j, i] = total[:, 4 + k] / total[:, 0] - mean[:, i] * mean[:, j]
     values, vectors = np.linalg.eigh(covariance)
-    is_known = total[:, 0] >= FEW
-    is_flat = is_known & (values[:, 0] < THICKNESS**2) & (values[:, 1] > 6.0 * np.maximum(values[:, 0], 0.0))
-    return is_flat, is_flat & (np.abs(vectors[:, 2, 0]) < UPRIGHT), is_known & ~is_flat
+    is_known = total[:, 0] >= LEAST_POINTS
+    is_flat = is_known & (values[:, 0] < THICKNESS**2) & (values[:, 1] > FLATNESS * np.maximum(values[:, 0], 0.0))
+    return is_flat, is_flat & (np.abs(vectors[:, 2, 0]) < UPRIGHT_SINE), is_known & ~is_flat
 
 
 def _things(cells: Longs) -> Longs:
@@ -137,12 +135,14 @@ def _by_size(
     across = relative[:, 1] * axes[:, 0] - relative[:, 0] * axes[:, 1]
     length, width = _extent(things, along, len(count)), _extent(things, across, len(count))
     smooth = np.bincount(things, is_flat) / count
-    is_vehicle = (
-        (length > LENGTHS[0]) & (length < LENGTHS[1]) & (width > WIDTHS[0]) & (width < WIDTHS[1])
-        & (top > LOWEST) & (smooth > SMOOTH)
-    )  # fmt: skip
-    is_pole = (length < NARROW) & (top > LEAST_POLE)
+    is_vehicle = _within(length, VEHICLE_LENGTHS_M) & _within(width, VEHICLE_WIDTHS_M)
+    is_vehicle &= (top > VEHICLE_HEIGHTS_M[0]) & (smooth > SMOOTH_SHARE)
+    is_pole = (length < POLE_WIDTH_M) & (top > LEAST_POLE_HEIGHT_M)
     return np.where(is_vehicle[things], VEHICLE, np.where(is_pole[things], POLE, labels)).astype(np.uint16)
+
+
+def _within(values: Floats, limits: tuple[float, float]) -> Bools:
+    return (values > limits[0]) & (values < limits[1])
 
 
 def _extent(things: Longs, values: Floats, count: int) -> Floats:

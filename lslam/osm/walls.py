@@ -22,6 +22,7 @@ from lslam.osm.kernels import segments
 
 CELL = 2.0  # m; of the grid in which the ground is found
 SLOPE = 0.3  # m per m; steepest street
+ROUGHNESS_M = 0.3  # m; of the ground within a cell
 NEIGHBOURHOOD = 0.6  # m; half the window in which the points of a wall lie on a plane
 THICKNESS = 0.1  # m; largest standard deviation across that plane
 STEP = 0.5  # m; three of them reach from the last such neighbourhood of a wall to its corner
@@ -109,14 +110,17 @@ def walls_of(buildings: Iterable[Building]) -> tuple[Floats, Longs]:
     return np.asarray(found, np.float64), np.array(owners, np.int64)
 
 
-def _high(cloud: NDArray[np.float32], height: float) -> Longs:
-    """Indices of the points more than `height` m above the ground."""
+def lowest_levels(cloud: NDArray[np.float32]) -> tuple[Floats, int]:
+    """(2 half, 2 half) height, m, of the lowest point in each cell about the sensor, `ground.EMPTY` without points; and half."""
     half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / CELL)) + 1
     lowest = ground.lowest(cloud, np.eye(3), CELL, half)
-    level = np.full(len(lowest), ground.EMPTY)
-    level[lowest >= 0] = cloud[lowest[lowest >= 0], 2]
-    top = ground.envelope(level.reshape(2 * half, 2 * half), SLOPE * CELL, 0.3)
-    return ground.above(cloud, np.eye(3), CELL, half, top, height)
+    return np.where(lowest >= 0, cloud[lowest, 2].astype(np.float64), ground.EMPTY).reshape(2 * half, 2 * half), half
+
+
+def _high(cloud: NDArray[np.float32], height: float) -> Longs:
+    """Indices of the points more than `height` m above the ground."""
+    level, half = lowest_levels(cloud)
+    return ground.above(cloud, np.eye(3), CELL, half, ground.envelope(level, SLOPE * CELL, ROUGHNESS_M), height)
 
 
 def _directed(found: Floats, views: Floats) -> Floats:

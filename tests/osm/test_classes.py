@@ -40,7 +40,7 @@ def test_each_thing_of_a_street_is_what_it_is(low: float) -> None:
     ends = np.cumsum([len(part) for part in parts])
     for k, (end, number) in enumerate(zip(ends, expected, strict=True)):
         of_part = found[end - len(parts[k]) : end]
-        above = parts[k][:, 2] > classes.STEP + 0.1 if k else np.ones(len(parts[k]), np.bool_)
+        above = parts[k][:, 2] > classes.ROUGHNESS_M + 0.1 if k else np.ones(len(parts[k]), np.bool_)
         assert np.mean(of_part[above] == number) > 0.8, k
 
 
