@@ -1,4 +1,4 @@
-"""What is found beside what a thesis prints: number by number, and one system against another."""
+"""Runs compared with what a thesis prints: number by number, and one system against another."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CHANCE = 0.05
 
 
 @dataclass(frozen=True)
-class Judged:
+class Judgement:
     """A verdict and why."""
 
     verdict: Verdict
@@ -34,19 +34,19 @@ def spread(values: Sequence[float]) -> tuple[float, float]:
     return middle, ordered[-1]
 
 
-def difficulty(printed: float | None, found: Sequence[float]) -> str:
+def difficulty(printed: float | None, values: Sequence[float]) -> str:
     """How hard ours was beside theirs, by the angular error, deg: `as hard`, `easier`, `harder`; empty where nobody knows.
 
     >>> difficulty(2.0, [0.1, 0.2]), difficulty(2.0, [1.5]), difficulty(None, [1.0])
     ('easier', 'as hard', '')
     """
-    if printed is None or not found:
+    if printed is None or not values:
         return ""
-    ratio = spread(found)[0] / printed
+    ratio = spread(values)[0] / printed
     return "as hard" if 1 / LIKE <= ratio <= LIKE else "easier" if ratio < 1 else "harder"
 
 
-def judge_number(printed: float, found: Sequence[float], hardness: str = "") -> Judged:
+def judge_number(printed: float, values: Sequence[float], hardness: str = "") -> Judgement:
     """Whether ours is of the printed size. It is refuted only where all runs are off to one side, of what was as hard.
 
     >>> judge_number(0.8, [0.5, 0.9]).verdict, judge_number(0.8, [0.1, 0.2], "as hard").verdict
@@ -54,20 +54,20 @@ def judge_number(printed: float, found: Sequence[float], hardness: str = "") -> 
     >>> judge_number(0.8, [0.1, 0.2], "easier").why
     'all 2 runs are smaller by more than 2 times, of what was easier'
     """
-    failed = sum(map(np.isinf, found))
-    if failed or not found:
-        return Judged("undecided", f"{failed} of {len(found)} runs failed")
-    low, high = min(found), max(found)
+    failed = sum(map(np.isinf, values))
+    if failed or not values:
+        return Judgement("undecided", f"{failed} of {len(values)} runs failed")
+    low, high = min(values), max(values)
     if low / LIKE <= printed <= high * LIKE:
-        return Judged("reproduced", f"{printed:g} lies among the runs, within a factor of {LIKE:g}")
+        return Judgement("reproduced", f"{printed:g} lies among the runs, within a factor of {LIKE:g}")
     side = "smaller" if high < printed else "larger"
-    said = f"all {len(found)} runs are {side} by more than {LIKE:g} times"
+    text = f"all {len(values)} runs are {side} by more than {LIKE:g} times"
     if hardness == "as hard":
-        return Judged("refuted", f"{said}, of what was as hard")
-    return Judged("undecided", f"{said}, of what was {hardness or 'nobody knows how hard'}")
+        return Judgement("refuted", f"{text}, of what was as hard")
+    return Judgement("undecided", f"{text}, of what was {hardness or 'nobody knows how hard'}")
 
 
-def judge_order(is_smaller: bool, pairs: Sequence[tuple[float, float]]) -> Judged:
+def judge_order(is_smaller: bool, pairs: Sequence[tuple[float, float]]) -> Judgement:
     """Whether the first of each pair, of one seed, is smaller (or larger) than the second, as it is stated.
 
     Decided where every seed says the same and so many of them do not by chance.
@@ -75,14 +75,14 @@ def judge_order(is_smaller: bool, pairs: Sequence[tuple[float, float]]) -> Judge
     >>> judge_order(True, [(1, 2)] * 5).verdict, judge_order(False, [(1, 2)] * 5).verdict, judge_order(True, [(1, 2)] * 4).verdict
     ('reproduced', 'refuted', 'undecided')
     """
-    known = [(a, b) for a, b in pairs if a != b]
-    if not known:
-        return Judged("undecided", "no pair of runs")
-    agree = sum((a < b) == is_smaller for a, b in known)
-    finite = [a / b for a, b in known if np.isfinite([a, b]).all() and b > 0]
+    unequal = [(a, b) for a, b in pairs if a != b]
+    if not unequal:
+        return Judgement("undecided", "no pair of runs")
+    agree = sum((a < b) == is_smaller for a, b in unequal)
+    finite = [a / b for a, b in unequal if np.isfinite([a, b]).all() and b > 0]
     ratio = f"; median ratio {np.median(finite):.2f}" if finite else ""
-    said = f"so in {agree} of {len(pairs)} seeds{ratio}"
-    is_certain = agree in (0, len(pairs)) and len(known) == len(pairs) and 0.5 ** len(pairs) < CHANCE
+    text = f"so in {agree} of {len(pairs)} seeds{ratio}"
+    is_certain = agree in (0, len(pairs)) and len(unequal) == len(pairs) and 0.5 ** len(pairs) < CHANCE
     if not is_certain:
-        return Judged("undecided", said)
-    return Judged("reproduced" if agree else "refuted", said)
+        return Judgement("undecided", text)
+    return Judgement("reproduced" if agree else "refuted", text)

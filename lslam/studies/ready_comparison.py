@@ -17,6 +17,7 @@ from lslam.core.config.section import Section
 from lslam.core.errors import ConfigError, UsageError, nearest
 from lslam.core.geometry import geodesy, se2
 from lslam.core.printable import significant
+from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import RunScore, Table
 from lslam.core.untrusted import parse_toml
 from lslam.evaluation.beside import difficulty, judge_number, judge_order, spread
@@ -43,6 +44,8 @@ MAPS = "maps"
 HARD = "-hard"
 # Between a system and the map that it is given.
 ON = "@"
+# deg, one sigma of the heading at the start.
+START_HEADING_DEG = 5.0
 
 
 class MapKind(Section):
@@ -101,51 +104,51 @@ class ReadyComparison(Section):
     def variants(self, settings: Sequence[str]) -> list[Variant]:
         """The methods, and the systems of `on_map` on each map, `settings` over all."""
         common = [*_ALWAYS, *self.settings, *settings]
-        found = find_variants(self.methods, None, common, self.imu)
+        variants = find_variants(self.methods, None, common, self.imu)
         for name, own in self.on_map.items():
             config = load_config(None, [*common, *own])
-            found += [Variant(f"{name}{ON}{kind}", config, name) for kind in self.maps]
-        return found
+            variants += [Variant(f"{name}{ON}{kind}", config, name) for kind in self.maps]
+        return variants
 
     def fitted(self, variants: Sequence[Variant], cell: Cell, out: Path) -> list[Variant]:
         """The variants with the map of a simulated drive, its place and heading; drift is drawn by the drive's seed."""
         if not self.maps:
             return list(variants)
-        world = parse_toml((cell.path / "truth" / "world.toml").read_text(encoding="utf-8"))
-        first = np.array(world["T_enu_world"]) @ read_trajectory(cell.path / "truth" / "trajectory.tum").poses[0]
-        start = geodesy.from_local(first[None, :3, 3], np.array(world["origin_lat_lon_alt"]))[0]
+        T_enu_world, origin = _world_of(cell)
+        first = T_enu_world @ read_trajectory(cell.path / "truth" / "trajectory.tum").poses[0]
+        start = geodesy.from_local(first[None, :3, 3], origin)[0]
         place = {
             "origin": tuple(start.tolist()),
             "heading_deg": 90.0 - float(np.degrees(se2.of_se3(first[None])[0, 2])),
         }
-        fitted = []
+        on_map = []
         for variant in variants:
             config = variant.config
             debug = config.debug.model_copy(update={"drift_seed": cell.seed or 0})
             if kind := variant.name.partition(ON)[2]:
                 extract = str(self._map(kind, cell, out))
-                osm = config.osm.model_copy(update={**place, "extract": extract, "start_heading_deg": 5.0})
+                osm = config.osm.model_copy(
+                    update={**place, "extract": extract, "start_heading_deg": START_HEADING_DEG}
+                )
                 config = config.model_copy(update={"osm": osm})
-            fitted.append(replace(variant, config=config.model_copy(update={"debug": debug})))
-        return fitted
+            on_map.append(replace(variant, config=config.model_copy(update={"debug": debug})))
+        return on_map
 
     def _map(self, kind: str, cell: Cell, out: Path) -> Path:
-        wanted = self.maps[kind]
-        if wanted == MapKind():
+        errors = self.maps[kind]
+        if errors == MapKind():
             return cell.path / EXACT
-        if wanted.perturbed:
+        if errors.perturbed:
             return cell.path / PERTURBED
         path = out / MAPS / f"{cell.sequence}-{cell.seed}-{kind}.osm"
-        origin = np.array(
-            parse_toml((cell.path / "truth" / "world.toml").read_text(encoding="utf-8"))["origin_lat_lon_alt"]
-        )
+        origin = _world_of(cell)[1]
         exact = read_buildings(cell.path / EXACT, origin)[1].buildings
         none = {"simplified": 0.0, "merged": 0.0, "missing": 0.0, "new": 0.0}
-        turn = float(np.radians(wanted.house_deg))
-        faults = MapFaults(wanted.offset_m, 1.0, wanted.house_m, 1.0, turn, **none)
-        drawn = draw_perturbation(exact, faults, np.random.default_rng(cell.seed))
+        turn = float(np.radians(errors.house_deg))
+        faults = MapFaults(errors.offset_m, 1.0, errors.house_m, 1.0, turn, **none)
+        perturbation = draw_perturbation(exact, faults, np.random.default_rng(cell.seed))
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_osm(path, osm_from_buildings(perturb(exact, drawn), origin, None))
+        write_osm(path, osm_from_buildings(perturb(exact, perturbation), origin, None))
         return path
 
     def beside(self, runs: Sequence[RunScore]) -> tuple[Table, Table]:
@@ -156,12 +159,12 @@ class ReadyComparison(Section):
         rows = []
         for sequence, method in dict.fromkeys((run.sequence, run.method) for run in runs):
             for of, printed, source in self._of(sequence, method):
-                found, turned = (list(_values(runs, sequence, method, each).values()) for each in (of, "angular"))
-                hardness = difficulty(self._printed(sequence, method, "angular"), turned)
-                judged = judge_number(printed, found, hardness)
-                ours = " / ".join(map(_said, spread(found)))
+                values, angular = (list(_values(runs, sequence, method, each).values()) for each in (of, "angular"))
+                hardness = difficulty(self._printed(sequence, method, "angular"), angular)
+                judgement = judge_number(printed, values, hardness)
+                ours = " / ".join(map(_text, spread(values)))
                 theirs = (sequence, method, QUANTITIES[of][1], f"{printed:g}")
-                rows.append((*theirs, ours, hardness, judged.verdict, judged.why, source))
+                rows.append((*theirs, ours, hardness, judgement.verdict, judgement.why, source))
         header = ("sequence", "method", "quantity", "thesis", "ours", "ours was", "verdict", "why", "source")
         recipe = (
             "ours: median / worst over seeds; reproduced: within a factor of two of a run; refuted: all runs are off to one side "
@@ -179,23 +182,31 @@ class ReadyComparison(Section):
 
     def _statements(self, runs: Sequence[RunScore]) -> Table:
         rows = []
-        known = list(dict.fromkeys((run.sequence, run.method) for run in runs))
+        scores = list(dict.fromkeys((run.sequence, run.method) for run in runs))
         for stated in self.stated:
-            for sequence, method in known:
+            for sequence, method in scores:
                 if method.split(ON)[0] != stated.left:
                     continue
                 kind = method.removeprefix(stated.left)
-                right = stated.right + kind if (sequence, stated.right + kind) in known else stated.right
+                right = stated.right + kind if (sequence, stated.right + kind) in scores else stated.right
                 a, b = (self._printed(sequence, name, stated.of) for name in (method, right))
                 if a is None or b is None:
                     continue
                 ours, theirs = (_values(runs, sequence, name, stated.of) for name in (method, right))
                 pairs = [(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
-                judged = judge_order(a < b, pairs)
-                rows.append((stated.text, sequence + kind, f"{a / b:.2f}", judged.verdict, judged.why, stated.source))
+                judgement = judge_order(a < b, pairs)
+                rows.append(
+                    (stated.text, sequence + kind, f"{a / b:.2f}", judgement.verdict, judgement.why, stated.source)
+                )
         header = ("the thesis", "drive", "its ratio", "verdict", "here", "source")
         recipe = "stated: decided where all seeds say the same, five or more of them"
         return Table("beside the thesis, system against system", header, tuple(rows), recipe)
+
+
+def _world_of(cell: Cell) -> tuple[Floats, Floats]:
+    """T_enu_world (4, 4) of a simulated drive, and latitude, longitude (deg) and height (m) of its origin."""
+    world = parse_toml((cell.path / "truth" / "world.toml").read_text(encoding="utf-8"))
+    return np.array(world["T_enu_world"]), np.array(world["origin_lat_lon_alt"])
 
 
 def _values(runs: Sequence[RunScore], sequence: str, method: str, of: str) -> dict[int, float]:
@@ -208,7 +219,7 @@ def _values(runs: Sequence[RunScore], sequence: str, method: str, of: str) -> di
     }
 
 
-def _said(value: float) -> str:
+def _text(value: float) -> str:
     return "failed" if value == inf else significant(value)
 
 

@@ -259,8 +259,8 @@ def turned(
 def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[Floats, Floats]:
     """Weighted mean of the pose T (4, 4) with covariance C (6, 6) and of one with covariance P (6, 6), and its covariance.
 
-    Poses found on one map share its error, as large as their own, all but one part in `age`. The other pose, which began at one
-    of them, has it too: no weighing takes it away.
+    Poses on one map share its error, as large as their own, all but one part in `age`. The other pose starts at one of them and
+    has it too, so that no weighing averages it.
 
     rest : (6,) from the other pose to T; all in world axes, m and rad
     age : factor on P
@@ -268,12 +268,12 @@ def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[
     gain = _copy(C)
     _eliminate(_sum(C, P, age), gain)
     K = _transposed(gain)
-    kept = _sum(C, _product(K, C), -1.0)
-    d, left = np.zeros(6), np.empty((6, 6))
+    white = _sum(C, _product(K, C), -1.0)
+    d, share = np.zeros(6), np.empty((6, 6))
     for i in range(6):
         for k in range(6):
             d[i] -= K[i, k] * rest[k]
-            left[i, k] = (1.0 if i == k else 0.0) - K[i, k]
+            share[i, k] = (1.0 if i == k else 0.0) - K[i, k]
     pose, turn, R = _copy(T), np.empty((3, 3)), np.empty((3, 3))
     exponential(d[3], d[4], d[5], turn)
     multiply(turn, T, R)
@@ -282,4 +282,4 @@ def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[
         pose[i, 3] += d[i]
         for j in range(3):
             pose[i, j] = R[i, j]
-    return pose, _sum(kept, _product(kept, _transposed(left)), 1.0 - 1.0 / age)
+    return pose, _sum(white, _product(white, _transposed(share)), 1.0 - 1.0 / age)
