@@ -44,7 +44,7 @@ MAPS = "maps"
 HARD = "-hard"
 # Between a system and the map that it is given.
 ON = "@"
-# deg, one sigma of the heading at the start.
+# deg; so far off the heading at the start may be.
 START_HEADING_DEG = 5.0
 
 
