@@ -16,8 +16,8 @@ from lslam.core.labels import CLASSES
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.osm.walls import CELL, ROUGHNESS_M, SLOPE, THICKNESS, lowest_levels
 
-GROUND, WALL, POLE = CLASSES["other-ground"], CLASSES["building"], CLASSES["pole"]
-VEGETATION, VEHICLE, OTHER = CLASSES["vegetation"], CLASSES["car"], CLASSES["unlabeled"]
+_GROUND, _WALL, _POLE = CLASSES["other-ground"], CLASSES["building"], CLASSES["pole"]
+_VEGETATION, _VEHICLE, _OTHER = CLASSES["vegetation"], CLASSES["car"], CLASSES["unlabeled"]
 NEAR_M = 10.0  # m about the sensor, where the ground is surely seen
 CUBE_M = 0.4  # m; three of them to a side are the neighbourhood of a point
 FLATNESS = 6.0  # times the variance across a plane that it has along its narrower side, or it is a line
@@ -33,7 +33,7 @@ POLE_WIDTH_M, LEAST_POLE_HEIGHT_M = 0.8, 1.2  # m; width of a pole in squares of
 def classify(points: NDArray[Any]) -> NDArray[np.uint16]:
     """Classes (N,), as SemanticKITTI's numbers, of the points (N, 3), m, of a submap whose z points up; 0 where it cannot say."""
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
-    labels = np.full(len(cloud), GROUND, np.uint16)
+    labels = np.full(len(cloud), _GROUND, np.uint16)
     height = _heights(cloud)
     off = np.flatnonzero(height > ROUGHNESS_M)
     if len(off):
@@ -62,8 +62,8 @@ def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
     keys, member = np.unique(_packed(cells), return_inverse=True)
     is_flat, is_upright, is_rough = _shapes(points, keys, member)
     flat, upright = is_flat[member], is_upright[member]
-    labels = np.where(is_rough[member], VEGETATION, OTHER).astype(np.uint16)
-    labels[flat & ~upright & (height < VEHICLE_HEIGHTS_M[0])] = GROUND
+    labels = np.where(is_rough[member], _VEGETATION, _OTHER).astype(np.uint16)
+    labels[flat & ~upright & (height < VEHICLE_HEIGHTS_M[0])] = _GROUND
     # A wall is higher than a vehicle: as far as planes rise that stand together.
     planes = _things(cells[upright])
     rise = np.zeros(planes.max(initial=-1) + 1)
@@ -73,8 +73,8 @@ def _standing(points: Floats, height: Floats) -> NDArray[np.uint16]:
     # Windows and balconies are no planes: most of what stands in their columns is.
     column = np.unique(_packed(cells * [1, 1, 0]), return_inverse=True)[1]
     share = np.bincount(column, is_wall) / np.bincount(column)
-    labels[is_wall | (share > WALL_SHARE)[column] | (flat & (height > VEHICLE_HEIGHTS_M[1]))] = WALL
-    low = (height < VEHICLE_HEIGHTS_M[1]) & np.isin(labels, (OTHER, VEGETATION))
+    labels[is_wall | (share > WALL_SHARE)[column] | (flat & (height > VEHICLE_HEIGHTS_M[1]))] = _WALL
+    low = (height < VEHICLE_HEIGHTS_M[1]) & np.isin(labels, (_OTHER, _VEGETATION))
     things = _things(cells[low])
     labels[low] = _by_size(points[low], height[low], things, labels[low], flat[low])
     return labels
@@ -138,7 +138,7 @@ def _by_size(
     is_vehicle = _within(length, VEHICLE_LENGTHS_M) & _within(width, VEHICLE_WIDTHS_M)
     is_vehicle &= (top > VEHICLE_HEIGHTS_M[0]) & (smooth > SMOOTH_SHARE)
     is_pole = (length < POLE_WIDTH_M) & (top > LEAST_POLE_HEIGHT_M)
-    return np.where(is_vehicle[things], VEHICLE, np.where(is_pole[things], POLE, labels)).astype(np.uint16)
+    return np.where(is_vehicle[things], _VEHICLE, np.where(is_pole[things], _POLE, labels)).astype(np.uint16)
 
 
 def _within(values: Floats, limits: tuple[float, float]) -> Bools:

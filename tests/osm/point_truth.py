@@ -21,7 +21,7 @@ TRUE = {
     "vegetation": ("vegetation",),
     "vehicle": ("car", "moving-car"),
 }
-FOUND = (classes.GROUND, classes.WALL, classes.POLE, classes.VEGETATION, classes.VEHICLE)
+FOUND = (CLASSES["other-ground"], CLASSES["building"], CLASSES["pole"], CLASSES["vegetation"], CLASSES["car"])
 NAMES = tuple(TRUE)
 SPACING_M, SCANS = 2.0, 5
 REACH_M = 60.0  # as osm.wall_range

@@ -7,6 +7,7 @@ import pytest
 from point_truth import NAMES, confusion, scores
 from wall_scenes import Floats, box_at, noisy, plain, upright
 
+from lslam.core.labels import CLASSES
 from lslam.osm import classes
 
 # Least precision and recall on a clean street: what geometry can tell there.
@@ -27,7 +28,7 @@ def scene() -> tuple[list[Floats], list[int]]:
     post = np.column_stack([np.full(40, -12.0), np.full(40, -6.0), np.linspace(0.2, 2.4, 40)])
     facade = upright((-15, 12), (15, 12), 0.3, 8)
     parts = [plain(25, 0.5), facade, car_at(2, -5), bush, post]
-    return parts, [classes.GROUND, classes.WALL, classes.VEHICLE, classes.VEGETATION, classes.POLE]
+    return parts, [CLASSES["other-ground"], CLASSES["building"], CLASSES["car"], CLASSES["vegetation"], CLASSES["pole"]]
 
 
 @pytest.mark.parametrize("low", [0.0, -30.0])
