@@ -17,7 +17,7 @@ from lslam.registration.start_search import best_by_non_ground
 # In `pose_source`.
 ALL_POINTS = "all-points"
 # Well constrained scans in a row, two seconds at 10 Hz, after which the map of all points is dropped.
-FED = 20
+CONSTRAINED_SCANS = 20
 
 
 class AllPoints(Stateful):
@@ -35,7 +35,7 @@ class AllPoints(Stateful):
         self._config = config.model_copy(update=plain)
         # `icp` by default settings, updated from the first poorly constrained scan on.
         self._icp = Registration(self._config)
-        self._fed = FED
+        self._fed = CONSTRAINED_SCANS
 
     def locate(self, attempt: Attempt) -> RegistrationResult:
         """The scan's points registered by `icp` on those of the scans that were registered last."""
@@ -57,7 +57,7 @@ class AllPoints(Stateful):
         Few rings at speed leave so few features that one outlier misleads them by metres.
         own : the result of `locate`, if there is one already
         """
-        if self._fed >= FED:
+        if self._fed >= CONSTRAINED_SCANS:
             self._icp = self._of_recent(attempt.history)
         self._fed = 0
         if own is None:
@@ -72,7 +72,7 @@ class AllPoints(Stateful):
 
     def enter(self, result: RegistrationResult) -> None:
         """While it is needed, enter a scan into the map, and adapt `icp` by its own result of the scan, if there is one."""
-        if self._fed >= FED:
+        if self._fed >= CONSTRAINED_SCANS:
             return
         self._fed += 1
         own = result.detail if result.replaced is not None else None

@@ -13,7 +13,7 @@ import numpy as np
 
 from lslam.core.geometry import so3
 from lslam.core.kernels import facts as at
-from lslam.core.kernels.gauss_newton import UNSEEN
+from lslam.core.kernels.gauss_newton import UNSEEN_SHARE
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.elastic_constraints import ElasticConstraints, ElasticSweep
@@ -28,7 +28,7 @@ from lslam.registration.solver import voxel_terms
 
 # Parts of a sweep whose points are linearised together. Within an eighth, what a point tells of begin and end differs from
 # the mean of its part by 1/28 rms: of the information 2 % are lost, and nothing is biased.
-PARTS = 8
+SWEEP_PARTS = 8
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ElasticResult:
 
 
 class SweepPoints:
-    """Source points in the order of their times, in `PARTS` parts that share the map's levels but no correspondence."""
+    """Source points in the order of their times, in `SWEEP_PARTS` parts that share the map's levels but no correspondence."""
 
     def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float, blob_weight: float) -> None:
         assert points.source_times is not None
@@ -53,7 +53,7 @@ class SweepPoints:
         self.times = points.source_times[order]
         self.points = subset(points, order)
         self._moved = np.empty_like(self.points.source)
-        bounds = np.linspace(0, len(order), PARTS + 1).round().astype(int)
+        bounds = np.linspace(0, len(order), SWEEP_PARTS + 1).round().astype(int)
         self.parts = [slice(a, b) for a, b in pairwise(bounds.tolist())]
         self.matches = [Correspondences(part.stop - part.start) for part in self.parts]
         kind = residual_named("plane")
@@ -63,16 +63,21 @@ class SweepPoints:
         ]
 
     def shares(self, sweep: ElasticSweep) -> Floats:
-        """(PARTS,) mean share of the sweep that is over when a part was measured."""
+        """(SWEEP_PARTS,) mean share of the sweep that is over when a part was measured."""
         begin, end = sweep.times[0], sweep.times[-1]
         return np.array([(self.times[part].mean(dtype=np.float64) - begin) / (end - begin) for part in self.parts])
 
     def linearise(self, prior: MotionPrior, width: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
-        """H (PARTS, 6, 6), g (PARTS, 6) about the pose at the stamp, and facts of the points placed by `prior`."""
+        """H (SWEEP_PARTS, 6, 6), g (SWEEP_PARTS, 6) about the pose at the stamp, and facts of the points placed by `prior`."""
         self._moved[:] = deskew_points(self.points.source, self.times, prior)
         T = prior.pose
         pose = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-        H, g, facts, unused = np.zeros((PARTS, 6, 6)), np.zeros((PARTS, 6)), np.zeros(at.COUNT), np.zeros((6, 6))
+        H, g, facts, unused = (
+            np.zeros((SWEEP_PARTS, 6, 6)),
+            np.zeros((SWEEP_PARTS, 6)),
+            np.zeros(at.COUNT),
+            np.zeros((6, 6)),
+        )
         for k, (terms, matches) in enumerate(zip(self._terms, self.matches, strict=True)):
             matches.clear()
             for term in terms:
@@ -106,7 +111,7 @@ def register_elastic(
         lever = np.sqrt(max(facts[at.LEVER] / max(facts[at.INFORMATION], 1e-300), 1e-6))
         weak = _weak(H.sum(0), lever, weak_share * facts[at.INFORMATION])
         constraints.add_to(A, b, sweep)
-        d, skew = np.split(_step(A, b, lever, UNSEEN * weak_share * facts[at.INFORMATION]).reshape(3, 6), [2])
+        d, skew = np.split(_step(A, b, lever, UNSEEN_SHARE * weak_share * facts[at.INFORMATION]).reshape(3, 6), [2])
         if not np.isfinite(d).all():
             break
         move, turn = (float(np.linalg.norm(d[:, part], axis=1).max()) for part in (slice(0, 3), slice(3, 6)))

@@ -70,7 +70,7 @@ class ElasticSweep:
 
 
 # Of the covariance of a change of motion, what stays from scan to scan: a memory of five.
-FORGETTING = 0.8
+FORGETTING_FACTOR = 0.8
 # m and rad, a change that registration cannot tell from none.
 LEAST_CHANGE = 1e-3
 # m and rad, likewise of the map, which is the mean of many scans.
@@ -78,8 +78,8 @@ LEAST_SKEW = 1e-4
 # With an acceleration a of its own in each sweep of T seconds, lines fitted to neighbouring ones miss each other by
 # (a2 - a1) T^2 / 12, the velocity of a line is ahead of that between their middles by (a1 + 2 a2) T^2 / 6, and the change of
 # motion that is measured is (a0 + 4 a1 + a2) T^2 / 6: rms of the first two by that of the third.
-MISS = 1.0 / 6.0
-LAG = math.sqrt(10.0) / 6.0
+MISS_RATIO = 1.0 / 6.0
+LAG_RATIO = math.sqrt(10.0) / 6.0
 NOTHING: Floats = np.zeros((6, 6))
 
 
@@ -148,12 +148,12 @@ class LastSweep(Stateful):
         length = self._ends_ns[1] - self._ends_ns[0]
         location, since = NOTHING, 0.0
         if self._ends is not None and P is not None and abs(begin_ns - self._ends_ns[1]) < length / 2:
-            location, since = _inverse(MISS**2 * Q + P[6:, 6:]), 1.0
+            location, since = _inverse(MISS_RATIO**2 * Q + P[6:, 6:]), 1.0
             if not prior.is_bent:
                 twist = se3.log(se3.relative(*self._ends)) / length
                 begin, end = (self._ends[1] @ se3.exp((ns - self._ends_ns[1]) * twist) for ns in (begin_ns, end_ns))
                 expected = ElasticSweep(se3.normalise(begin), se3.normalise(end), prior.times)
-        velocity, skewed = _inverse(LAG**2 * Q), _inverse(M + LEAST_SKEW**2 * np.eye(6))
+        velocity, skewed = _inverse(LAG_RATIO**2 * Q), _inverse(M + LEAST_SKEW**2 * np.eye(6))
         return ElasticConstraints(expected, location, velocity, since, self._skew, skewed)
 
     def follow(
@@ -172,7 +172,7 @@ class LastSweep(Stateful):
         middle, expected = middle_of(sweep, stamp_ns, pose)[0], middle_of(prior, stamp_ns, prior.pose)[0]
         change = se3.log(se3.relative(expected, middle))
         Q = self._change_over(prior.span_s)
-        self._change = FORGETTING * Q + (1.0 - FORGETTING) * np.outer(change, change)
+        self._change = FORGETTING_FACTOR * Q + (1.0 - FORGETTING_FACTOR) * np.outer(change, change)
 
     def forget(self) -> None:
         """The last scan has no sweep, or a wrong one."""

@@ -27,11 +27,11 @@ Grid = tuple[
 ]  # fmt: skip
 
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
-REACH = 2.0
+MATCH_REACH_M = 2.0
 # rad, one sigma: a normal that wavers more is not known.
-WAVER = 0.03
+NORMAL_SIGMA_RAD = 0.03
 # m, one sigma: what is thicker is no surface, but two that meet.
-THICK = 0.1
+SURFACE_SIGMA_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def surface_size(size: float, grid_step: float) -> float:
 def feature_scan(features: Features, T_world_lidar: Floats, grid_step: float = 0.0) -> FeatureScan:
     """Index the features of a scan, thinned by a grid of `grid_step`, m, at its pose (4, 4)."""
     R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
-    reach = surface_size(REACH, grid_step)
+    reach = surface_size(MATCH_REACH_M, grid_step)
     size = reach / 2
 
     def grid(part: FeaturePoints) -> Grid:
@@ -73,11 +73,11 @@ def _normals(points: Floats) -> Floats:
 
     Voxels of half the reach tell them, and before these voxels twice as large, for two rings of a sparse sensor.
     """
-    fine, normals = GaussianMap(REACH / 2, capacity=1 << 12), np.zeros_like(points)
+    fine, normals = GaussianMap(MATCH_REACH_M / 2, capacity=1 << 12), np.zeros_like(points)
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(
-            points, around.size, THICK**2, WAVER**2, around.planes, around.keys, around.table, normals
+            points, around.size, SURFACE_SIGMA_M**2, NORMAL_SIGMA_RAD**2, around.planes, around.keys, around.table, normals
         )  # fmt: skip
     return normals
 

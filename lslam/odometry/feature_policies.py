@@ -14,7 +14,7 @@ from lslam.registration.policies import policies_of
 from lslam.registration.result import RegistrationResult
 
 # Planar points of one normal that constrain a direction well enough, as many as LOAM asks for a plane.
-ENOUGH = 5
+ENOUGH_POINTS = 5
 
 
 class LessPlanar:
@@ -77,10 +77,10 @@ class AllPointsInstead:
 
 
 def is_well_constrained(result: RegistrationResult, sigma: float) -> bool:
-    """Whether the position's largest variance is below that of `ENOUGH` points of one normal, of `sigma`, m."""
+    """Whether the position's largest variance is below that of `ENOUGH_POINTS` points of one normal, of `sigma`, m."""
     if not result.ok or result.covariance is None:
         return False
-    return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < sigma**2 / ENOUGH
+    return float(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]) < sigma**2 / ENOUGH_POINTS
 
 
 def feature_policies(config: RecoveryConfig) -> tuple[Policy, ...]:

@@ -17,7 +17,7 @@ from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap, FeatureScan
 from lslam.odometry.kernels.feature_residuals import linearise_edges, linearise_planes
 from lslam.odometry.kernels.lines import linearise_lines
 from lslam.registration.alignment import upright_directions
-from lslam.registration.gaussian_map import FLOOR, GaussianMap
+from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise, slots_of
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.residuals import PLANE
@@ -95,7 +95,7 @@ def map_problem(
     lines, matches = target.edges, Correspondences(len(planes) + len(edges))
     on_lines = Term(
         linearise_lines, (edges,), (lines.moments, lines.keys, lines.table, *target.lines),
-        (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR),
+        (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR_M2),
         (*slots_of(len(edges)), matches.away2[len(planes) :]),
     )  # fmt: skip
     on_planes = voxel_terms(PLANE, (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0)

@@ -20,7 +20,7 @@ from lslam.registration.preprocessing.features import Features
 from lslam.registration.preprocessing.ground import Z
 from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing, is_more
-from lslam.registration.start_search import MUCH, START_STEP, start_offsets
+from lslam.registration.start_search import MUCH_RATIO, START_STEP_M, start_offsets
 
 # Fewer inliers, ten per degree of freedom, are insignificant.
 MIN_FEATURES = 60
@@ -186,11 +186,11 @@ class FeatureTarget(Target):
         if history.inserted > 1 or not self._with_start_search:
             return result
         # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
-        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP, self._up)]
-        trials = [on_coarse(T_prior @ T, 2 * START_STEP) for T in offsets]
+        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP_M, self._up)]
+        trials = [on_coarse(T_prior @ T, 2 * START_STEP_M) for T in offsets]
         agree = [edges_at(one) for one in trials]
         most, usual = max(agree, default=0), max(edges_at(result), 0)
-        is_clear = most > MUCH * usual and is_more(most, usual)
+        is_clear = most > MUCH_RATIO * usual and is_more(most, usual)
         return trials[int(np.argmax(agree))] if is_clear else result
 
     def _planes(self) -> FeatureMap:

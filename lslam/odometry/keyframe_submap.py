@@ -15,20 +15,20 @@ from lslam.registration.local_map import LocalMap, MapScans
 from lslam.registration.preprocessing.prepare import PreparedPoints
 
 # Median range beyond which keyframes stand so far apart, m, and how far they do where it is less.
-SPACING = ((20.0, 10.0), (10.0, 5.0), (5.0, 1.0))
-NARROW_SPACING = 0.5
+SPACING_M = ((20.0, 10.0), (10.0, 5.0), (5.0, 1.0))
+NARROW_SPACING_M = 0.5
 # Of the median range, what stays from scan to scan: a door is passed in a second, a keyframe later is soon enough.
-SMOOTHING = 0.95
-TURN = np.deg2rad(30.0)
-NEARBY = 1.5  # spacings within which another keyframe already looks another way
-NEAREST = 10
-ON_HULL = 10
+FORGETTING_FACTOR = 0.95
+KEYFRAME_TURN_RAD = np.deg2rad(30.0)
+NEARBY_SPACINGS = 1.5  # spacings within which another keyframe already looks another way
+NEAREST_KEYFRAMES = 10
+HULL_KEYFRAMES = 10
 # Share of the longest axis below which keyframes have no extent along another.
-FLAT = 0.01
+FLAT_SHARE = 0.01
 
 
 class KeyframeSubmap(MapScans):
-    """All keyframes, of which the `NEAREST` and the `ON_HULL` nearest of their convex hull are the map."""
+    """All keyframes, of which the `NEAREST_KEYFRAMES` and the `HULL_KEYFRAMES` nearest of their convex hull are the map."""
 
     STATE = ("clouds", "poses", "chosen", "spaciousness", "hull")
 
@@ -47,7 +47,9 @@ class KeyframeSubmap(MapScans):
     def enter(self, target: LocalMap, points: PreparedPoints, T_world_lidar: Floats) -> None:
         """Add a keyframe when it is due; the map is built anew when other keyframes are nearest."""
         median = float(np.median(np.linalg.norm(points.source, axis=1))) if len(points.source) else 0.0
-        self.spaciousness = SMOOTHING * self.spaciousness + (1 - SMOOTHING) * median if self.poses else median
+        self.spaciousness = (
+            FORGETTING_FACTOR * self.spaciousness + (1 - FORGETTING_FACTOR) * median if self.poses else median
+        )
         if self._is_due(T_world_lidar):
             self.clouds.append((points.map_points, points.source))
             self.poses.append(T_world_lidar.copy())
@@ -76,20 +78,20 @@ class KeyframeSubmap(MapScans):
         if distances[nearest] > spacing:
             return True
         turned = float(so3.angle(se3.relative(self.poses[nearest], T)[:3, :3]))
-        return turned > TURN and int((distances < NEARBY * spacing).sum()) <= 1
+        return turned > KEYFRAME_TURN_RAD and int((distances < NEARBY_SPACINGS * spacing).sum()) <= 1
 
     def _selected(self, position: Floats) -> tuple[int, ...]:
         """Numbers of the keyframes that are the map around `position` (3,), in the order they were made."""
         distances = np.linalg.norm(self._positions() - position, axis=1)
-        nearest = np.argsort(distances, kind="stable")[:NEAREST]
+        nearest = np.argsort(distances, kind="stable")[:NEAREST_KEYFRAMES]
         hull = np.array(self.hull, np.int64)
-        outer = hull[np.argsort(distances[hull], kind="stable")[:ON_HULL]]
+        outer = hull[np.argsort(distances[hull], kind="stable")[:HULL_KEYFRAMES]]
         return tuple(int(k) for k in np.union1d(nearest, outer))
 
 
 def spacing_of(spaciousness: float) -> float:
     """Distance between keyframes, m, where points are `spaciousness`, m, away in the median."""
-    return next((spacing for beyond, spacing in SPACING if spaciousness > beyond), NARROW_SPACING)
+    return next((spacing for beyond, spacing in SPACING_M if spaciousness > beyond), NARROW_SPACING_M)
 
 
 def hull_of(positions: Floats) -> tuple[int, ...]:
@@ -98,7 +100,7 @@ def hull_of(positions: Floats) -> tuple[int, ...]:
     if len(positions) < 3:
         return tuple(range(len(positions)))
     _, extents, axes = np.linalg.svd(centred, full_matrices=False)
-    dimensions = int((extents > FLAT * extents[0]).sum()) if extents[0] > 0 else 0
+    dimensions = int((extents > FLAT_SHARE * extents[0]).sum()) if extents[0] > 0 else 0
     along = centred @ axes[:dimensions].T
     if dimensions == 0:
         return (0,)

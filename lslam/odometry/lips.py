@@ -30,7 +30,7 @@ from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_poi
 from lslam.registration.result import RegistrationResult
 
 # Share of the points on planes that known planes must take; where it is less, the scan is elsewhere.
-LEAST_SHARE = 0.1
+KNOWN_SHARE = 0.1
 
 
 def create(config: Config) -> Lips:
@@ -154,7 +154,7 @@ def _refusal(window: PlaneWindow, planes: Planes, matches: Longs) -> str:
     if len(window.landmarks) == 0:
         return ""
     share = float(planes.counts[matches >= 0].sum() / planes.counts.sum())
-    if share < LEAST_SHARE:
+    if share < KNOWN_SHARE:
         return f"only {share:.0%} of the points on planes lie on known ones: the IMU carries the scan"
     return ""
 

@@ -20,10 +20,10 @@ from lslam.registration.preprocessing.petals import petal_features
 from lslam.registration.result import RegistrationResult
 
 # Of the correspondences, the nearest, that have a say: a fifth is dropped as outliers (section IV-C).
-INLIERS = 0.8
+INLIER_SHARE = 0.8
 # Part of the slope over the pieces that is the sensor's motion, not noise of thirds of a scan.
-TRUST = 0.5
-LIVOX = LoamVariant(None, with_map=True, with_less_planes=True, inlier_ratio=INLIERS)
+SLOPE_SHARE = 0.5
+LIVOX = LoamVariant(None, with_map=True, with_less_planes=True, inlier_ratio=INLIER_SHARE)
 
 
 def create(config: Config) -> LoamLivox:
@@ -89,7 +89,7 @@ def joined(
 
     Each of them says where the sensor was at the stamp, had it moved as the prior says. Their differences are a motion that
     the prior does not know, and noise: the sweep moves by the line through them, drawn by least squares and followed by
-    `TRUST` of its slope. A scan has failed when half of its pieces have.
+    `SLOPE_SHARE` of its slope. A scan has failed when half of its pieces have.
 
     middles : s from the stamp
     """
@@ -122,7 +122,7 @@ def joined(
 def line_weights(at: Floats, times: Floats) -> Floats:
     """(T, N) what each of the values at the times `at` (N,), s, counts in the line through them at `times` (T,), s."""
     off = at - at.mean()
-    return np.asarray(1.0 / len(at) + TRUST * np.outer(times - at.mean(), off) / (off @ off))
+    return np.asarray(1.0 / len(at) + SLOPE_SHARE * np.outer(times - at.mean(), off) / (off @ off))
 
 
 def _combined(parts: list[RegistrationResult], shares: Floats) -> Floats | None:

@@ -24,9 +24,9 @@ from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # Centroids of this grid, covariances of this many neighbours, correspondences within this distance, m.
-LEAF = 0.3
-NEIGHBOURS = 20
-REACH = 1.0
+LEAF_M = 0.3
+COVARIANCE_POINTS = 20
+MATCH_REACH_M = 1.0
 
 
 @dataclass
@@ -56,9 +56,9 @@ class Open3dGicp(Traits):
         """Open3D's point cloud: gated, down-sampled, with a covariance per point."""
         points = clean_points(scan.points, self._preprocess).astype(np.float64)
         package = self._package
-        cloud = package.geometry.PointCloud(package.utility.Vector3dVector(points)).voxel_down_sample(LEAF)
+        cloud = package.geometry.PointCloud(package.utility.Vector3dVector(points)).voxel_down_sample(LEAF_M)
         if len(cloud.points) >= MIN_SOURCE_POINTS:
-            cloud.estimate_covariances(package.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+            cloud.estimate_covariances(package.geometry.KDTreeSearchParamKNN(COVARIANCE_POINTS))
         return cloud
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
@@ -77,7 +77,7 @@ class Open3dGicp(Traits):
             return RegistrationResult(T_prior, source_points=count, inliers=count)
         registration = self._package.pipelines.registration
         alignment = registration.registration_generalized_icp(
-            cloud, self._last.cloud, REACH, se3.relative(self._last.T_world_lidar, T_prior),
+            cloud, self._last.cloud, MATCH_REACH_M, se3.relative(self._last.T_world_lidar, T_prior),
             registration.TransformationEstimationForGeneralizedICP(),
         )  # fmt: skip
         pose = self._last.T_world_lidar @ np.asarray(alignment.transformation, np.float64)

@@ -97,7 +97,7 @@ class WindowValues:
 
 
 # Mahalanobis length beyond which a plane counts less (Huber): the square root of the 95 % quantile of chi-square, three degrees.
-HUBER = 2.8
+HUBER_SIGMAS = 2.8
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def normal_equations(
         r, by_pose, by_plane = sighting_residuals(values, sightings, anchors, T_imu_lidar)
         J = np.concatenate([by_pose, by_plane], axis=2)
         far = np.sqrt(np.einsum("ki,kij,kj->k", r, sightings.information, r))
-        weight = np.minimum(1.0, HUBER / np.maximum(far, HUBER))
+        weight = np.minimum(1.0, HUBER_SIGMAS / np.maximum(far, HUBER_SIGMAS))
         weighted = np.swapaxes(J, 1, 2) @ (weight[:, None, None] * sightings.information)
         at = np.concatenate([
             SHARED + STATE_SIZE * sightings.states[:, None] + np.arange(6),

@@ -15,33 +15,33 @@ from lslam.core.kernels.voxel import MASK, OFFSET
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.odometry import closest_point
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import BREADTH
+from lslam.registration.local_map import LEAST_BREADTH
 
 # m, edge of the voxels: at 15 m two rings of a 16-beam sensor fall into one.
-VOXEL = 1.0
+VOXEL_M = 1.0
 # Points of a voxel that is asked at all, and of one that a plane may begin in.
 FEWEST, LEAST_SEED = 3, 8
 # m, rms distance of a voxel's points from the plane that takes it: three sigma of ranging and calibration.
-NEAR = 0.09
+ON_PLANE_M = 0.09
 # Times the usual mean square of a plane's voxels: beyond, a voxel holds points of another surface too.
-MIXED = 4.0
+MIXED_RATIO = 4.0
 # Cosine of 20 deg between the plane's normal and a planar voxel's.
-ALIKE = 0.94
+ALIKE_COSINE = 0.94
 # m, between means of voxels that touch: beyond the next but one there is a gap.
-TOUCHING = 2.2
+TOUCHING_M = 2.2
 # m, so far round the seed the plane is fitted, step after step; nothing farther is of it, since ground and long walls bend.
-GROWTH = (2.0, 4.0, 8.0, 16.0, 30.0)
+GROWTH_M = (2.0, 4.0, 8.0, 16.0, 30.0)
 # Voxels and points of a plane; m, least standard deviation of its points across its length: a strip has no normal.
 LEAST_VOXELS, LEAST_POINTS, BREADTH_M = 5, 40, 0.3
 # m, least distance of the sensor from a plane: the closest point of a nearer one has no direction.
-LEAST_DISTANCE = 0.3
+LEAST_DISTANCE_M = 0.3
 # m, least noise of the points, each the mean of what one sensor measures in a cell.
-SIGMA = 0.01
+LEAST_SIGMA_M = 0.01
 # m and rad, one sigma, of what all points of a plane are off by together: ranging has a bias, deskewing leaves some motion, and
 # another part of a wall, seen from elsewhere, leans a little.
 COMMON_M, COMMON_RAD = 0.005, np.deg2rad(0.03)
 # Voxels so many times larger begin planes where small ones hold one ring each, on the ground round the sensor.
-WIDER = 3
+WIDE_FACTOR = 3
 # Planes of a scan, and seeds that are tried for them.
 MOST_PLANES, MOST_SEEDS = 60, 150
 
@@ -75,16 +75,18 @@ class PlaneExtractor:
     common_m, common_rad : by which all points of a plane are off together
     """
 
-    def __init__(self, sigma: float = SIGMA, common_m: float = COMMON_M, common_rad: float = COMMON_RAD) -> None:
+    def __init__(
+        self, sigma: float = LEAST_SIGMA_M, common_m: float = COMMON_M, common_rad: float = COMMON_RAD
+    ) -> None:
         self.sigma, self.common_m, self.common_rad = sigma, common_m, common_rad
         self._voxels = GaussianMap(
-            VOXEL,
+            VOXEL_M,
             min_points=LEAST_SEED,
             planarity=0.3,
             count_cap=np.inf,
             reach=np.inf,
             capacity=1 << 13,
-            breadth=BREADTH,
+            breadth=LEAST_BREADTH,
         )
 
     def extract(self, points: NDArray[np.float32]) -> Planes:
@@ -95,10 +97,10 @@ class PlaneExtractor:
         used = int(voxels.pool[gaussians.USED])
         order = np.argsort(voxels.keys[:used], kind="stable")
         cells = _Cells.of(voxels, order[voxels.moments[order, 0] >= FEWEST])
-        wide = voxels.coarsen(WIDER)
+        wide = voxels.coarsen(WIDE_FACTOR)
         few = np.argsort(wide.keys[: len(wide)], kind="stable")
         regions = self._regions(
-            cells, [_Seeds.of(cells, voxels.planes[order]), _Seeds.of(cells, wide.planes[few], WIDER)]
+            cells, [_Seeds.of(cells, voxels.planes[order]), _Seeds.of(cells, wide.planes[few], WIDE_FACTOR)]
         )
         if not regions:
             none = np.zeros((0, 3))
@@ -128,7 +130,7 @@ class PlaneExtractor:
         if len(region) < LEAST_VOXELS or cells.counts[region].sum() < LEAST_POINTS:
             return None
         n, d, fit = _fitted(cells.counts[region], cells.means[region], cells.scatters[region])
-        if fit.values[1] < BREADTH_M**2 or abs(d) < LEAST_DISTANCE:
+        if fit.values[1] < BREADTH_M**2 or abs(d) < LEAST_DISTANCE_M:
             return None
         cp, variance = n * d, max(float(fit.values[0]), self.sigma**2)
         C = closest_point.covariance(cp, fit.count, fit.mean, fit.scatter, variance) + self._common(cp)
@@ -195,7 +197,7 @@ class _Cells:
         scatter = second - mean[:, :, None] * mean[:, None, :]
         mean += (cell + 0.5) * voxels.size
         tree = cKDTree(mean)
-        pairs = tree.query_pairs(TOUCHING, output_type="ndarray")
+        pairs = tree.query_pairs(TOUCHING_M, output_type="ndarray")
         touching = csr_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(mean), len(mean)))
         return cls(count, mean, scatter, voxels.planes[slots, 3:6], voxels.planes[slots, 7], tree, touching)
 
@@ -211,7 +213,7 @@ class _Cells:
                 return alone
             n, d, _ = _fitted(self.counts[region], self.means[region], self.scatters[region])
         thick = self._off(region, n, d)
-        region = region[thick <= MIXED * np.median(thick)]
+        region = region[thick <= MIXED_RATIO * np.median(thick)]
         at = np.flatnonzero(region == seed)
         if len(at) == 0 or len(region) < LEAST_VOXELS:
             return alone
@@ -220,8 +222,8 @@ class _Cells:
 
     def _on(self, some: Longs, n: Floats, d: float) -> Bools:
         """Which of some voxels have their points on the plane n . x = d, and do not face elsewhere."""
-        is_alike = (self.tilts[some] <= 0) | (np.abs(np.einsum("vi,i->v", self.normals[some], n)) > ALIKE)
-        return np.asarray((self._off(some, n, d) < NEAR**2) & is_alike)
+        is_alike = (self.tilts[some] <= 0) | (np.abs(np.einsum("vi,i->v", self.normals[some], n)) > ALIKE_COSINE)
+        return np.asarray((self._off(some, n, d) < ON_PLANE_M**2) & is_alike)
 
     def _off(self, some: Longs, n: Floats, d: float) -> Floats:
         """Mean squares, m2, of the distances of some voxels' points from the plane n . x = d."""
@@ -247,7 +249,7 @@ class _Seeds:
         if len(planes) and len(cells.means):
             nearest = np.asarray(cells.tree.query(planes[:, :3])[1], np.int64)
         return cls(
-            nearest, planes[: len(nearest), :3], planes[: len(nearest), 3:6], tuple(r for r in GROWTH if r > size)
+            nearest, planes[: len(nearest), :3], planes[: len(nearest), 3:6], tuple(r for r in GROWTH_M if r > size)
         )
 
 

@@ -30,9 +30,9 @@ from lslam.odometry.plane_factors import (
 from lslam.odometry.plane_segmentation import Planes, turned
 
 # States in the window: a second of most sensors.
-LAG = 10
+LAG_SCANS = 10
 # Scans after which a plane that none of them saw is marginalised too.
-FORGET = 10
+UNSEEN_SCANS = 10
 # Gauss-Newton steps, and the step, in sigmas of the newest pose, below which they end.
 MOST_STEPS, SMALL = 5, 0.02
 
@@ -78,7 +78,7 @@ class Landmarks:
 class PlaneWindow:
     """States, planes and the factors among them; every method returns a new window.
 
-    values : of `LAG` states at most; steps : between them; seen : planes in them; T_imu_lidar : (4, 4)
+    values : of `LAG_SCANS` states at most; steps : between them; seen : planes in them; T_imu_lidar : (4, 4)
     """
 
     T_imu_lidar: Floats
@@ -175,11 +175,11 @@ class PlaneWindow:
         return out
 
     def marginalised(self) -> PlaneWindow:
-        """Without the oldest state where there are more than `LAG`, and without planes that were not seen for long."""
+        """Without the oldest state where there are more than `LAG_SCANS`, and without planes that were not seen for long."""
         window = self
-        while window.values.states > LAG:
+        while window.values.states > LAG_SCANS:
             window = window._without_oldest()
-        return window._without_planes(window.landmarks.unseen >= FORGET)
+        return window._without_planes(window.landmarks.unseen >= UNSEEN_SCANS)
 
     def _without_oldest(self) -> PlaneWindow:
         v, of_first = self.values, self.seen.states == 0
@@ -212,9 +212,9 @@ class PlaneWindow:
 # Cosine of 10 deg between normals, and m between planes, along the normal at what the scan saw.
 ALIKE, CLOSE = 0.985, 0.5
 # m, by which boxes of one plane may miss each other.
-APART = 3.0
+BOXES_APART_M = 3.0
 # 99.9 % quantile of chi-square with three degrees of freedom.
-GATE = 16.27
+GATE_CHI2 = 16.27
 
 
 def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
@@ -238,7 +238,7 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
     squares = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
     # The nearest landmark of each plane: the last one written is the smallest.
     for k in np.argsort(-squares, kind="stable"):
-        if squares[k] < GATE:
+        if squares[k] < GATE_CHI2:
             matches[which[k]] = landmark[k]
     return matches
 
@@ -254,7 +254,7 @@ def _candidates(window: PlaneWindow, planes: Planes) -> tuple[Longs, Longs]:
     off = np.abs(planes.means @ m.T - e)
     lows, highs = turned(planes, T)
     is_near = (
-        (lows[:, None] - APART < marks.highs[None]) & (highs[:, None] + APART > marks.lows[None])
+        (lows[:, None] - BOXES_APART_M < marks.highs[None]) & (highs[:, None] + BOXES_APART_M > marks.lows[None])
     ).all(axis=2)  # fmt: skip
     which, landmark = np.nonzero((cosine > ALIKE) & (off < CLOSE) & is_near)
     return which, landmark

@@ -57,7 +57,7 @@ def judge(
 # s; over a shorter time a registration may err by as much as the fastest moves.
 LEAST_S = 0.1
 # Of R^T R: what float32 and rounding leave of a rotation is nearer.
-RIGID = 1e-3
+RIGID_TOLERANCE = 1e-3
 
 
 def measurable(scan: Scan) -> Scan:
@@ -77,7 +77,7 @@ def fault(pose: Floats, stamp_ns: int, last: ScanResult | None) -> str:
     pose = np.asarray(pose)
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         return "the pose is not finite"
-    if not so3.is_rotation(pose[:3, :3], RIGID) or not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
+    if not so3.is_rotation(pose[:3, :3], RIGID_TOLERANCE) or not np.array_equal(pose[3], (0.0, 0.0, 0.0, 1.0)):
         return "the pose is no rigid transform"
     if last is None:
         return ""

@@ -24,9 +24,9 @@ from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # The recipe: the package's own centroids and covariances, correspondences within a metre, and a map of the last ten
 # keyframes, a new one every 2 m or 15 deg.
-LEAF = 0.3
-REACH = 1.0
-KEYFRAMES = 10
+LEAF_M = 0.3
+MATCH_REACH_M = 1.0
+MAP_KEYFRAMES = 10
 STEP_M, STEP_DEG = 2.0, 15.0
 
 
@@ -69,7 +69,7 @@ class SmallGicp(Traits):
             return RegistrationResult(T_prior, source_points=count, inliers=count)
         target, tree = self._target
         alignment = self._package.align(
-            target, source, tree, T_prior, max_correspondence_distance=REACH, num_threads=self._threads
+            target, source, tree, T_prior, max_correspondence_distance=MATCH_REACH_M, num_threads=self._threads
         )
         pose = np.asarray(alignment.T_target_source, np.float64)
         return RegistrationResult(
@@ -84,11 +84,11 @@ class SmallGicp(Traits):
 
     def _insert(self, points: Floats, pose: Floats) -> None:
         self._clouds.append(se3.apply(pose, points))
-        del self._clouds[:-KEYFRAMES]
+        del self._clouds[:-MAP_KEYFRAMES]
         self._target = self._covered(np.concatenate(self._clouds))
         self._T_world_keyframe = pose.copy()
 
     def _covered(self, points: Floats) -> tuple[Any, Any]:
         """Cloud with covariances, and its tree."""
-        cloud, tree = self._package.preprocess_points(points, downsampling_resolution=LEAF, num_threads=self._threads)
+        cloud, tree = self._package.preprocess_points(points, downsampling_resolution=LEAF_M, num_threads=self._threads)
         return cloud, tree

@@ -22,7 +22,7 @@ from lslam.core.types.state import Stateful
 from lslam.registration.result import RegistrationResult
 
 # Scans over which the change of the motion is averaged: a second.
-MEMORY = 10
+MEMORY_SCANS = 10
 # m/s2 and rad/s2, prior sigmas of the acceleration: a car brakes, a hand turns.
 USUAL = np.repeat([3.0, 1.0], 3)
 
@@ -33,7 +33,7 @@ class DeskewUncertainty(Stateful):
     STATE = ("_mean", "scans", "_stamp_ns", "_pose", "_within", "_span_s", "_lead_s")
 
     def __init__(self) -> None:
-        self.scans = 0  # observed, `MEMORY` at most
+        self.scans = 0  # observed, `MEMORY_SCANS` at most
         self._mean = np.zeros((6, 6))
         self._stamp_ns: int | None = None
         self._pose = np.eye(4)
@@ -74,14 +74,14 @@ class DeskewUncertainty(Stateful):
         # The ratio to the prediction error a dt^2 - a L dt / 2 of the error a (L dt / 4 - L^2 / 12 + (T^2 - L^2) / 24).
         part = lead * (3.0 - lead) / (12.0 - 6.0 * lead) + (share**2 - lead**2) / (24.0 - 12.0 * lead)
         off = part * change
-        self.scans = min(self.scans + 1, MEMORY)
+        self.scans = min(self.scans + 1, MEMORY_SCANS)
         self._mean = self._mean + (np.outer(off, off) - self._mean) / self.scans
 
 
 # Factor on the first sweep's variance: its velocity is that at its end, off by a T, twice the error of later ones.
-FIRST = 4.0
+FIRST_SWEEP_FACTOR = 4.0
 # Scans after it from which the first sweep's covariance is estimated.
-BEGINNING = 2
+FIRST_SWEEP_SCANS = 2
 
 
 class PoseUncertainty(Stateful):
@@ -113,7 +113,7 @@ class PoseUncertainty(Stateful):
         # The world's origin, until the first sweep's covariance is estimated.
         self._start: Floats | None = None
         # Factor on the deskewing covariance, of the first scan and those entered with it until then.
-        self._start_factor = FIRST
+        self._start_factor = FIRST_SWEEP_FACTOR
         self._sweep = DeskewUncertainty()
         self._scans = 0
         self.map_age = 1.0
@@ -156,7 +156,7 @@ class PoseUncertainty(Stateful):
         if self._start is None:
             return np.asarray(self._map + own)
         at_start = noise.transported(self._start_factor * sweep, position - self._start)
-        if self._sweep.scans >= BEGINNING:
+        if self._sweep.scans >= FIRST_SWEEP_SCANS:
             self._map, self._start = self._map + at_start, None
             return np.asarray(self._map + own)
         return np.asarray(self._map + at_start + own)

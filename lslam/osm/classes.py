@@ -48,9 +48,9 @@ def _heights(cloud: NDArray[np.float32]) -> Floats:
     level, half = lowest_levels(cloud)
     # What panes mirror seems to lie far below: no street falls so from where the sensor is.
     away = CELL * np.hypot(*(np.indices(level.shape) - (half - 0.5)))
-    here = level[(away < NEAR_M) & (level < ground.EMPTY)]
+    here = level[(away < NEAR_M) & (level < ground.NO_HEIGHT)]
     if len(here):
-        level[level < np.median(here) - SLOPE * away - ROUGHNESS_M] = ground.EMPTY
+        level[level < np.median(here) - SLOPE * away - ROUGHNESS_M] = ground.NO_HEIGHT
     top = np.asarray(ground.envelope(level, SLOPE * CELL, ROUGHNESS_M)).reshape(level.shape)
     i, j = (np.floor(cloud[:, :2] / CELL).astype(np.int64) + half).T
     return np.asarray(cloud[:, 2] - top[i, j], np.float64)

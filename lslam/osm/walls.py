@@ -111,10 +111,12 @@ def walls_of(buildings: Iterable[Building]) -> tuple[Floats, Longs]:
 
 
 def lowest_levels(cloud: NDArray[np.float32]) -> tuple[Floats, int]:
-    """(2 half, 2 half) height, m, of the lowest point in each cell about the sensor, `ground.EMPTY` without points; and half."""
+    """(2 half, 2 half) height, m, of the lowest point in each cell about the sensor, `NO_HEIGHT` without points; and half."""
     half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / CELL)) + 1
     lowest = ground.lowest(cloud, np.eye(3), CELL, half)
-    return np.where(lowest >= 0, cloud[lowest, 2].astype(np.float64), ground.EMPTY).reshape(2 * half, 2 * half), half
+    return np.where(lowest >= 0, cloud[lowest, 2].astype(np.float64), ground.NO_HEIGHT).reshape(
+        2 * half, 2 * half
+    ), half
 
 
 def _high(cloud: NDArray[np.float32], height: float) -> Longs:

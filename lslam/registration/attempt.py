@@ -19,7 +19,7 @@ from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
 
 # The kernel opens so many times its end width around a pose that is nearly right.
-NEAR_KERNEL = 2.0
+NEAR_KERNEL_FACTOR = 2.0
 
 
 class Target(Stateful, ABC):
@@ -90,7 +90,7 @@ class Attempt:
     def annealing(self) -> Annealing:
         """The kernel's schedule: from the recent error of the motion prior, or narrow about one that is nearly right."""
         c, h = self.config, self.history
-        width = NEAR_KERNEL * c.kernel_min if self.is_near else h.threshold.width
+        width = NEAR_KERNEL_FACTOR * c.kernel_min if self.is_near else h.threshold.width
         steps = c.max_iterations * self.target.times_steps
         if not self.is_near and h.starting > 0:
             steps = c.start_iterations

@@ -11,7 +11,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
-FLOOR = 1e-4
+FLOOR_M2 = 1e-4
 
 
 class GaussianMap(Stateful):
@@ -54,7 +54,7 @@ class GaussianMap(Stateful):
             self._grow()
         R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
         return gaussians.insert(
-            points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR,
+            points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR_M2,
             self.breadth, self.reach, self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free,
         )  # fmt: skip
 
@@ -67,14 +67,14 @@ class GaussianMap(Stateful):
 
     def shapes(self) -> Floats:
         """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
-        from lslam.registration.kernels.discs import EXTENT2
+        from lslam.registration.kernels.discs import EXTENT_M2
         from lslam.registration.kernels.ndt_residual import describe
 
         if len(self._shapes) < len(self.keys):
             self._shapes = np.zeros((len(self.keys), 14))
         describe(
             self.moments, self.planes, self.keys, self.refreshed, int(self.pool[gaussians.USED]),
-            FLOOR, max(EXTENT2, self.size**2), self._shapes,
+            FLOOR_M2, max(EXTENT_M2, self.size**2), self._shapes,
         )  # fmt: skip
         return self._shapes
 
@@ -89,7 +89,7 @@ class GaussianMap(Stateful):
             reach=self.reach, capacity=capacity, breadth=self.breadth,
         )  # fmt: skip
         gaussians.coarsen(
-            factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR, self.breadth, self.moments, self.keys,
+            factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR_M2, self.breadth, self.moments, self.keys,
             int(self.pool[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
             coarse.table, coarse.pool, coarse.free,
         )  # fmt: skip

@@ -22,9 +22,9 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 
 # A plane must have been seen across its beams by so many times the standard deviation that it is thick, squared: below that, a
 # plane through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
-BREADTH = SIGNIFICANT_SIGMAS**2
+LEAST_BREADTH = SIGNIFICANT_SIGMAS**2
 # Times the coarse voxels. Beams of two degrees lie two metres apart on a wall 60 m away, and on the ground 10 m ahead.
-WIDE = (2, 4)
+WIDE_FACTORS = (2, 4)
 
 
 class LocalMap(Stateful):
@@ -33,19 +33,19 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`; None: `BREADTH`
+    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`; None: `LEAST_BREADTH`
     """
 
     def __init__(
         self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float,
         breadth: float | None = None,
     ) -> None:  # fmt: skip
-        breadth = BREADTH if breadth is None else breadth
+        breadth = LEAST_BREADTH if breadth is None else breadth
         self.levels = tuple(
             GaussianMap(
                 edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=breadth
             )
-            for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE)))
+            for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE_FACTORS)))
         )
         # How often the map has changed: what was looked up in it before is void then.
         self.changes = 0

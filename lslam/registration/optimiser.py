@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
 from lslam.core.kernels import facts as at
-from lslam.core.kernels.gauss_newton import UNSEEN, step, step_on_surfaces, trimmed
+from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimmed
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.registration.result import LEAST_MATCHED, RegistrationResult
@@ -81,7 +81,7 @@ class Limits:
 
     weak_share: float
     least: float = 0.0
-    unseen: float = UNSEEN
+    unseen: float = UNSEEN_SHARE
     by_surfaces: bool = False
     allowed: Floats = field(default_factory=lambda: EVERYWHERE)
 

@@ -53,7 +53,7 @@ def _shapes(target: GaussianMap) -> Arrays:
 
 # The mean of a blob lies where rings do, which it stands across: along the sensor's axis it is known to a ring's gap, five
 # or six times worse than the points scatter.
-ALONG = 0.03
+WEIGHT_ALONG_AXIS = 0.03
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ResidualKind:
     voxels: Callable[[GaussianMap], Arrays] = _planes
     by_surfaces: bool = False
     is_wide: bool = True
-    along: float = ALONG
+    along: float = WEIGHT_ALONG_AXIS
     voxel_share: float = 1.0
     times_steps: int = 1
 

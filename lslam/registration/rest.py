@@ -15,13 +15,13 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import Stateful
 from lslam.registration.alignment import upright_directions
-from lslam.registration.gaussian_map import FLOOR
-from lslam.registration.local_map import BREADTH
+from lslam.registration.gaussian_map import FLOOR_M2
+from lslam.registration.local_map import LEAST_BREADTH
 from lslam.registration.preprocessing.ground import ground_of, up_of
 from lslam.registration.result import RegistrationResult
 
 # Squared Mahalanobis distance of six dimensions that two poses of one place exceed once in a thousand scans.
-CHI2_LIMIT = 22.5
+SAME_POSE_CHI2 = 22.5
 # Rest lasts longer than the time that the last motion took to show, by this factor.
 REST_RATIO = 2
 
@@ -62,13 +62,13 @@ class RestDetector(Stateful):
         d = np.concatenate([T[:3, 3] - reference[:3, 3], so3.log(T[:3, :3] @ reference[:3, :3].T)])
         if d[:3] @ d[:3] + result.lever_arm**2 * (d[3:] @ d[3:]) > self.sigma**2:
             return False
-        return float(d @ np.linalg.solve(2.0 * C, d)) < CHI2_LIMIT
+        return float(d @ np.linalg.solve(2.0 * C, d)) < SAME_POSE_CHI2
 
 
 # Voxels between surfaces of different things.
 THINGS_APART_VOXELS = 2.5
 # Squared sigmas beyond which a point is no inlier, so that two points at least make a vote.
-MOST_CHI2 = 9.0
+INLIER_CHI2 = 9.0
 # Squared sigmas by which a point tells two poses apart.
 TELLING_CHI2 = 0.5
 
@@ -89,7 +89,7 @@ class Votes:
 class PlanWalls:
     """Vertical surfaces of a scan, in plan: a façade of few rings far away has no plane in a voxel, and a line here.
 
-    A thing is a wall where its points are thin in plan, and lie across beams (`BREADTH`): a ring on a slope is thin, too.
+    A thing is a wall where its points are thin in plan, and lie across beams (`LEAST_BREADTH`): a ring on a slope is thin, too.
 
     cloud : (N, 3) m, LiDAR frame
     sigma : m, noise of a point
@@ -119,9 +119,9 @@ class PlanWalls:
         xx, xy, yy, zz = mean(x * x), mean(x * y), mean(y * y), mean(z * z)
         spread, angle = np.hypot((xx - yy) / 2, xy), 0.5 * np.arctan2(2 * xy, xx - yy)
         self._normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-        thick = np.maximum((xx + yy) / 2 - spread, 0.0) + FLOOR
+        thick = np.maximum((xx + yy) / 2 - spread, 0.0) + FLOOR_M2
         self._variance = thick + self._sigma2
-        self._is_wall = (thick < self._sigma2) & (np.minimum((xx + yy) / 2 + spread, zz) > BREADTH * thick)
+        self._is_wall = (thick < self._sigma2) & (np.minimum((xx + yy) / 2 + spread, zz) > LEAST_BREADTH * thick)
 
     def votes(self, cloud: NDArray[np.float32], motion: Floats) -> Votes:
         """How many things of a later scan (N, 3) fit better if the sensor stands, and how many if it came by `motion` (4, 4)."""
@@ -139,7 +139,7 @@ class PlanWalls:
             return Votes(0, 0)
         things = _connected(here[telling, :2], THINGS_APART_VOXELS * self._voxel_size)
         sums = np.bincount(things, gain[telling])
-        return Votes(*(int(np.count_nonzero(sign * sums > MOST_CHI2)) for sign in (1, -1)))
+        return Votes(*(int(np.count_nonzero(sign * sums > INLIER_CHI2)) for sign in (1, -1)))
 
     def _cost(self, points: Floats) -> tuple[Floats, Bools]:
         """(N,) squared sigmas of levelled points from their wall, NaN where none is known, and whether anything is near."""
@@ -147,8 +147,8 @@ class PlanWalls:
         is_near = np.isfinite(away)
         near = np.where(is_near, near, 0)
         off = ((points - self._mean[near])[:, :2] * self._normal[near]).sum(1)
-        cost = np.minimum(off**2 / self._variance[near], MOST_CHI2)
-        return np.where(is_near, np.where(self._is_wall[near], cost, np.nan), MOST_CHI2), is_near
+        cost = np.minimum(off**2 / self._variance[near], INLIER_CHI2)
+        return np.where(is_near, np.where(self._is_wall[near], cost, np.nan), INLIER_CHI2), is_near
 
 
 def _connected(points: Floats, apart_m: float) -> Longs:
@@ -184,13 +184,13 @@ class Rest(Stateful):
 
     def is_here(self, T_world_lidar: Floats, lever_arm: float) -> bool:
         """Whether a pose (4, 4) is the spot, within what registrations of one spot differ by: a sigma at least, three at most."""
-        usual = float(np.sqrt(MOST_CHI2 * self._squares / self.scans))
+        usual = float(np.sqrt(INLIER_CHI2 * self._squares / self.scans))
         return self._away(T_world_lidar, lever_arm) < min(max(usual, self.sigma), self._reach)
 
     @property
     def _reach(self) -> float:
         """m; beyond three sigma a single point would tell, and nearer a wall of the street may have no vote yet."""
-        return float(np.sqrt(MOST_CHI2)) * self.sigma
+        return float(np.sqrt(INLIER_CHI2)) * self.sigma
 
     def _away(self, T_world_lidar: Floats, lever_arm: float) -> float:
         """m from the spot to a pose (4, 4), but for height and tilt, for a point at the `lever_arm`, m."""

@@ -9,7 +9,7 @@ from lslam.core.kernels.significance import OUTLIER_SIGMAS, SIGNIFICANT_SIGMAS
 from lslam.core.types.state import Stateful
 
 # Of what was lately, what stays from scan to scan: a memory of five.
-FORGETTING = 0.8
+FORGETTING_FACTOR = 0.8
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class AdaptiveThreshold(Stateful):
 
     def observe(self, error: float) -> None:
         """Learn from one registered scan's prediction error, m."""
-        self.mean_square = FORGETTING * self.mean_square + (1 - FORGETTING) * error**2
+        self.mean_square = FORGETTING_FACTOR * self.mean_square + (1 - FORGETTING_FACTOR) * error**2
 
     def widen(self) -> None:
         """Reset to the widest after a failed scan."""
@@ -84,11 +84,11 @@ class UsualAgreement(Stateful):
 
         Each scan fills the voxels of a young map, and the next one finds more of them: a mean over the last few lags behind.
         """
-        self.usual = max(share, FORGETTING * self.usual + (1 - FORGETTING) * share)
+        self.usual = max(share, FORGETTING_FACTOR * self.usual + (1 - FORGETTING_FACTOR) * share)
 
     def relax(self) -> None:
         """Expect less after a bad scan, as if nothing had agreed: a place that has changed for good is accepted after a few."""
-        self.usual *= FORGETTING
+        self.usual *= FORGETTING_FACTOR
 
 
 def is_more(count: int, other: int) -> bool:

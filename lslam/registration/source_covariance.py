@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from lslam.core.types.arrays import Floats
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.kernels.discs import EXTENT2, source_discs
+from lslam.registration.kernels.discs import EXTENT_M2, source_discs
 
 # m; a sparse sensor's neighbouring rings share a cell of the second size, where the first holds one of them.
-CELL = 1.0
-WIDENING = 2
+COVARIANCE_CELL_M = 1.0
+CELL_FACTOR = 2
 # As many neighbours as Segal et al. (2009) take.
-NEIGHBOURS = 20
+COVARIANCE_POINTS = 20
 
 Neighbourhood = Literal["voxel", "knn"]
 
@@ -37,10 +37,10 @@ def _of_neighbours(
     from scipy.spatial import cKDTree
 
     cloud = map_points.astype(np.float64)
-    near = cloud[cKDTree(cloud).query(source, min(NEIGHBOURS, len(cloud)))[1].reshape(len(source), -1)]
+    near = cloud[cKDTree(cloud).query(source, min(COVARIANCE_POINTS, len(cloud)))[1].reshape(len(source), -1)]
     away = near - near.mean(axis=1, keepdims=True)
     normal = np.linalg.eigh(np.swapaxes(away, 1, 2) @ away)[1][:, :, 0]
-    discs = EXTENT2 * np.eye(3) - (EXTENT2 - thin) * normal[:, :, None] * normal[:, None, :]
+    discs = EXTENT_M2 * np.eye(3) - (EXTENT_M2 - thin) * normal[:, :, None] * normal[:, None, :]
     return np.ascontiguousarray(discs[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 
 
@@ -51,9 +51,9 @@ def _of_voxels(
     a guess that holds the sensor to where the ring was. Such points get no normal but their noise, `thin` in all
     directions, and the map's normal alone decides.
     """
-    scan = GaussianMap(CELL, capacity=1 << int(np.ceil(np.log2(max(len(map_points), 256)))), reach=np.inf)
+    scan = GaussianMap(COVARIANCE_CELL_M, capacity=1 << int(np.ceil(np.log2(max(len(map_points), 256)))), reach=np.inf)
     scan.insert(map_points, np.eye(4))
     out = np.tile([thin, 0.0, 0.0, thin, 0.0, thin], (len(source), 1))
-    for cells in (scan.coarsen(WIDENING), scan):
+    for cells in (scan.coarsen(CELL_FACTOR), scan):
         source_discs(source, cells.size, cells.planes, cells.keys, cells.table, thin, out)
     return out

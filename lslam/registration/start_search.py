@@ -12,7 +12,7 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Points
 from lslam.registration.alignment import upright_directions
-from lslam.registration.attempt import NEAR_KERNEL, Attempt
+from lslam.registration.attempt import NEAR_KERNEL_FACTOR, Attempt
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Correspondences, normal_equations
 from lslam.registration.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
@@ -24,21 +24,21 @@ from lslam.registration.solver import solve, voxel_terms
 
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
-NEAR = 0.4
-ALL_ALIKE = RegistrationConfig(sigma=NEAR, blob_weight=1.0, weak_share=0.0)
+NEAR_M = 0.4
+ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, blob_weight=1.0, weak_share=0.0)
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
-HIGH = 1.2
+HIGH_M = 1.2
 # m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
-START_STEP = 1.0
+START_STEP_M = 1.0
 # A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
 TURN_STEP_DEG = 3.0
 START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, TURN_STEP_DEG), 10)
 # Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
-SEARCH_SHARE, LOOKED_AT = 4, 3
+SEARCH_STRIDE, MOST_STARTS = 4, 3
 # Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
 # as much where planes, the prior or both say otherwise.
-CLEARLY = 1.05
-MUCH = 2 * CLEARLY - 1
+CLEAR_RATIO = 1.05
+MUCH_RATIO = 2 * CLEAR_RATIO - 1
 
 
 class NonGroundPoints:
@@ -49,7 +49,7 @@ class NonGroundPoints:
     """
 
     def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:
-        self._cells = GaussianMap(NEAR, min_points=1, planarity=np.inf, reach=np.inf, capacity=1 << 12)
+        self._cells = GaussianMap(NEAR_M, min_points=1, planarity=np.inf, reach=np.inf, capacity=1 << 12)
         self._up = up_of(preprocess)
         for points, T_world_lidar in scans:
             index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance, self._up)
@@ -58,21 +58,21 @@ class NonGroundPoints:
     def agreeing(self, high: PreparedPoints, T_world_lidar: Floats) -> Bools:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
         matches = Correspondences(len(high.source))
-        terms = voxel_terms(MEANS, MEANS.points(high, NEAR), (self._cells,), matches, NEAR, 1.0)
-        normal_equations(terms, T_world_lidar, NEAR, matches)
-        return (matches.away2 >= 0) & (matches.away2 < NEAR**2)
+        terms = voxel_terms(MEANS, MEANS.points(high, NEAR_M), (self._cells,), matches, NEAR_M, 1.0)
+        normal_equations(terms, T_world_lidar, NEAR_M, matches)
+        return (matches.away2 >= 0) & (matches.away2 < NEAR_M**2)
 
     def share(self, high: PreparedPoints, T_world_lidar: Floats) -> float:
         """Which part of them does."""
         return np.count_nonzero(self.agreeing(high, T_world_lidar)) / max(len(high.source), 1)
 
     def align(self, high: PreparedPoints, T_start: Floats) -> RegistrationResult:
-        """Lay them on these points, point to point, from less than `START_STEP` away, with height and tilt as they are.
+        """Lay them on these points, point to point, from less than `START_STEP_M` away, with height and tilt as they are.
 
         At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
         """
         level = np.eye(6) - upright_directions(T_start, self._up)
-        annealing = Annealing(START_STEP, NEAR / 2, 0.7, 20)
+        annealing = Annealing(START_STEP_M, NEAR_M / 2, 0.7, 20)
         return solve((self._cells,), high, T_start, annealing, ALL_ALIKE, residual=MEANS, allowed=level)
 
 
@@ -83,7 +83,7 @@ def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground
 
 def high_points(points: PreparedPoints, ground: Ground) -> PreparedPoints:
     """What to look for among `NonGroundPoints` at some pose: the points of another scan that are high above its ground."""
-    above = points.map_points[ground.above(points.map_points, HIGH)]
+    above = points.map_points[ground.above(points.map_points, HIGH_M)]
     return PreparedPoints(above, above.astype(np.float64), np.zeros((len(above), 6)), len(above))
 
 
@@ -123,7 +123,7 @@ def best_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
         result = _best_start(attempt, result, non_ground, high)
     coarser = target.coarse_maps(points, T_prior)
     flat = on_ground(points, ground, target.preprocess.ground_tolerance)
-    width = NEAR_KERNEL * c.kernel_min
+    width = NEAR_KERNEL_FACTOR * c.kernel_min
 
     def placed(start: Floats) -> RegistrationResult:
         """Height and tilt by the ground, the rest by non-ground points, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
@@ -146,7 +146,7 @@ def best_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
     last = attempt.history.recent[-1][1]
     is_drawn = result.ok and is_at_rest(place, last)
     # What rings draw there is no evidence that it is there.
-    margin = CLEARLY if is_at_rest(result.T_world_lidar, last) else MUCH
+    margin = CLEAR_RATIO if is_at_rest(result.T_world_lidar, last) else MUCH_RATIO
     if is_drawn or not is_much_more(most, agreeing(result), margin):
         return result
     near = target.refine(points, place, width, c.start_iterations, target.coarse_maps(points, place))
@@ -163,23 +163,23 @@ def _best_start(
 ) -> RegistrationResult:
     """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
     target, count = attempt.target, len(high.source)
-    coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_SHARE)
-    slow = target.slowly(2 * START_STEP)
+    coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_STRIDE)
+    slow = target.slowly(2 * START_STEP_M)
     trials = [
         solve((coarse_map,), few, attempt.T_prior @ se3.make(np.eye(3), offset), slow, attempt.config)
-        for offset in start_offsets(attempt.config.start_reach, START_STEP, up_of(target.preprocess))
+        for offset in start_offsets(attempt.config.start_reach, START_STEP_M, up_of(target.preprocess))
     ]
     # Without non-ground points, as in hills, the ground decides.
     trials.sort(key=lambda at: (-non_ground.share(high, at.T_world_lidar), -at.inliers))
     for promising in distinct(trials, best.T_world_lidar):
         start = promising.T_world_lidar
         # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
-        result = attempt.judge(target.coarse_to_fine(attempt.points, start, 2 * START_STEP), start)
+        result = attempt.judge(target.coarse_to_fine(attempt.points, start, 2 * START_STEP_M), start)
         share, usual = (non_ground.share(high, at.T_world_lidar) for at in (result, best))
         if count == 0:
             share, usual = result.agreement, best.agreement
         # A failed one has the prior's pose: fewer inliers than there are no improvement.
-        if result.ok and (share > CLEARLY * usual if best.ok else share >= usual):
+        if result.ok and (share > CLEAR_RATIO * usual if best.ok else share >= usual):
             best = result
     return best
 
@@ -188,7 +188,7 @@ def _likeliest(
     non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats
 ) -> Floats:  # fmt: skip
     """(4, 4) pose up to `reach`, m, from the prior, or turned about `up`, at which most points have one near by."""
-    moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR, up)]
+    moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR_M, up)]
     turns = np.deg2rad(START_TURNS_DEG)
     turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in turns]
     return max([*moved, *turned], key=lambda start: non_ground.share(high, start))
@@ -197,10 +197,10 @@ def _likeliest(
 def is_at_rest(pose: Floats, last: Floats) -> bool:
     """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
     move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
-    return bool(np.linalg.norm(move) < 2 * NEAR and turn < np.deg2rad(TURN_STEP_DEG))
+    return bool(np.linalg.norm(move) < 2 * NEAR_M and turn < np.deg2rad(TURN_STEP_DEG))
 
 
-def is_much_more(ours: Bools, others: Bools, margin: float = MUCH) -> bool:
+def is_much_more(ours: Bools, others: Bools, margin: float = MUCH_RATIO) -> bool:
     """Whether `margin` times as many points agree at one pose as at the other, and not by chance: flags (S,) of the same.
 
     McNemar's test of paired shares at two sigma, on the points that agree at one of the poses only.
@@ -210,14 +210,14 @@ def is_much_more(ours: Bools, others: Bools, margin: float = MUCH) -> bool:
 
 
 def distinct(results: list[RegistrationResult], T_best: Floats) -> list[RegistrationResult]:
-    """The first `LOOKED_AT` places that lie at least half a step from the known pose (4, 4) and from each other."""
+    """The first `MOST_STARTS` places that lie at least half a step from the known pose (4, 4) and from each other."""
     places, apart = [T_best[:3, 3]], []
     for result in results:
         place = result.T_world_lidar[:3, 3]
-        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP / 2:
+        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP_M / 2:
             places.append(place)
             apart.append(result)
-    return apart[:LOOKED_AT]
+    return apart[:MOST_STARTS]
 
 
 def start_offsets(reach: float, step: float, up: Floats = Z) -> Floats:

@@ -55,8 +55,8 @@ THIRDS = ("street", "corridor", "urban")
 
 BLOBS_AS_BEFORE = {**residuals.RESIDUALS, "plane": replace(residuals.RESIDUALS["plane"], along=1.0)}
 MAP: dict[str, Variant] = {
-    "breadth": ((), ((local_map, "BREADTH", 0.0),)),
-    "wide voxels": ((), ((local_map, "WIDE", ()),)),
+    "breadth": ((), ((local_map, "LEAST_BREADTH", 0.0),)),
+    "wide voxels": ((), ((local_map, "WIDE_FACTORS", ()),)),
     "wide weigh less": ((), ((solver, "part_of_usual", lambda size, usual: 1.0),)),
 }
 WITHOUT: dict[str, dict[str, Variant]] = {
@@ -68,9 +68,9 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "start search": (("recovery.start_search=false",), ()),
         "held at rest": (("recovery.at_rest=false",), ()),
         "at rest": ((), ((start_search, "is_at_rest", lambda pose, last: False),)),
-        "HIGH": ((), ((start_search, "HIGH", 0.3),)),
-        "CLEARLY": ((), ((start_search, "CLEARLY", 1.0),)),
-        "MUCH": ((), ((start_search, "MUCH", 1.0),)),
+        "HIGH_M": ((), ((start_search, "HIGH_M", 0.3),)),
+        "CLEAR_RATIO": ((), ((start_search, "CLEAR_RATIO", 1.0),)),
+        "MUCH_RATIO": ((), ((start_search, "MUCH_RATIO", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),
         "possible jumps": ((), ((tracker, "fault", lambda pose, stamp_ns, last: ""),)),
         "bounded acceleration": ((), ((ConstantVelocity, "MAX_ACCELERATION", np.inf),)),

@@ -57,7 +57,7 @@ NOT_OF_IT = {
     "registration/source_covariance.py", "registration/voxel_target.py SPARSE_SHARE",
     "registration/start_search.py NO_PLANES", "core/kernels/voxel.py OFFSET", "core/kernels/voxel.py MASK",
     "core/kernels/gaussians.py FREE", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
-    "core/kernels/ground.py EMPTY", "odometry/kernels/lines.py NO_LINE", "registration/kernels/curvature.py EDGE",
+    "core/kernels/ground.py NO_HEIGHT", "odometry/kernels/lines.py NO_LINE", "registration/kernels/curvature.py EDGE",
     "registration/kernels/curvature.py LESS_EDGE", "registration/kernels/curvature.py NEITHER",
     "registration/kernels/curvature.py LESS_PLANE", "registration/kernels/curvature.py PLANE",
     "registration/preprocessing/features.py MAY_BE_EDGE", "registration/preprocessing/features.py MAY_BE_FLAT",
@@ -88,8 +88,8 @@ KEYS = {
 CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odometry.py"}
 COSINES = {"UPRIGHT"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
-LACK = {"FORGETTING", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
-EXCESS = {"CLEARLY", "MUCH", "MORE", "PILED"}
+LACK = {"FORGETTING_FACTOR", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
+EXCESS = {"CLEAR_RATIO", "MUCH_RATIO", "MORE_POINTS_RATIO", "LONE_CHECK_RATIO", "PILED_RATIO"}
 FACTORS = {"half": 0.5, "double": 2.0}
 
 

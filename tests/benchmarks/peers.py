@@ -268,7 +268,7 @@ def gicp_keyframes(beginning: Beginning) -> Keyframed:
     method = small_gicp.create(load_config(None, [f"input.threads={CORES}"], {}))
 
     def covered(cloud: Any) -> Any:
-        return package.preprocess_points(cloud, downsampling_resolution=small_gicp.LEAF, num_threads=CORES)[0]
+        return package.preprocess_points(cloud, downsampling_resolution=small_gicp.LEAF_M, num_threads=CORES)[0]
 
     return Keyframed(method, package.PointCloud, covered)
 
@@ -282,8 +282,8 @@ def gicp_open3d(beginning: Beginning) -> Keyframed:
         return package.geometry.PointCloud(package.utility.Vector3dVector(points))
 
     def covered(cloud: Any) -> Any:
-        thinned = cloud.voxel_down_sample(open3d_method.LEAF)
-        thinned.estimate_covariances(package.geometry.KDTreeSearchParamKNN(open3d_method.NEIGHBOURS))
+        thinned = cloud.voxel_down_sample(open3d_method.LEAF_M)
+        thinned.estimate_covariances(package.geometry.KDTreeSearchParamKNN(open3d_method.COVARIANCE_POINTS))
         return thinned
 
     return Keyframed(method, cloud, covered)

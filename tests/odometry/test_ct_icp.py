@@ -20,13 +20,13 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
-from lslam.odometry.elastic import PARTS, SweepPoints, register_elastic
+from lslam.odometry.elastic import SWEEP_PARTS, SweepPoints, register_elastic
 from lslam.odometry.elastic_constraints import (
-    FORGETTING,
-    LAG,
+    FORGETTING_FACTOR,
+    LAG_RATIO,
     LEAST_CHANGE,
     LEAST_SKEW,
-    MISS,
+    MISS_RATIO,
     ElasticConstraints,
     ElasticSweep,
     LastSweep,
@@ -146,7 +146,7 @@ def test_the_parts_of_a_sweep_add_up_to_the_whole() -> None:
     true = elastic(pose_at(), pose_at())
     points = scanned(true)
     H, _, _ = points.linearise(true.prior, (0.15, 0.15, np.inf))
-    assert H.shape == (PARTS, 6, 6)
+    assert H.shape == (SWEEP_PARTS, 6, 6)
     shift = np.array([0.01, -0.02, 0.01, 0.001, 0.002, -0.001])
     moved = true.moved(np.tile(shift, (2, 1)))
     _, g_moved, _ = points.linearise(moved.prior, (10.0, 10.0, np.inf))
@@ -233,8 +233,8 @@ def test_miss_and_lag_are_the_constants_of_random_acceleration() -> None:
     slope, offset = np.polyfit(u, way.T, 1)
     middle = offset + slope / 2
     change = np.diff(middle, 2).std()
-    assert (offset[1:] - offset[:-1] - slope[:-1]).std() / change == pytest.approx(MISS, rel=0.03)
-    assert (slope[1:] - np.diff(middle)).std() / change == pytest.approx(LAG, rel=0.03)
+    assert (offset[1:] - offset[:-1] - slope[:-1]).std() / change == pytest.approx(MISS_RATIO, rel=0.03)
+    assert (slope[1:] - np.diff(middle)).std() / change == pytest.approx(LAG_RATIO, rel=0.03)
 
 
 def test_the_skew_of_a_map_is_found_where_the_sweep_is_known() -> None:
@@ -267,10 +267,10 @@ def test_the_skew_of_the_map_decays_over_five_scans() -> None:
     np.testing.assert_allclose(np.linalg.inv(held.skewed), sigma2 * np.eye(6), rtol=1e-9, atol=1e-15)
     changes = []
     for k in range(1, 6):
-        changes.append(1.0 / held.velocity[0, 0] / LAG**2 - 2 * LEAST_CHANGE**2)
+        changes.append(1.0 / held.velocity[0, 0] / LAG_RATIO**2 - 2 * LEAST_CHANGE**2)
         last.follow(100_000_000 * k, steady.pose, steady, steady, np.zeros(6), P, 0.1)
         held = last.constraints(100_000_000 * (k + 1), steady)
-    np.testing.assert_allclose(np.divide(changes[1:], changes[:-1]), FORGETTING, rtol=0.01)
+    np.testing.assert_allclose(np.divide(changes[1:], changes[:-1]), FORGETTING_FACTOR, rtol=0.01)
 
 
 @pytest.mark.parametrize("gap", [0, 1])

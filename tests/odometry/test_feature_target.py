@@ -14,7 +14,7 @@ from lslam.core.config.odometry import LoamConfig, RecoveryConfig
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
-from lslam.odometry.all_points import ALL_POINTS, FED
+from lslam.odometry.all_points import ALL_POINTS, CONSTRAINED_SCANS
 from lslam.odometry.feature_map import feature_scan
 from lslam.odometry.feature_policies import LessPlanar, feature_policies
 from lslam.odometry.feature_solver import (
@@ -211,7 +211,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     registration.update(registration.locate(features, np.eye(4)))
     assert registration.target.all_points is not None
     entered = []
-    for is_starved in (False, True, *[False] * (FED + 2)):
+    for is_starved in (False, True, *[False] * (CONSTRAINED_SCANS + 2)):
         monkeypatch.setattr(
             "lslam.odometry.feature_policies.is_well_constrained", lambda *_, starved=is_starved: not starved
         )
@@ -220,7 +220,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
         registration.update(result)
         entered.append(registration.target.all_points.state()["_icp"]["history"]["inserted"])
     assert entered[0] == 0
-    assert np.diff(entered[1:]).tolist() == [1] * (FED - 1) + [0] * 3
+    assert np.diff(entered[1:]).tolist() == [1] * (CONSTRAINED_SCANS - 1) + [0] * 3
 
 
 @pytest.mark.parametrize(

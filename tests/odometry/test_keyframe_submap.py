@@ -7,7 +7,7 @@ import pytest
 from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
-from lslam.odometry.keyframe_submap import NEAREST, ON_HULL, KeyframeSubmap, hull_of, spacing_of
+from lslam.odometry.keyframe_submap import HULL_KEYFRAMES, NEAREST_KEYFRAMES, KeyframeSubmap, hull_of, spacing_of
 from lslam.registration.preprocessing.prepare import PreparedPoints
 
 Floats = NDArray[np.float64]
@@ -67,7 +67,7 @@ def test_the_nearest_and_the_hulls_nearest_corners_are_the_map() -> None:
     """A long straight: its ends are the hull. A drive round a square: corners far away belong to it too."""
     target = KeyframeSubmap()
     listed = entered(target, [pose_at((6.0 * k, 0.0, 0.0)) for k in range(40)], 15.0)
-    assert sorted(x for x, _ in listed.held) == [0.0, *(6.0 * k for k in range(40 - NEAREST, 40))]
+    assert sorted(x for x, _ in listed.held) == [0.0, *(6.0 * k for k in range(40 - NEAREST_KEYFRAMES, 40))]
     square = [(60.0, 0.0), (60.0, 60.0), (0.0, 60.0), (0.0, 0.0)]
     ring, at = [], np.zeros(2)
     for corner in square:
@@ -76,17 +76,17 @@ def test_the_nearest_and_the_hulls_nearest_corners_are_the_map() -> None:
         at = np.array(corner)
     listed = entered(KeyframeSubmap(), ring, 15.0)
     assert set(square) <= {(round(x, 6), round(y, 6)) for x, y in listed.held}
-    assert len(listed.held) <= NEAREST + ON_HULL
+    assert len(listed.held) <= NEAREST_KEYFRAMES + HULL_KEYFRAMES
 
 
 def test_the_map_is_rebuilt_only_when_a_keyframe_leaves_it() -> None:
     target = KeyframeSubmap()
-    listed = entered(target, [pose_at((6.0 * k, 0.0, 0.0)) for k in range(NEAREST)], 15.0)
+    listed = entered(target, [pose_at((6.0 * k, 0.0, 0.0)) for k in range(NEAREST_KEYFRAMES)], 15.0)
     assert listed.cleared == 0
-    way = [pose_at((6.0 * k, 0.0, 0.0)) for k in (*range(NEAREST, 40), *range(40, -1, -1))]
+    way = [pose_at((6.0 * k, 0.0, 0.0)) for k in (*range(NEAREST_KEYFRAMES, 40), *range(40, -1, -1))]
     listed = entered(target, way, 15.0)
     assert listed.cleared > 0
-    assert sorted(x for x, _ in listed.held)[:NEAREST] == [6.0 * k for k in range(NEAREST)]
+    assert sorted(x for x, _ in listed.held)[:NEAREST_KEYFRAMES] == [6.0 * k for k in range(NEAREST_KEYFRAMES)]
 
 
 @pytest.mark.parametrize("dimensions", [1, 2, 3])

@@ -24,7 +24,7 @@ from lslam.odometry import create_odometry
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import estimate
 from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.loam_livox import TRUST, joined, line_weights
+from lslam.odometry.loam_livox import SLOPE_SHARE, joined, line_weights
 from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
@@ -106,11 +106,11 @@ def test_pieces_that_agree_move_the_sweep_and_pieces_that_differ_bend_it() -> No
     assert located.matched == 240
     # Independent thirds: the line's variance at the begin, 3/2 sweeps of a piece before its middle.
     assert located.covariance is not None
-    np.testing.assert_allclose(located.covariance, np.eye(6) * (1 / 3 + (1.5 * TRUST) ** 2 / 2), atol=1e-12)
+    np.testing.assert_allclose(located.covariance, np.eye(6) * (1 / 3 + (1.5 * SLOPE_SHARE) ** 2 / 2), atol=1e-12)
     # 0.3 m/s faster than the prior says.
     faster = [se3.exp(np.array([0.3 * t, 0, 0, 0, 0, 0])) for t in MIDDLES]
     located, sweep = joined(pieces(faster), MIDDLES, prior)
-    at = 0.3 * (0.05 + TRUST * (times - 0.05))
+    at = 0.3 * (0.05 + SLOPE_SHARE * (times - 0.05))
     np.testing.assert_allclose(sweep.poses[:, 0, 3], prior.poses[:, 0, 3] + at, atol=1e-12)
     np.testing.assert_allclose(located.T_world_lidar, sweep.pose, atol=1e-12)
 

@@ -108,7 +108,7 @@ def test_an_extended_window_has_a_state_where_the_step_leads() -> None:
 def test_marginalising_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Newest state and covariance are those of the whole; a plane that is left out leaves its information, too."""
     whole = driven(4)
-    monkeypatch.setattr(plane_window, "LAG", 2)
+    monkeypatch.setattr(plane_window, "LAG_SCANS", 2)
     few = whole.marginalised()
     assert few.values.states == 2
     np.testing.assert_allclose(few.joint_covariance(), whole.joint_covariance(), rtol=1e-5, atol=1e-12)
@@ -116,7 +116,7 @@ def test_marginalising_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert again is not None
     np.testing.assert_allclose(again.values.poses[-1], whole.values.poses[-1], atol=2e-4)
     unseen = few.landmarks.unseen.copy()
-    unseen[2] = plane_window.FORGET
+    unseen[2] = plane_window.UNSEEN_SCANS
     kept = few.seen.only(few.seen.planes != 2)
     one_less = replace(few, landmarks=replace(few.landmarks, unseen=unseen), seen=kept)
     assert len(one_less.marginalised().landmarks) == len(WALLS) - 1

@@ -74,7 +74,7 @@ def test_without_the_breadth_gate_single_rings_bias_the_pose(
     car_park: tuple[Sequence, Floats], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Matched with all voxels, it never leaves the start or is given up: the breadth of a voxel is what tells."""
-    monkeypatch.setattr(local_map, "BREADTH", 0.0)
+    monkeypatch.setattr(local_map, "LEAST_BREADTH", 0.0)
     sequence, truth = car_park
     assert worst(run(sequence), truth) > 10.0
 

@@ -384,4 +384,4 @@ def test_checkpoints_can_be_switched_off(tmp_path: Path) -> None:
     with pytest.raises(InterruptedRunError):
         lslam.run(drive(), config, out=tmp_path / "out", watch=interrupted("odometry", 6))
     assert not (tmp_path / "out" / "checkpoint").exists()
-    assert checkpoints.COPIES == 2
+    assert checkpoints.CHECKPOINT_COPIES == 2

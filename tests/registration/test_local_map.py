@@ -12,7 +12,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import BREADTH, LocalMap, make_map_scans
+from lslam.registration.local_map import LEAST_BREADTH, LocalMap, make_map_scans
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.simulation.scenarios import simulate
@@ -36,7 +36,7 @@ def assert_same(a: GaussianMap, b: GaussianMap) -> None:
 def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> None:
     target, points, T = new_map(), scan(0), pose_at((1.0, 2.0, 0.5), 30.0)
     target.insert(points.map_points, points.source, T)
-    kept = {"min_points": 6, "planarity": 0.3, "count_cap": 200.0, "reach": 100.0, "breadth": BREADTH}
+    kept = {"min_points": 6, "planarity": 0.3, "count_cap": 200.0, "reach": 100.0, "breadth": LEAST_BREADTH}
     fine, *coarser = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8, 6 * 0.8, 12 * 0.8))
     fine.insert(points.map_points, T)
     assert_same(target.fine, fine)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.start_search import NEAR, NonGroundPoints, ground_under, high_points, on_ground
+from lslam.registration.start_search import NEAR_M, NonGroundPoints, ground_under, high_points, on_ground
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -44,7 +44,7 @@ def test_the_share_is_that_of_points_with_a_neighbour_and_leaves_the_ground_out(
         pose = true @ pose_at((off, 0.1, 0.0))
         away, _ = tree.query(se3.apply(pose, seen.source))
         # Cells stand for their points: their mean lies up to half a cell from any of them.
-        assert (away < NEAR / 2).mean() - 0.02 <= first.share(seen, pose) <= (away < 1.5 * NEAR).mean() + 0.02
+        assert (away < NEAR_M / 2).mean() - 0.02 <= first.share(seen, pose) <= (away < 1.5 * NEAR_M).mean() + 0.02
     assert first.share(seen, true) == 1.0
     assert first.share(seen, true) > 1.06 * first.share(seen, true @ pose_at((1.0, 0.0, 0.0)))
 

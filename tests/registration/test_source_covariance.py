@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.registration import Registration
-from lslam.registration.source_covariance import NEIGHBOURS, Neighbourhood, source_covariance
+from lslam.registration.source_covariance import COVARIANCE_POINTS, Neighbourhood, source_covariance
 
 THIN = 9e-4
 
@@ -24,7 +24,7 @@ def test_neighbours_are_the_twenty_nearest_and_make_a_disc() -> None:
     source = cloud[::50].astype(np.float64) + rng.normal(0, 0.02, (len(cloud[::50]), 3))
     found = full(source_covariance(source, cloud, THIN, "knn"))
     for point, C in zip(source, found, strict=True):
-        near = cloud[np.argsort(((cloud - point) ** 2).sum(1), kind="stable")[:NEIGHBOURS]].astype(np.float64)
+        near = cloud[np.argsort(((cloud - point) ** 2).sum(1), kind="stable")[:COVARIANCE_POINTS]].astype(np.float64)
         _, vectors = np.linalg.eigh(np.cov(near.T))
         values, axes = np.linalg.eigh(C)
         np.testing.assert_allclose(values, [THIN, 1.0, 1.0], atol=1e-9)

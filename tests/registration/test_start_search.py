@@ -12,7 +12,7 @@ from recovery_drives import driven, seen_by
 
 from lslam.core.geometry import se3, so3
 from lslam.registration.registration import Registration
-from lslam.registration.start_search import MUCH, is_much_more, start_offsets
+from lslam.registration.start_search import MUCH_RATIO, is_much_more, start_offsets
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -200,7 +200,7 @@ def test_a_larger_share_is_significant_and_above_the_margin() -> None:
     assert not is_much_more(*of(70, 60, 40, 100))
     assert is_much_more(*of(70, 60, 60, 100)), "ten agree here alone, and none does there alone"
     assert not is_much_more(*of(600, 700, 500, 1000))
-    assert not is_much_more(*of(7000, int(1.01 * 7000 / MUCH), 6000, 10_000))
+    assert not is_much_more(*of(7000, int(1.01 * 7000 / MUCH_RATIO), 6000, 10_000))
     # 60 points agree at both poses, 40 at either one or the other, by chance: more than two sigma once in 52 times.
     ours = np.random.default_rng(0).binomial(40, 0.5, 4000)
     by_chance = np.mean([is_much_more(*of(60 + k, 100 - k, 60, 100)) for k in ours.tolist()])

@@ -20,7 +20,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.alignment import MapAlignment
-from lslam.registration.attempt import NEAR_KERNEL
+from lslam.registration.attempt import NEAR_KERNEL_FACTOR
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import UsualAgreement
@@ -102,7 +102,7 @@ class MapFollower(Stateful):
         A prior wider than the widest kernel says next to nothing, and is the initial guess only.
         """
         c = self.config.registration
-        width = max(self._spread(), NEAR_KERNEL * c.kernel_min)
+        width = max(self._spread(), NEAR_KERNEL_FACTOR * c.kernel_min)
         if start is self.T and width <= c.kernel_max:
             information = np.asarray(np.linalg.inv(self.covariance), np.float64)
             return alignment.refine(points, start, width, c.max_iterations, information=information)

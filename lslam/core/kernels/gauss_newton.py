@@ -16,9 +16,9 @@ Limits = tuple[float, float, float]
 
 # A degenerate direction is still estimated until its information is below this part of the threshold: errors of a degree in the
 # normals alone give a direction that nothing observes 3e-4 of the information.
-UNSEEN = 0.3
+UNSEEN_SHARE = 0.3
 # Part of the largest eigenvalue below which an eigenvalue is an error of rounding.
-ROUNDING = 1e-12
+ROUNDING_SHARE = 1e-12
 
 
 @inline_with_arrays
@@ -39,7 +39,7 @@ def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least
     d[:] = 0.0
     count = 0
     needed = max(weak_share * facts[INFORMATION], least)
-    none = ROUNDING * extent(values)[1]
+    none = ROUNDING_SHARE * extent(values)[1]
     for k in range(6):
         if values[k] <= needed or values[k] <= none:
             for i in range(6):

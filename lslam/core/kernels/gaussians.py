@@ -31,7 +31,7 @@ FREE = -1
 EMPTY, BLOB = -2.0, -1.0
 # Least variance of a blob across the beams, as a part of its largest variance. A bush is as deep as it is wide; a single ring
 # that bends in its voxel is a strip.
-SOLID = 0.1
+SOLID_SHARE = 0.1
 USED, FREED, HAND, LIVE = 0, 1, 2, 3
 
 
@@ -116,7 +116,7 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
     is_plane = l1 - l0 >= planarity * max(l2, 1e-12)
     if breadth > 0.0:
         across = breadth_of(xx, xy, xz, yy, yz, zz, mx - s[10] * w, my - s[11] * w, mz - s[12] * w)
-        if across < (breadth * (max(l0, 0.0) + floor) if is_plane else SOLID * l2):
+        if across < (breadth * (max(l0, 0.0) + floor) if is_plane else SOLID_SHARE * l2):
             p[7] = EMPTY
             return
     if is_plane:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import inline, kernel
 
-EMPTY = 1e30
+NO_HEIGHT = 1e30
 
 
 @inline
@@ -25,7 +25,7 @@ def lowest(points: NDArray[np.float32], R: NDArray[np.float64], cell: float, hal
     """Index of the lowest point of each cell, -1 where there is none: (4 half^2,)."""
     found, height = np.empty(4 * half * half, np.int64), np.empty(4 * half * half)
     found[:] = -1
-    height[:] = EMPTY
+    height[:] = NO_HEIGHT
     inverse = 1.0 / cell
     for k in range(len(points)):
         px, py, pz = float(points[k, 0]), float(points[k, 1]), float(points[k, 2])
@@ -86,16 +86,16 @@ def envelope(height: NDArray[np.float64], rise: float, tolerance: float) -> NDAr
     """
     n = len(height)
     top = np.empty((n, n))
-    top[:] = EMPTY
+    top[:] = NO_HEIGHT
     for i in range(n):
         for j in range(n):
             h = height[i, j]
-            if h >= EMPTY:
+            if h >= NO_HEIGHT:
                 continue
             seen = low = 0
             for a in range(max(i - 2, 0), min(i + 3, n)):
                 for b in range(max(j - 2, 0), min(j + 3, n)):
-                    if (a != i or b != j) and height[a, b] < EMPTY:
+                    if (a != i or b != j) and height[a, b] < NO_HEIGHT:
                         seen += 1
                         if height[a, b] < h + tolerance + 2.0 * rise:
                             low += 1

@@ -18,7 +18,7 @@ from lslam.core.kernels.voxel import index_of, pack
 Voxels = tuple[Floats, Longs, Ints]
 
 # Factor on the variance of the normal: the errors of neighbouring points of one ring are correlated.
-TILT = SIGNIFICANT_SIGMAS**2
+TILT_FACTOR = SIGNIFICANT_SIGMAS**2
 
 
 @inline
@@ -116,7 +116,7 @@ def variance_of(p: Floats, off: float, d2: float) -> float:
     mean.
     p : (8,) row of `planes`; off : distance of the point from the plane, m; d2 : squared distance from the mean, m2
     """
-    variance: float = p[6] + TILT * p[7] * (d2 - off * off)
+    variance: float = p[6] + TILT_FACTOR * p[7] * (d2 - off * off)
     return variance
 
 

@@ -52,7 +52,7 @@ STATE_CLASSES = (
 log = logging.getLogger("lslam")
 
 # The last one may be damaged when the machine itself went down while it was written.
-COPIES = 2
+CHECKPOINT_COPIES = 2
 
 
 class CheckpointSchedule:
@@ -100,7 +100,7 @@ class Checkpoints:
         self.folder.mkdir(exist_ok=True)
         record = {**content(), "warned": warnings_so_far().state()}
         write_state(self.folder / f"{self._stage}-{scans:07d}.npz", record)
-        for old in self._files()[:-COPIES]:
+        for old in self._files()[:-CHECKPOINT_COPIES]:
             with contextlib.suppress(OSError):
                 old.unlink()
         self.schedule.wrote(time.perf_counter() - began)

@@ -17,7 +17,7 @@ from lslam.core.types.state import State, Stateful
 from lslam.core.types.trajectory import Keyframe
 
 # Scans that wait for their cloud at most, so that a slow disk does not fill the memory.
-WAITING = 3
+QUEUE_SCANS = 3
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Keyframing(Stateful):
         if self._pool is None:
             self._write(keyframe, scan, motion)
             return
-        self._wait(WAITING - 1)
+        self._wait(QUEUE_SCANS - 1)
         self._pending.append(self._pool.submit(copy_context().run, self._write, keyframe, scan, motion))
 
     def _write(self, keyframe: Keyframe, scan: Scan, motion: MotionPrior) -> None:

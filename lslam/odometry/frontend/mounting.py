@@ -15,9 +15,9 @@ from lslam.registration.preprocessing.prepare import clean_points
 from lslam.registration.preprocessing.up import Up, find_up
 
 # Scans of which the largest serves: the first message may be a sliver.
-SCANS = 3
+MOUNTING_SCANS = 3
 # s; gravity is averaged over the first of the drive: swings of a hand and most of what a car accelerates cancel.
-GRAVITY_S = 10.0
+LEVELLING_S = 10.0
 
 
 def with_up(sequence: Sequence, config: Config) -> Config:
@@ -48,7 +48,7 @@ def _up_of(sequence: Sequence, config: Config) -> Up | None:
     up = find_up(clean_points(first.points, plain), gravity)
     if up.tilt_deg == 0.0 and up.source != "axis":
         return up
-    largest = max((first, *islice(scans, SCANS - 1)), key=len)
+    largest = max((first, *islice(scans, MOUNTING_SCANS - 1)), key=len)
     return find_up(clean_points(largest.points, plain), gravity)
 
 
@@ -57,7 +57,7 @@ def _gravity_up(sequence: Sequence, begin_ns: int) -> Floats | None:
     imu, T_lidar_imu = sequence.imu, sequence.calibration.T_lidar_imu
     if imu is None or len(imu) < 2:
         return None
-    begin, end = np.searchsorted(imu.stamps_ns, [begin_ns, begin_ns + round(1e9 * GRAVITY_S)])
+    begin, end = np.searchsorted(imu.stamps_ns, [begin_ns, begin_ns + round(1e9 * LEVELLING_S)])
     if end - begin > 1:
         imu = ImuStream(imu.stamps_ns[begin:end], imu.accel[begin:end], imu.gyro[begin:end])
     if not np.isfinite(imu.accel).all() or gravity_unit(imu)[1] is None:

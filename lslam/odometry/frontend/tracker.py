@@ -19,12 +19,12 @@ from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionMo
 from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.odometry.scan_outcome import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
-from lslam.registration.gaussian_map import FLOOR
+from lslam.registration.gaussian_map import FLOOR_M2
 from lslam.registration.result import RegistrationResult
 
 # Two registrations from different initial guesses are the same minimum if their distance is below this part of the distance
 # between the prior and the first.
-SAME = 0.3
+SAME_MINIMUM_RATIO = 0.3
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Tracker(Stateful):
 
     # A change of the motion within the sweep that moves no point by more, as surfaces are thick, is not worth a second
     # registration.
-    REFINE_M = FLOOR**0.5
+    REFINE_M = FLOOR_M2**0.5
     STATE = ("motion", "stationary", "middle", "_last")
 
     def __init__(
@@ -234,7 +234,7 @@ class Tracker(Stateful):
         if fused.is_accepted:
             return _both(located, fused)
         apart, off = (_apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
-        source = located if near.ok and apart < SAME * off else rejected
+        source = located if near.ok and apart < SAME_MINIMUM_RATIO * off else rejected
         # Where nothing is found near by, the first registration enters with the points as they are seen from there.
         base = near
         if not near.ok:

@@ -21,7 +21,7 @@ from lslam.odometry.base import Deskewing, Resumable
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.odometry.inertial.course import NEIGHBOURS, Course
+from lslam.odometry.inertial.course import NEIGHBOUR_SWEEPS, Course
 from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.registration.robust import is_more
 
@@ -77,7 +77,7 @@ def _is_placed(tracked: Tracked) -> bool:
 
 
 # Scans: two seconds, which are held in memory.
-WINDOW = 20
+WINDOW_SCANS = 20
 
 
 class WindowTracker(Stateful):
@@ -149,7 +149,7 @@ class WindowTracker(Stateful):
         if not self._scans:
             return self._moved(decided)
         self._decided += decided
-        is_full = len(self._scans) >= WINDOW and self._tracker.is_settled
+        is_full = len(self._scans) >= WINDOW_SCANS and self._tracker.is_settled
         return self._close() if is_full or loaded is None else []
 
     def state(self) -> State:
@@ -167,7 +167,7 @@ class WindowTracker(Stateful):
         """The scans of the window, the first of a run where the later ones put it."""
         is_bent = self.is_windowed and self._follow_course()
         out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
-        self._before = self._middles()[-NEIGHBOURS:]
+        self._before = self._middles()[-NEIGHBOUR_SWEEPS:]
         if self._world is None:
             out[0] = self._look_back(out)
         self._scans, self._decided = [], []
@@ -243,7 +243,7 @@ class WindowTracker(Stateful):
 
     def _is_bent(self) -> bool:
         """Whether the window's course, in one segment, displaces the points of most sweeps by more than their noise."""
-        if not self._is_whole() or len(self._middles()) < 2 * NEIGHBOURS:
+        if not self._is_whole() or len(self._middles()) < 2 * NEIGHBOUR_SWEEPS:
             return False
         course = self._course()
         squares = [square for t in self._decided if (square := _displacement2(t, course)) is not None]

@@ -24,7 +24,7 @@ MUCH_WORSE, OTHER_AXES = 4.0, np.deg2rad(20.0)
 # s: clocks of one machine differ by less; what differs by more is looked for only to say so.
 NEAR_S, FAR_S, STEP_S = 0.25, 10.0, 0.005
 # A correlation that is larger by less is the same.
-CLEARLY = 0.02
+CLEAR_CORRELATION = 0.02
 # A smaller clock offset is negligible, and an insignificant one is none.
 LEAST_OFFSET_S, SIGNIFICANT = 0.005, 3.0
 
@@ -77,7 +77,7 @@ def check_agreement(
         raise _no_fit(imu_rates, scan_rates, correlation)
     if offset_s is None and best in (0, len(offsets) - 1):
         at_zero = float(scores[len(offsets) // 2])
-        if correlation > at_zero + CLEARLY:
+        if correlation > at_zero + CLEAR_CORRELATION:
             raise _beyond(imu_rates, scan_rates, float(offsets[best]), at_zero, correlation)
         # In long even bends the clock offset is unobservable.
         best = len(offsets) // 2

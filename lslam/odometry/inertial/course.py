@@ -8,7 +8,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Longs
 
 # Middles on each side of a sweep. From one to the next its influence on a natural spline falls by 3.7.
-NEIGHBOURS = 3
+NEIGHBOUR_SWEEPS = 3
 # Of the motion from begin to end of a sweep.
 MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
 
@@ -27,9 +27,9 @@ class Course:
         """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no middle lies within, or there are few."""
         begin, end = stamp_ns + 1e9 * times[0], stamp_ns + 1e9 * times[-1]
         k = int(np.argmin(np.abs(self.instants_ns - (begin + end) / 2)))
-        if len(times) < 2 or len(self.instants_ns) < NEIGHBOURS or not begin <= self.instants_ns[k] <= end:
+        if len(times) < 2 or len(self.instants_ns) < NEIGHBOUR_SWEEPS or not begin <= self.instants_ns[k] <= end:
             return None
-        around = slice(max(k - NEIGHBOURS, 0), k + NEIGHBOURS + 1)
+        around = slice(max(k - NEIGHBOUR_SWEEPS, 0), k + NEIGHBOUR_SWEEPS + 1)
         nodes = 1e-9 * (self.instants_ns[around] - stamp_ns)
         twists = se3.log(se3.relative(self.poses[k], self.poses[around]))
         return se3.normalise(self.poses[k] @ se3.exp(natural_spline(np.asarray(nodes), twists, times)))

@@ -17,9 +17,9 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
-from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
+from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
-from lslam.odometry.inertial.imu_estimate import WORSE, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import WORSE_RATIO, ImuEstimate
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
@@ -137,7 +137,7 @@ class InertialMotion(Stateful):
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_imu @ vector_between(R_imu, end[:3, :3])])
         gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
-        if float(kalman.square(rest, P + 2 * C)) / (len(rest) * OUTLIER**2) > 1:
+        if float(kalman.square(rest, P + 2 * C)) / (len(rest) * INNOVATION_SIGMAS**2) > 1:
             return self._rejected(stamp_ns, result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.
@@ -327,7 +327,7 @@ class InertialMotion(Stateful):
             return
         newest = np.sort(np.array(self._errors[-self.JUDGED :]), axis=0)
         own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
-        if own > WORSE * steady + self.SLACK_M:
+        if own > WORSE_RATIO * steady + self.SLACK_M:
             self.refusal = (
                 f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
                 f"{LEVER_M:.0f} m): check its axes, T_lidar_imu and its stamps"

@@ -19,7 +19,7 @@ from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
 
 # Innovations beyond so many sigma are outliers and count accordingly less.
-OUTLIER = 4.0
+INNOVATION_SIGMAS = 4.0
 # rad/s per sqrt(Hz), least noise density; rad/s per sqrt(s), random walk of the bias: that of Kalibr's
 # ADIS16448. Ten times more, and turns over more than some seconds were registration's again, with all its noise.
 RATE_NOISE, BIAS_WALK = float(np.deg2rad(0.01)), float(np.deg2rad(0.001))
@@ -60,7 +60,7 @@ USUAL_NOISE = ImuNoise()
 # One sigma of scale, misalignment and mounting together: a data sheet's 2 % across the axes, a degree of mounting.
 AXES_SIGMA = 0.025
 # The noise is learnt over so many scans.
-MEMORY = 20
+NOISE_MEMORY_SCANS = 20
 # Where they are estimated, one sigma: a mounting read off a drawing or by eye, rad; the latency of a driver, s; how an offset
 # of two clocks drifts (some ppm), s per sqrt(s).
 MOUNTING_SIGMA, OFFSET_SIGMA, OFFSET_WALK = np.deg2rad(3.0), 0.03, 1e-5
@@ -170,7 +170,7 @@ class Gyroscope:
             return self._learnt_with_offset(step, rest, noise)
         x, P, excess = kalman.turned(
             np.concatenate([self.bias, self.axes.ravel()]), self.covariance, self._variance(step), step.rotations[-1],
-            step.velocity_arms[-1], step.duration, rest, noise, self.noise.gyro_walk, OUTLIER,
+            step.velocity_arms[-1], step.duration, rest, noise, self.noise.gyro_walk, INNOVATION_SIGMAS,
         )  # fmt: skip
         return self._moved(x, P, excess, step)
 
@@ -212,11 +212,11 @@ class Gyroscope:
         H = self.columns(step)
         allowed = float(np.trace(H @ before @ H.T + own))
         x = np.concatenate([self.bias, self.axes.ravel(), [self.offset_s]])
-        x, P = kalman.update(x, before, H, rest, own, OUTLIER)
-        return self._moved(x, P, min(float(rest @ rest), OUTLIER**2 * allowed) - allowed, step)
+        x, P = kalman.update(x, before, H, rest, own, INNOVATION_SIGMAS)
+        return self._moved(x, P, min(float(rest @ rest), INNOVATION_SIGMAS**2 * allowed) - allowed, step)
 
     def _moved(self, x: Floats, P: Floats, excess: float, step: Increments) -> Gyroscope:
-        variance = max(self.rate_variance + excess / (3 * step.duration * MEMORY), self.noise.rate**2)
+        variance = max(self.rate_variance + excess / (3 * step.duration * NOISE_MEMORY_SCANS), self.noise.rate**2)
         offset = float(x[12]) if self.has_offset else self.offset_s
         return Gyroscope(x[:3], x[3:12].reshape(3, 3), P, variance, self.noise, offset, self.is_mounted)
 

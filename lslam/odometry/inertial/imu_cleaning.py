@@ -19,8 +19,8 @@ CALM_S = 1.0
 # A stream slower than this cannot tell how the sensor moves within a sweep of 0.1 s.
 LEAST_RATE_HZ = 50.0
 # Clocks differ by some ppm, and drivers round their periods: nearer to that rate than a twentieth is that rate.
-RATE_SLACK = 0.05
-MOST_BAD = 0.1
+RATE_SLACK_SHARE = 0.05
+MOST_BAD_SHARE = 0.1
 
 
 class ImuFault(StrEnum):
@@ -89,7 +89,7 @@ def rate_of(imu: ImuStream) -> float:
 
 def is_slow(rate_hz: float) -> bool:
     """Whether a stream of that rate cannot tell how the sensor moves within a sweep; nothing is said of time that stands."""
-    return 0 < rate_hz < (1 - RATE_SLACK) * LEAST_RATE_HZ
+    return 0 < rate_hz < (1 - RATE_SLACK_SHARE) * LEAST_RATE_HZ
 
 
 def gravity_unit(imu: ImuStream) -> tuple[float, str | None]:
@@ -137,7 +137,7 @@ def _ordered(imu: ImuStream, notes: list[str]) -> ImuStream:
     ahead = np.ones(len(imu), bool)
     ahead[1:] = imu.stamps_ns[1:] > latest[:-1]
     for bad, what in ((~finite, "are not finite"), (~ahead, "repeat a time or go back")):
-        if bad.sum() > MOST_BAD * len(imu):
+        if bad.sum() > MOST_BAD_SHARE * len(imu):
             raise ImuRefusedError(f"{int(bad.sum())} of its {len(imu)} samples {what}")
         if bad.any():
             notes.append(f"IMU: {int(bad.sum())} of {len(imu)} samples {what} and are left out")

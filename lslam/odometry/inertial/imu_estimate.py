@@ -13,7 +13,7 @@ import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuState, ImuStream
-from lslam.odometry.inertial.gyroscope import OUTLIER, Gyroscope
+from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import vector_between
@@ -22,9 +22,9 @@ from lslam.odometry.kernels.rotation import vector_between
 PLACE_SIGMA, TURN_SIGMA = 0.007, np.deg2rad(0.05)
 # Random walk of gravity in the world of a registration that drifts, m/s2 per sqrt(s).
 GRAVITY_WALK = 5e-3
-GRAVITY_SIGMA = 0.03  # m/s2, over the Earth
+GRAVITY_SIGMA_M_S2 = 0.03  # m/s2, over the Earth
 # Times that one account of the motion may miss the registered one by more than its alternative before it is refused.
-WORSE = 2.0
+WORSE_RATIO = 2.0
 
 # (3, 3) m2 and rad2, of a registration without covariance.
 PLACE_NOISE, TURN_NOISE = PLACE_SIGMA**2 * np.eye(3), TURN_SIGMA**2 * np.eye(3)
@@ -115,7 +115,7 @@ class ImuEstimate:
         step = self._integrated(imu, step.instants_ns, bias)
         place = PLACE_NOISE if noise is None else PLACE_NOISE + noise
         x, P = _propagate(self, step, R)
-        x, P = kalman.placed(x, P, moved, 2 * place, GRAVITY, GRAVITY_SIGMA, OUTLIER)
+        x, P = kalman.placed(x, P, moved, 2 * place, GRAVITY, GRAVITY_SIGMA_M_S2, INNOVATION_SIGMAS)
         return self._with(x[3:], P[3:, 3:], step, gyroscope)
 
     def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:

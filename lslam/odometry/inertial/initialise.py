@@ -15,7 +15,7 @@ from lslam.core.types.scan_result import FASTEST_M_S, STILL_M
 from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
-from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, WORSE, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, WORSE_RATIO, ImuEstimate
 
 # Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
 ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = FASTEST_M_S / OUTLIER_SIGMAS, 0.5, 0.1, 0.02
@@ -23,11 +23,11 @@ ANY_SPEED, ANY_ACCEL_BIAS, ANY_GYRO_BIAS, MEAN_GYRO_BIAS = FASTEST_M_S / OUTLIER
 # A bias that is given was measured over minutes; one second that looks like standing may be a slow turn.
 GIVEN_ACCEL_BIAS, GIVEN_GYRO_BIAS, STANDING_GYRO_BIAS, GIVEN_SPEED = 0.1, 2e-4, 2e-3, 0.3
 # A given bias may differ from the mean rate error of the first seconds by so much, rad/s: misaligned axes add to that.
-MOST_BIAS_ERROR = 0.03
+MOST_BIAS_ERROR_RAD_S = 0.03
 # A standing sensor: spread of rates (rad/s) and forces (m/s2) over a second.
 STILL_RATE, STILL_FORCE = 0.02, 0.3
 # What gravity may be off beyond what a bias explains, m/s2.
-LEVEL_SIGMA = 0.3
+LEVEL_SIGMA_M_S2 = 0.3
 # The speed at the first scan is read off so many seconds: longer, and errors of the force add up.
 SPEED_S = 0.8
 # Gravity is read off so many seconds: shorter, and swings of the sensor take its place.
@@ -161,7 +161,7 @@ def _refuse_sign(imu: ImuStream, T_lidar_imu: Floats, part: FirstPoses, gyro_bia
         for sign in (1.0, -1.0)
     )
     # Forces of the right sign miss the path farther nowhere where anything accelerates.
-    if as_given > WORSE * reversed_:
+    if as_given > WORSE_RATIO * reversed_:
         raise ImuRefusedError(
             "its specific forces fit the path of the scans when they point the other way",
             "at rest they must be +g up, change the sign of its accelerometer",
@@ -173,7 +173,7 @@ def _without_wrong_bias(config: ImuConfig, scan_bias: Floats | None, problems: l
     if config.gyro_bias is None or scan_bias is None:
         return config
     off = float(np.abs(np.array(config.gyro_bias) - scan_bias).max())
-    if off < MOST_BIAS_ERROR:
+    if off < MOST_BIAS_ERROR_RAD_S:
         return config
     problems.append(
         f"imu.gyro_bias {config.gyro_bias} and imu.accel_bias are not used, they are estimated: the scans show a rate bias "
@@ -199,13 +199,13 @@ def _first_guess(
         gyro_bias, gyro_sigma = rates, STANDING_GYRO_BIAS
     accel_bias, accel_sigma = np.zeros(3), ANY_ACCEL_BIAS
     if config.gyro_bias is not None:
-        gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR
+        gyro_bias, gyro_sigma = np.array(config.gyro_bias), MOST_BIAS_ERROR_RAD_S
     if config.accel_bias is not None:
         accel_bias, accel_sigma = np.array(config.accel_bias), GIVEN_ACCEL_BIAS
     # At first only the difference of force and gravity is observable: a bias tilts the vertical.
     R, shared = T_lidar_imu[:3, :3], accel_sigma**2
     covariance = np.zeros((9, 9))
-    np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA**2 + shared, shared], 3))
+    np.fill_diagonal(covariance, np.repeat([ANY_SPEED**2, LEVEL_SIGMA_M_S2**2 + shared, shared], 3))
     covariance[DOWN, BIAS], covariance[BIAS, DOWN] = shared * R, shared * R.T
     gyroscope = Gyroscope.of_bias(gyro_bias, gyro_sigma, ImuNoise.of(config))
     guess = ImuEstimate(np.zeros(3), np.zeros(3), accel_bias, gyroscope, covariance)

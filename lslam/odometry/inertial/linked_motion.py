@@ -31,7 +31,7 @@ from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.result import RegistrationResult
 
 # m/s2, change of velocity over a gap of the IMU, one sigma: a car brakes.
-BRAKING = 3.0
+BRAKING_M_S2 = 3.0
 
 
 class LinkedMotion(FilterMotion):
@@ -134,7 +134,7 @@ def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
 def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep:
     """The motion (4, 4) of the IMU that is expected over a gap, after it stood, or after the IMU was refused."""
     walk = e.gyroscope.noise
-    sigmas = BRAKING * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
+    sigmas = BRAKING_M_S2 * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
     C = np.diag(np.repeat([0.0, 0.0, *np.square(sigmas)], 3))
     C[:6, :6] = PRIOR_COVARIANCE
     none = np.zeros((3, 3))

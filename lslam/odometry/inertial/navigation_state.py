@@ -13,8 +13,8 @@ import numpy as np
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY
-from lslam.odometry.inertial.gyroscope import MOUNTING, OFFSET_WALK, OUTLIER, USUAL_NOISE, Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, MOUNTING, OFFSET_WALK, USUAL_NOISE, Gyroscope, ImuNoise
+from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
 
@@ -26,7 +26,7 @@ DEVICE = slice(15, None)
 # What every scan of a window has of its own: position, rotation, velocity and both biases.
 OWN = np.r_[0:9, 12:18]
 # Without the offset of the clocks, which stands last.
-SIZE = 27
+STATE_SIZE = 27
 # Of the pose at the beginning, where the world is put: m and rad, one sigma.
 BEGIN_SIGMA = 1e-4
 
@@ -57,7 +57,7 @@ def transition(step: Increments, R: Floats, R_end: Floats, gyroscope: Gyroscope)
 
 def process_noise(t: float, rate_variance: float, noise: ImuNoise = USUAL_NOISE) -> Floats:
     """(27, 27) that `t` seconds add; rate_variance : (rad/s)^2 per Hz of the gyroscope."""
-    Q = np.zeros((SIZE, SIZE))
+    Q = np.zeros((STATE_SIZE, STATE_SIZE))
     force = noise.force**2 * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
     for i, a in enumerate((PLACE, SPEED)):
         for j, b in enumerate((PLACE, SPEED)):
@@ -115,7 +115,7 @@ class NavigationState:
         R_end, velocities, moved = step.motion(0, R, e.velocity, e.gravity)
         F = transition(step, R, R_end[-1], e.gyroscope)
         P = F @ self.covariance @ F.T
-        P[:SIZE, :SIZE] += process_noise(t, e.gyroscope.rate_variance, e.gyroscope.noise)
+        P[:STATE_SIZE, :STATE_SIZE] += process_noise(t, e.gyroscope.rate_variance, e.gyroscope.noise)
         if e.gyroscope.has_offset:
             P[-1, -1] += OFFSET_WALK**2 * t
         if step.hidden is not None:
@@ -153,8 +153,8 @@ class NavigationState:
         size = len(self.covariance)
         H = np.zeros((1, size))
         H[0, DOWN] = self.estimate.gravity / norm
-        rest, noise = np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA**2]])
-        x, P = kalman.update(np.zeros(size), self.covariance, H, rest, noise, OUTLIER)
+        rest, noise = np.array([GRAVITY - norm]), np.array([[GRAVITY_SIGMA_M_S2**2]])
+        x, P = kalman.update(np.zeros(size), self.covariance, H, rest, noise, INNOVATION_SIGMAS)
         return self._shifted(x, P)
 
     def _shared(self) -> NavigationState:

@@ -17,7 +17,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.integrate import integrate
 from lslam.odometry.inertial.navigation_state import (
     GYRO,
@@ -35,7 +35,7 @@ COMMON = np.r_[9:12, 18:27]
 SHARED, EACH = len(COMMON), len(OWN)
 DOWN, AXES = slice(0, 3), slice(3, 12)
 # m and rad: a step of all poses below ends the iteration; what it leaves is its square.
-STEP = 1e-3
+LEAST_STEP = 1e-3
 MOST_STEPS = 5
 
 
@@ -136,7 +136,7 @@ class Window:
             if not np.isfinite(d).all():
                 break
             window = window.moved(d)
-            if np.abs(d[SHARED:].reshape(-1, EACH)[:, :6]).max() < STEP:
+            if np.abs(d[SHARED:].reshape(-1, EACH)[:, :6]).max() < LEAST_STEP:
                 break
         return window, H
 
@@ -155,8 +155,8 @@ class Window:
         self._add_past(H, g)
         norm = float(np.linalg.norm(self.gravity))
         along = self.gravity / norm
-        H[DOWN, DOWN] += np.outer(along, along) / GRAVITY_SIGMA**2
-        g[DOWN] += along * (norm - GRAVITY) / GRAVITY_SIGMA**2
+        H[DOWN, DOWN] += np.outer(along, along) / GRAVITY_SIGMA_M_S2**2
+        g[DOWN] += along * (norm - GRAVITY) / GRAVITY_SIGMA_M_S2**2
         for k in range(len(self.moments)):
             self._add_scan(H, g, k)
             if k > 0:

@@ -11,20 +11,20 @@ from lslam.core.geometry import se3
 from lslam.core.kernels.significance import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan_result import OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
-from lslam.odometry.integrity.directions import MOST_EMPTIED
+from lslam.odometry.integrity.directions import EMPTIED_SHARE
 from lslam.odometry.integrity.pair_registration import is_within
 
 # Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
-LEAST: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
+LEAST_DEVIATION: Floats = np.array([0.06, 0.06, 0.08, *np.deg2rad([0.3, 0.3, 0.12])])
 # One check is enough where it says so much more, and clearly explains more of the points.
 LARGE: Floats = np.repeat([OPEN_M, OPEN_RAD], 3)
-MORE = 1.15
+LONE_CHECK_RATIO = 1.15
 # m/s2, five times gravity, over so many m: nothing that carries a LiDAR is accelerated so, but scans out of order are.
 MOST_ACCELERATION, LEAST_JERK_M = 50.0, 0.3
 # Checks in a row between standing and moving: one is chance.
 OPEN_IN_A_ROW = 2
-AXES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
+AXIS_NAMES = ("ahead", "to the left", "up", "of roll", "of pitch", "of yaw")
 
 
 @dataclass(frozen=True)
@@ -72,13 +72,13 @@ def _noise(apart: Floats) -> Floats:
 
 def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: int) -> list[tuple[int, int]]:
     """Begin and end of where they say so again and again, or one of them by much, along one axis."""
-    is_better = np.array([check.agreement > MORE * check.claimed_agreement for check in checks])
+    is_better = np.array([check.agreement > LONE_CHECK_RATIO * check.claimed_agreement for check in checks])
     is_large = is_better & (np.abs(apart) > LARGE[axis] + 2 * OUTLIER_SIGMAS * sigma)
     stretches = []
-    for begin, end in _runs(np.where(np.abs(apart) > LEAST[axis], np.sign(apart), 0)):
+    for begin, end in _runs(np.where(np.abs(apart) > LEAST_DEVIATION[axis], np.sign(apart), 0)):
         part = slice(begin, end)
         mean, count = float(np.mean(apart[part])), end - begin
-        bound = LEAST[axis] + OUTLIER_SIGMAS * float(np.median(sigma[part])) / np.sqrt(count)
+        bound = LEAST_DEVIATION[axis] + OUTLIER_SIGMAS * float(np.median(sigma[part])) / np.sqrt(count)
         if is_large[part].any() or (count >= IN_A_ROW and abs(mean) > bound):
             stretches.append((begin, end))
     return stretches
@@ -87,11 +87,13 @@ def _stretches(checks: list[MotionCheck], apart: Floats, sigma: Floats, axis: in
 def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
     """In words, the two axes along which most is missing."""
     seconds = float(np.median([check.seconds for check in run]))
-    worst = sorted(np.argsort(-np.abs(apart) / LEAST)[:2].tolist())
+    worst = sorted(np.argsort(-np.abs(apart) / LEAST_DEVIATION)[:2].tolist())
     motion = " and ".join(
-        f"{apart[axis]:+.2f} m {AXES[axis]}" if axis < 3 else f"{np.rad2deg(apart[axis]):+.2f} deg {AXES[axis]}"
+        f"{apart[axis]:+.2f} m {AXIS_NAMES[axis]}"
+        if axis < 3
+        else f"{np.rad2deg(apart[axis]):+.2f} deg {AXIS_NAMES[axis]}"
         for axis in worst
-        if abs(apart[axis]) > LEAST[axis]
+        if abs(apart[axis]) > LEAST_DEVIATION[axis]
     )
     each = "each" if len(run) > 1 else "it"
     why = f"beside the scan {seconds:.1f} s before, {each} moved by {motion or 'another way'} more than its pose says"
@@ -148,10 +150,10 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
             spans[-1] = (
                 spans[-1][0],
                 check.last,
-                *max(spans[-1][2:], (more[axis], AXES[axis]), key=lambda m: abs(m[0])),
+                *max(spans[-1][2:], (more[axis], AXIS_NAMES[axis]), key=lambda m: abs(m[0])),
             )
         else:
-            spans.append((check.first, check.last, more[axis], AXES[axis]))
+            spans.append((check.first, check.last, more[axis], AXIS_NAMES[axis]))
     return [
         Alert(
             first + 1,
@@ -175,7 +177,7 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
             f"the poses stand, yet {100 * max(check.emptied for check in checks[begin:end]):.0f} % of the directions in which "
             "there were points are empty: the clouds are not in the frame of the sensor, perhaps in that of a world",
         )
-        for begin, end in _runs(np.array([check.emptied > MOST_EMPTIED for check in checks], np.float64))
+        for begin, end in _runs(np.array([check.emptied > EMPTIED_SHARE for check in checks], np.float64))
         if end - begin >= IN_A_ROW
     ]
 

@@ -12,7 +12,7 @@ CELL_RAD = float(np.deg2rad(5.0))
 # Points that tell the directions of a scan, and that fill a cell.
 POINTS, FILLING = 20_000, 3
 # Share of the directions that empty: far from the few per cent of dropouts, and from the half and more of a cloud that leaves.
-MOST_EMPTIED = 0.25
+EMPTIED_SHARE = 0.25
 # Cells are numbered by row, from the pole below upwards.
 _ROWS = round(np.pi / CELL_RAD)
 _COLUMNS = 2 * _ROWS

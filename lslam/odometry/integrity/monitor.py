@@ -30,7 +30,7 @@ PAUSE_S = 1.0
 # Points that make the planes of the first scan, and of the last scan those that are laid on them.
 PLANE_POINTS, LAID_POINTS = 5000, 1200
 # Another motion than the one found from the claim must explain so many times more points.
-MORE = 1.1
+MORE_POINTS_RATIO = 1.1
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class IntegrityMonitor(Stateful):
                 hypotheses.append(pair.near(expected))
         if is_odd and (is_still(claimed) or self._usual.is_less(max(h.agreement for h in hypotheses))):
             hypotheses.append(pair.far(claimed))
-        best, rival = best_of(hypotheses, MORE)
+        best, rival = best_of(hypotheses, MORE_POINTS_RATIO)
         if best.sigma is None:
             return
         usual = self._usual.usual

@@ -16,7 +16,7 @@ from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import SAME_M, motion_apart
 from lslam.odometry.integrity.directions import directions, filled_directions
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import BREADTH, WIDE
+from lslam.registration.local_map import LEAST_BREADTH, WIDE_FACTORS
 from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE
@@ -29,7 +29,7 @@ SETTINGS = RegistrationConfig(blob_weight=0.0)
 # room, and spans several points and several sigma of their noise.
 EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, SETTINGS.coarse_factor * SETTINGS.voxel_size
 # Half of an edge is how far a plane reaches.
-CAPTURE = 0.4
+CAPTURE_EDGES = 0.4
 # Steps that settle a scan which lies within its noise of where it was.
 STEPS_AT_REST = 4
 
@@ -82,9 +82,9 @@ class PairRegistration:
         self._planes = tuple(
             GaussianMap(
                 LARGEST_M * wider, min_points=SETTINGS.min_points, planarity=SETTINGS.planarity,
-                count_cap=SETTINGS.count_cap, reach=1e4, capacity=1 << 13, breadth=BREADTH,
+                count_cap=SETTINGS.count_cap, reach=1e4, capacity=1 << 13, breadth=LEAST_BREADTH,
             )
-            for wider in (1, *WIDE)
+            for wider in (1, *WIDE_FACTORS)
         )  # fmt: skip
         self._edge = LARGEST_M
         self._terms: list[Term] = []
@@ -95,7 +95,7 @@ class PairRegistration:
     def begin(self, first: Floats, last: PreparedPoints) -> None:
         """Take the points (N, 3), m, of the earlier scan, and those of the later one."""
         self._edge = float(np.clip(EDGE_SHARE * median_range(first), SMALLEST_M, LARGEST_M))
-        for level, wider in zip(self._planes, (1, *WIDE), strict=True):
+        for level, wider in zip(self._planes, (1, *WIDE_FACTORS), strict=True):
             level.clear()
             level.size = self._edge * wider
             level.insert(first.astype(np.float32), np.eye(4))
@@ -110,7 +110,7 @@ class PairRegistration:
     def near(self, start: Floats) -> MotionHypothesis:
         """The motion that fits near a start (4, 4): planes capture points as far as they reach."""
         s = SETTINGS
-        widest = max(CAPTURE * self._edge, s.kernel_min)
+        widest = max(CAPTURE_EDGES * self._edge, s.kernel_min)
         return self._lay(start, Annealing(widest, s.kernel_min, s.kernel_decay, s.max_iterations))
 
     def far(self, start: Floats) -> MotionHypothesis:

@@ -36,8 +36,8 @@ NEARBY_RINGS = 2
 # Three points that are nearly in line define no plane: least sine of the angle at the nearest point.
 LEAST_SINE = 0.1
 # Largest variance, rad2, of a normal of three points that counts as observing a direction: four degrees.
-UNSURE = 5e-3
-SHORTEST = 1e-3  # m, of a line or a side of a triangle
+NORMAL_VARIANCE_RAD2 = 5e-3
+SHORTEST_M = 1e-3  # m, of a line or a side of a triangle
 
 
 @inline
@@ -99,7 +99,7 @@ def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: 
             continue
         ux, uy, uz = edges[k, 0] - p[0], edges[k, 1] - p[1], edges[k, 2] - p[2]
         length = math.sqrt(ux * ux + uy * uy + uz * uz)
-        if length < SHORTEST:
+        if length < SHORTEST_M:
             continue
         s = 1.0 / length
         ux, uy, uz = ux * s, uy * s, uz * s
@@ -171,7 +171,7 @@ def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, 
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         area = math.sqrt(nx * nx + ny * ny + nz * nz)
         aa, bb = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz
-        if min(aa, bb) < SHORTEST * SHORTEST or area < LEAST_SINE * math.sqrt(aa * bb):
+        if min(aa, bb) < SHORTEST_M * SHORTEST_M or area < LEAST_SINE * math.sqrt(aa * bb):
             continue
         s = 1.0 / area
         nx, ny, nz = nx * s, ny * s, nz * s
@@ -188,5 +188,5 @@ def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, 
             nx, ny, nz = sign * ux, sign * uy, sign * uz
         w = _add_plane(H, g, facts, e, nx, ny, nz, rx, ry, rz, spread, c2)
         # The normal is that of the surface, or the noise of the three points leaves it a small variance, rad2.
-        if towards != 0.0 or 2.0 * variance * (aa + bb - ab) * s * s < UNSURE:
+        if towards != 0.0 or 2.0 * variance * (aa + bb - ab) * s * s < NORMAL_VARIANCE_RAD2:
             add_surface(S, unused, w, nx, ny, nz, rx, ry, rz)

@@ -17,7 +17,7 @@ from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
 from lslam.core.kernels.linearisation import Pose, Sums, Width
-from lslam.core.kernels.residuals import TILT, add_facts, add_row, octant_slots, place
+from lslam.core.kernels.residuals import TILT_FACTOR, add_facts, add_row, octant_slots, place
 from lslam.core.kernels.voxel import MASK, OFFSET
 
 Floats = NDArray[np.float64]
@@ -143,5 +143,5 @@ def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[f
         if away2[i] > gate2:
             facts[MATCHED] += 1.0
             continue
-        variance = p[6] + sigma2 + TILT * p[7] * along * along
+        variance = p[6] + sigma2 + TILT_FACTOR * p[7] * along * along
         add_line(H, g, facts, ex, ey, ez, p[3], p[4], p[5], rx, ry, rz, variance, c2)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import kernel
 
-SIDE = 5  # neighbours on each side
+SIDE_POINTS = 5  # neighbours on each side
 EDGE, LESS_EDGE, NEITHER, LESS_PLANE, PLANE = 2, 1, 0, -1, -2
 
 # Coarser than any spinning LiDAR: neighbours farther apart do not lie on one surface.
@@ -110,7 +110,7 @@ def curvatures(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
     """Curvature (K,) of equation 2.21, the part of it that is a bend (K,), and the breaks of the rings (K,).
 
-    The curvature is NaN where a ring ends or has a gap within `SIDE` points. It is NaN as well on the far side of an
+    The curvature is NaN where a ring ends or has a gap within `SIDE_POINTS` points. It is NaN as well on the far side of an
     occlusion boundary and where a surface is nearly parallel to the beam: such points are no features (Zhang and Singh
     2014, section V.A).
 
@@ -135,14 +135,14 @@ def curvatures(
             elif abs(far - near) > max(jump, jump_slope * min(near, far)):
                 breaks[j] = True
                 if far > near:
-                    hidden[j + 1 : min(j + 2 + SIDE, last)] = True
+                    hidden[j + 1 : min(j + 2 + SIDE_POINTS, last)] = True
                 else:
-                    hidden[max(j - SIDE, first) : j + 1] = True
+                    hidden[max(j - SIDE_POINTS, first) : j + 1] = True
         whole = 0  # points since the last gap, this one included
         for j in range(first, last):
             whole = 1 if j == first or steps[j - 1] > gap else whole + 1
-            c = j - SIDE
-            if whole < 2 * SIDE + 1 or hidden[c]:
+            c = j - SIDE_POINTS
+            if whole < 2 * SIDE_POINTS + 1 or hidden[c]:
                 continue
             r = ranges[c]
             before, after = r - ranges[c - 1], ranges[c + 1] - r
@@ -153,20 +153,20 @@ def curvatures(
             ):
                 continue
             sx, sy, sz = 0.0, 0.0, 0.0
-            for n in range(c - SIDE, c + SIDE + 1):
+            for n in range(c - SIDE_POINTS, c + SIDE_POINTS + 1):
                 sx += xyz[c, 0] - xyz[n, 0]
                 sy += xyz[c, 1] - xyz[n, 1]
                 sz += xyz[c, 2] - xyz[n, 2]
             square = sx * sx + sy * sy + sz * sz
-            scale = (2 * SIDE + 1) * r
+            scale = (2 * SIDE_POINTS + 1) * r
             curvature[c] = np.sqrt(square) / scale
             jumps = False
-            for n in range(c - SIDE, c + SIDE):
+            for n in range(c - SIDE_POINTS, c + SIDE_POINTS):
                 jumps |= breaks[n]
             if not jumps:
-                dx = xyz[c + SIDE, 0] - xyz[c - SIDE, 0]
-                dy = xyz[c + SIDE, 1] - xyz[c - SIDE, 1]
-                dz = xyz[c + SIDE, 2] - xyz[c - SIDE, 2]
+                dx = xyz[c + SIDE_POINTS, 0] - xyz[c - SIDE_POINTS, 0]
+                dy = xyz[c + SIDE_POINTS, 1] - xyz[c - SIDE_POINTS, 1]
+                dz = xyz[c + SIDE_POINTS, 2] - xyz[c - SIDE_POINTS, 2]
                 along = sx * dx + sy * dy + sz * dz
                 square -= along * along / max(dx * dx + dy * dy + dz * dz, 1e-12)
             bend[c] = np.sqrt(max(square, 0.0)) / scale
@@ -191,7 +191,8 @@ def pick(
     """Label (K,) every point `EDGE`, `LESS_EDGE`, `NEITHER`, `LESS_PLANE` or `PLANE`.
 
     A ring is divided into `regions` parts of equally many points. In each part the points of largest curvature are edges,
-    those of smallest curvature planes. The `SIDE` neighbours on either side of a picked point, up to a break, are not picked.
+    those of smallest curvature planes. The `SIDE_POINTS` neighbours on either side of a picked point, up to a
+    break, are not picked.
 
     allowed : (K,) bit 0: may be an edge, bit 1: less planar, bit 2: planar
     limits : largest number of edges, of edges and less sharp edges together, and of planes in a part
@@ -236,11 +237,11 @@ def pick(
                     else:
                         labels[best] = PLANE
                     taken[best] = True
-                    for n in range(best, min(best + SIDE, starts[k + 1] - 1)):
+                    for n in range(best, min(best + SIDE_POINTS, starts[k + 1] - 1)):
                         if breaks[n]:
                             break
                         taken[n + 1] = True
-                    for n in range(best - 1, max(best - 1 - SIDE, starts[k] - 1), -1):
+                    for n in range(best - 1, max(best - 1 - SIDE_POINTS, starts[k] - 1), -1):
                         if breaks[n]:
                             break
                         taken[n] = True

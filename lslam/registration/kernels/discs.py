@@ -14,7 +14,7 @@ Longs = NDArray[np.int64]
 Ints = NDArray[np.int32]
 
 # m2 in the plane of a disc. Segal et al. (2009) take 1 m2, and about 1e-3 m2, our sigma2, across.
-EXTENT2 = 1.0
+EXTENT_M2 = 1.0
 
 
 @inline
@@ -44,7 +44,7 @@ def source_discs(source: Floats, size: float, planes: Floats, keys: Longs, table
         s = find(pack(ix, iy, iz), keys, table)
         if s < 0 or planes[s, 7] < 0.0:
             continue
-        xx, xy, xz, yy, yz, zz = disc(planes[s, 3], planes[s, 4], planes[s, 5], thin, EXTENT2)
+        xx, xy, xz, yy, yz, zz = disc(planes[s, 3], planes[s, 4], planes[s, 5], thin, EXTENT_M2)
         out[i, 0], out[i, 1], out[i, 2] = xx, xy, xz
         out[i, 3], out[i, 4], out[i, 5] = yy, yz, zz
         count += 1

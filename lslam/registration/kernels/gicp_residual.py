@@ -20,7 +20,7 @@ from lslam.core.kernels.residuals import (
     thin_information,
     variance_of,
 )
-from lslam.registration.kernels.discs import EXTENT2, disc
+from lslam.registration.kernels.discs import EXTENT_M2, disc
 
 Floats = NDArray[np.float64]
 
@@ -71,7 +71,7 @@ def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Sett
     unused = np.zeros(6)
     c2 = scale * scale
     # A match may lie anywhere in its voxel: what is off sideways in a wide one says nothing.
-    extent2 = max(EXTENT2, size * size)
+    extent2 = max(EXTENT_M2, size * size)
     for i in range(len(source)):
         if is_done[i]:
             continue

@@ -15,7 +15,7 @@ from lslam.core.kernels.jit import kernel
 
 Floats = NDArray[np.float64]
 
-SIDE = 2  # neighbours on each side
+PETAL_SIDE = 2  # neighbours on each side
 
 
 @kernel
@@ -68,9 +68,9 @@ def smoothness(
     jump_slope: float,
     grazing: float,
 ) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
-    """Curvature (K,) over `SIDE` neighbours on each side, its bend (K,), the contrast (K,) and the breaks of the lines (K,).
+    """Curvature (K,) over `PETAL_SIDE` neighbours on each side, its bend, the contrast and the breaks of the lines, each (K,).
 
-    The curvature is NaN for points that are no features: those that are `left_out`, within `SIDE` points of a line's end,
+    The curvature is NaN for points that are no features: those that are `left_out`, within `PETAL_SIDE` points of a line's end,
     just behind an occlusion boundary, on a surface whose angle with the beam has a cosine above `grazing`, or alone between
     two breaks.
 
@@ -92,18 +92,18 @@ def smoothness(
             if abs(far - near) > max(jump, jump_slope * min(near, far)):
                 breaks[j] = True
                 if far > near:
-                    hidden[j + 1 : min(j + 1 + SIDE, last)] = True
+                    hidden[j + 1 : min(j + 1 + PETAL_SIDE, last)] = True
                 else:
-                    hidden[max(j + 1 - SIDE, first) : j + 1] = True
-        for c in range(first + SIDE, last - SIDE):
+                    hidden[max(j + 1 - PETAL_SIDE, first) : j + 1] = True
+        for c in range(first + PETAL_SIDE, last - PETAL_SIDE):
             if hidden[c]:
                 continue
             before, after = 0, 0
-            while before < SIDE and not breaks[c - before - 1]:
+            while before < PETAL_SIDE and not breaks[c - before - 1]:
                 before += 1
-            while after < SIDE and not breaks[c + after]:
+            while after < PETAL_SIDE and not breaks[c + after]:
                 after += 1
-            is_whole = before + after == 2 * SIDE
+            is_whole = before + after == 2 * PETAL_SIDE
             x, y, z = xyz[c, 0], xyz[c, 1], xyz[c, 2]
             dx = xyz[c + after, 0] - xyz[c - before, 0]
             dy = xyz[c + after, 1] - xyz[c - before, 1]
@@ -112,12 +112,12 @@ def smoothness(
             if length == 0.0 or abs(x * dx + y * dy + z * dz) > grazing * length * ranges[c]:
                 continue
             sx, sy, sz = 0.0, 0.0, 0.0
-            for n in range(c - SIDE, c + SIDE + 1):
+            for n in range(c - PETAL_SIDE, c + PETAL_SIDE + 1):
                 sx += x - xyz[n, 0]
                 sy += y - xyz[n, 1]
                 sz += z - xyz[n, 2]
             square = sx * sx + sy * sy + sz * sz
-            scale = (2 * SIDE + 1) * ranges[c]
+            scale = (2 * PETAL_SIDE + 1) * ranges[c]
             curvature[c] = math.sqrt(square) / scale
             if is_whole:
                 along = (sx * dx + sy * dy + sz * dz) / length

@@ -17,7 +17,7 @@ from lslam.core.kernels.residuals import (
     place,
     thin_information,
 )
-from lslam.registration.kernels.discs import EXTENT2
+from lslam.registration.kernels.discs import EXTENT_M2
 from lslam.registration.kernels.gicp_residual import certainty_of_pair
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats,
     unused = np.zeros(6)
     c2 = scale * scale
     # A match may lie anywhere in its voxel: what is off sideways in a wide one says nothing.
-    extent2 = max(EXTENT2, size * size)
+    extent2 = max(EXTENT_M2, size * size)
     for i in range(len(source)):
         if is_done[i]:
             continue

@@ -17,12 +17,12 @@ from lslam.core.types.scan import Span
 from lslam.registration.preprocessing.prepare import PreparedPoints
 
 # At 200 deg/s one of 32 steps of a 0.1 s sweep turns by 0.6 deg: blending two matrices errs by 4e-6 of the range.
-KNOTS = 33
+SWEEP_KNOTS = 33
 
 
 def knots_over(span: Span) -> Floats:
-    """(KNOTS,) times over a sweep, s from the scan's stamp; that of the stamp alone where the sweep takes no time."""
-    return np.linspace(*span, KNOTS) if span.seconds > 0 else np.zeros(1)
+    """(SWEEP_KNOTS,) times over a sweep, s from the scan's stamp; that of the stamp alone where the sweep takes no time."""
+    return np.linspace(*span, SWEEP_KNOTS) if span.seconds > 0 else np.zeros(1)
 
 
 def deskew_points(points: NDArray[Any], times: NDArray[np.float32] | None, prior: MotionPrior) -> NDArray[Any]:
@@ -50,9 +50,9 @@ def deskew(points: PreparedPoints, prior: MotionPrior) -> PreparedPoints:
 
 
 def _knots(prior: MotionPrior) -> tuple[float, float, Floats]:
-    """Start, step and (KNOTS, 3, 4) poses within the sweep, seen from the pose at the stamp."""
+    """Start, step and (SWEEP_KNOTS, 3, 4) poses within the sweep, seen from the pose at the stamp."""
     within = se3.relative(prior.pose, prior.poses)
     start, end = float(prior.times[0]), float(prior.times[-1])
-    if len(within) != KNOTS:
-        within = poses_at(prior.times_ns, within, np.round(1e9 * np.linspace(start, end, KNOTS)).astype(np.int64))
-    return start, (end - start) / (KNOTS - 1), np.ascontiguousarray(within[:, :3, :])
+    if len(within) != SWEEP_KNOTS:
+        within = poses_at(prior.times_ns, within, np.round(1e9 * np.linspace(start, end, SWEEP_KNOTS)).astype(np.int64))
+    return start, (end - start) / (SWEEP_KNOTS - 1), np.ascontiguousarray(within[:, :3, :])

@@ -137,7 +137,7 @@ def features_along(
     return gather_features(scan, walk, labels, config.grid_step)
 
 
-def curvature_noise(ranges: Floats, side: int = curvature.SIDE) -> float:
+def curvature_noise(ranges: Floats, side: int = curvature.SIDE_POINTS) -> float:
     """Standard deviation, m, of curvature times range that the noise of `ranges` (K,), m, along the rings makes.
 
     side : neighbours on either side that the curvature takes

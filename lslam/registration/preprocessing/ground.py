@@ -21,8 +21,8 @@ from lslam.core.kernels import ground
 from lslam.core.types.arrays import Floats, Longs
 
 # m; cells of the grid, and the farthest that ground is looked for.
-CELL = 0.5
-REACH = 150.0
+GROUND_CELL_M = 0.5
+GROUND_REACH_M = 150.0
 TRIPLES = 200
 # Planes steeper than 40 deg against the expected horizontal are walls or roofs.
 UPRIGHT = float(np.cos(np.deg2rad(40.0)))
@@ -49,7 +49,7 @@ class Ground:
 
     def above(self, points: NDArray[np.float32], height: float) -> Longs:
         """Indices of those of the scan's points (N, 3), m, that lie higher above it than `height`, m, increasing."""
-        return ground.above(points, self.R, CELL, self.half, self.top, height)
+        return ground.above(points, self.R, GROUND_CELL_M, self.half, self.top, height)
 
 
 def above_ground(
@@ -67,16 +67,16 @@ def ground_of(points: NDArray[np.float32], slope: float, tolerance: float, up: F
     Without a plane to be found the slope is that against the horizontal of `up`.
     """
     if len(points) < 3:
-        return Ground(np.eye(3), 1, np.full((2, 2), ground.EMPTY))
+        return Ground(np.eye(3), 1, np.full((2, 2), ground.NO_HEIGHT))
     farthest = float(np.sqrt(np.einsum("ij,ij->i", points, points).max()))
-    half = int(np.ceil(min(farthest, REACH) / CELL)) + 1
+    half = int(np.ceil(min(farthest, GROUND_REACH_M) / GROUND_CELL_M)) + 1
     R, floor = levelling(points, tolerance, half, up)
-    index = ground.lowest(points, R, CELL, half)
+    index = ground.lowest(points, R, GROUND_CELL_M, half)
     low = points[index[index >= 0]].astype(np.float64) @ R.T
     is_under = low[:, 2] < floor - tolerance - slope * np.hypot(low[:, 0], low[:, 1])
-    height = np.full(len(index), ground.EMPTY)
-    height[index >= 0] = np.where(is_under, ground.EMPTY, low[:, 2])
-    return Ground(R, half, ground.envelope(height.reshape(2 * half, 2 * half), slope * CELL, tolerance))
+    height = np.full(len(index), ground.NO_HEIGHT)
+    height[index >= 0] = np.where(is_under, ground.NO_HEIGHT, low[:, 2])
+    return Ground(R, half, ground.envelope(height.reshape(2 * half, 2 * half), slope * GROUND_CELL_M, tolerance))
 
 
 def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floats = Z) -> tuple[Floats, float]:
@@ -93,7 +93,7 @@ def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floa
 
 def _levelling(points: NDArray[np.float32], tolerance: float, half: int) -> tuple[Floats, float]:
     """`levelling` of points whose z is about up."""
-    index = ground.lowest(points, np.eye(3), CELL, half)
+    index = ground.lowest(points, np.eye(3), GROUND_CELL_M, half)
     low = points[index[index >= 0]].astype(np.float64)
     if len(low) < 3:
         return np.eye(3), -np.inf

@@ -34,8 +34,8 @@ _STRAY = 3.0
 # Step of reflectivity over the sum of both sides: one is twice as bright as the other.
 _CONTRAST = 1.0 / 3.0
 # Curvature of a right angle over two neighbours on each side, in terms of that over five.
-_SHORTER = (petals.SIDE * (petals.SIDE + 1) / (2 * petals.SIDE + 1)) / (
-    curvature.SIDE * (curvature.SIDE + 1) / (2 * curvature.SIDE + 1)
+_SHORTER = (petals.PETAL_SIDE * (petals.PETAL_SIDE + 1) / (2 * petals.PETAL_SIDE + 1)) / (
+    curvature.SIDE_POINTS * (curvature.SIDE_POINTS + 1) / (2 * curvature.SIDE_POINTS + 1)
 )
 
 
@@ -57,7 +57,7 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         walk.points, walk.ranges, walk.starts, _left_out(walk, brightness), brightness,
         config.occlusion, slope * walk.step, np.sin(np.radians(config.parallel_deg)),
     )  # fmt: skip
-    allowed, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.SIDE)
+    allowed, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.PETAL_SIDE)
     limits, usual = (config.max_edge_points, config.max_less_edge_points), _SHORTER * walk.step
     labels = curvature.pick(
         curved, bend, walk.ranges, breaks, allowed, walk.starts, 1, (*limits, config.max_planar_points),

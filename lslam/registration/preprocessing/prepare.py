@@ -20,11 +20,11 @@ from lslam.registration.preprocessing.ground import above_ground, up_of
 # The field of view of a spinning scanner, 360 x 45 deg. With a smaller one the test is more lenient.
 FIELD_OF_VIEW_SR = 4.8
 # m; wide enough for several pulses of one ring at fifty metres, and as the source points' grid begins.
-WIDE_CELL = 1.0
+WIDE_CELL_M = 1.0
 # Least share of sparse cells: edges make up to a fifth of a clear scan's cells sparse.
-CLEAR = 0.25
+SPARSE_CELLS_SHARE = 0.25
 # Largest share of returns to remove: beyond, the scan was downsampled before.
-MOSTLY = 0.5
+MOST_REMOVED_SHARE = 0.5
 
 
 def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf: float, least_line: float) -> Longs:
@@ -33,15 +33,16 @@ def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf:
     A drop occupies a cell of its own where a surface has many returns per cell: a tenth of the returns can be two thirds of
     the cells. `counts` (M,) are the returns in each. The angle between pulses is the root of field of view over returns, so a
     surface at range r that crosses a cell has a line of edge / (r times that) returns, part of a ring or of a column; a drop
-    has one. Cells with less than `least_line` of such a line are removed if their surroundings of WIDE_CELL have less, too:
+    has one. Cells with less than `least_line` of such a line are removed if their surroundings of WIDE_CELL_M have less, too:
     far away a small cell has one return at most. (The radius in which Charron et al. 2018 count neighbours of snow grows with
     range for the same reason.) All are kept where few cells would be removed, or most returns.
     """
     pulses = int(counts.sum())
     needed = least_line / np.sqrt(FIELD_OF_VIEW_SR / max(pulses, 1))
-    is_accompanied = voxel.accompanied(centroids, counts, leaf * needed, WIDE_CELL, WIDE_CELL * needed)
-    is_clear = len(counts) - len(is_accompanied) < CLEAR * len(counts)
-    return np.arange(len(counts)) if is_clear or int(counts[is_accompanied].sum()) < MOSTLY * pulses else is_accompanied
+    is_accompanied = voxel.accompanied(centroids, counts, leaf * needed, WIDE_CELL_M, WIDE_CELL_M * needed)
+    is_clear = len(counts) - len(is_accompanied) < SPARSE_CELLS_SHARE * len(counts)
+    are_most_gone = int(counts[is_accompanied].sum()) < MOST_REMOVED_SHARE * pulses
+    return np.arange(len(counts)) if is_clear or are_most_gone else is_accompanied
 
 
 def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float) -> Longs:
@@ -68,7 +69,7 @@ def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float
 
 
 # A source grid never gets finer than the points it is made of, nor so coarse that walls merge.
-COARSEST_SOURCE = 3.0
+COARSEST_SOURCE_M = 3.0
 
 NO_TIMES = np.zeros(0, np.float32)
 
@@ -232,7 +233,7 @@ def _target_count(map_points: NDArray[np.float32], map_times: NDArray[np.float32
     for _ in range(3):
         count = len(down[0])
         if count > high:
-            next_size = min(size * (count / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE)
+            next_size = min(size * (count / (0.5 * (low + high))) ** 0.5, COARSEST_SOURCE_M)
         elif count < low and len(map_points) > count:
             next_size = max(size * (count / (0.5 * (low + high))) ** 0.5, config.map_leaf)
         else:

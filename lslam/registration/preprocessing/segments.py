@@ -24,7 +24,7 @@ from lslam.registration.preprocessing.features import (
     features_along,
     walk_rings,
 )
-from lslam.registration.preprocessing.ground import CELL, REACH, levelling, up_of
+from lslam.registration.preprocessing.ground import GROUND_CELL_M, GROUND_REACH_M, levelling, up_of
 
 # m; a ring's next neighbour on the ground is at least so far off, so that noise does not tilt the line between them.
 _BASELINE = 0.3
@@ -103,9 +103,9 @@ def _floor(
     meet it. Without a plane the sensor counts as level and the floor lies where those rings end.
     """
     first = np.concatenate([np.arange(walk.starts[k], walk.starts[k + 1]) for k in lowest])
-    reach = min(_FLOOR_REACH * float(np.median(walk.ranges[first])), REACH)
+    reach = min(_FLOOR_REACH * float(np.median(walk.ranges[first])), GROUND_REACH_M)
     near = np.flatnonzero(walk.ranges < reach)[::_FLOOR_SHARE]
-    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(reach / CELL) + 1, vertical)
+    R, floor = levelling(walk.points[near].astype(np.float32), _TOLERANCE, int(reach / GROUND_CELL_M) + 1, vertical)
     if floor == -np.inf:
         floor = float(np.median(walk.points[first] @ vertical))
     return np.ascontiguousarray(R[2]), floor

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from lslam.core.geometry import so3
 from lslam.core.kernels import ground
 from lslam.core.types.arrays import Floats
-from lslam.registration.preprocessing.ground import CELL, Z, levelling
+from lslam.registration.preprocessing.ground import GROUND_CELL_M, Z, levelling
 
 # Cosine of 45 deg: within it z is close enough to up for everything that looks for the ground.
 NEAR_Z = float(np.cos(np.deg2rad(45.0)))
 # The ground fills more than half of the hemisphere below the sensor: a plane that fills less is a wall, or no whole floor.
-LEAST_SHARE = 0.5
+GROUND_SHARE = 0.5
 # m, roughness of the ground; extent, in cells to each side; sectors about the foot of the sensor.
 TOLERANCE, CELLS, SECTORS = 0.25, 80, 12
 # Axes, and the diagonals between three of them: no direction is farther than 37 deg from one.
@@ -57,15 +57,15 @@ def find_up(points: NDArray[np.float32], gravity_up: Floats | None = None) -> Up
     about_z = ground_share(points, Z)[0]
     if gravity_up is not None:
         share, normal = ground_share(points, gravity_up)
-        has_ground = share > LEAST_SHARE
-        if about_z > LEAST_SHARE and not has_ground:
+        has_ground = share > GROUND_SHARE
+        if about_z > GROUND_SHARE and not has_ground:
             return AXIS
         direction = normal if has_ground else gravity_up
         return Up(Z if direction[2] > NEAR_Z else direction, "gravity")
-    if about_z > LEAST_SHARE:
+    if about_z > GROUND_SHARE:
         return Up(Z, "ground")
     shares = [ground_share(points, d) for d in DIRECTIONS]
-    grounds = [(n[2] > 0.0, share, n) for share, n in shares if share > LEAST_SHARE]
+    grounds = [(n[2] > 0.0, share, n) for share, n in shares if share > GROUND_SHARE]
     # Of a floor and its ceiling the one nearer to z.
     normal = max(grounds, key=lambda ground: ground[:2])[2] if grounds else Z
     return AXIS if normal[2] > NEAR_Z else Up(normal, "ground")
@@ -86,7 +86,7 @@ def ground_share(points: NDArray[np.float32], up: Floats) -> tuple[float, Floats
     R, height = levelling(points, TOLERANCE, CELLS, up)
     if not -height > TOLERANCE or not np.isfinite(height):
         return 0.0, up
-    index = ground.lowest(points, R, CELL, CELLS)
+    index = ground.lowest(points, R, GROUND_CELL_M, CELLS)
     above = points[index[index >= 0]].astype(np.float64) @ R[2] - height
     under = float((above < -TOLERANCE).sum()) / max(float((np.abs(above) <= TOLERANCE).sum()), 1.0)
     level = points @ R.T.astype(np.float32)

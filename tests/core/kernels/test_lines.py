@@ -11,7 +11,7 @@ from lslam.core.geometry import so3
 from lslam.core.kernels import facts as at
 from lslam.odometry.feature_map import MIN_LINE_POINTS
 from lslam.odometry.kernels import lines
-from lslam.registration.gaussian_map import FLOOR, GaussianMap
+from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.optimiser import slots_of
 
 Floats = NDArray[np.float64]
@@ -46,7 +46,7 @@ class LineScene:
         m, n = self.target, len(self.source)
         H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         lines.linearise_lines(
-            (self.source,), (m.moments, m.keys, m.table, *self.rows), (SIZE, SIGMA2, float(MIN_LINE_POINTS), FLOOR),
+            (self.source,), (m.moments, m.keys, m.table, *self.rows), (SIZE, SIGMA2, float(MIN_LINE_POINTS), FLOOR_M2),
             (*slots_of(n), np.full(n, -1.0)), (self.R, self.t), (c, c, np.inf), (H, S, g, facts),
         )  # fmt: skip
         return np.triu(H) + np.triu(H, 1).T, g, facts
@@ -60,9 +60,9 @@ class LineScene:
             if len(inside) < MIN_LINE_POINTS:
                 continue
             values, vectors = np.linalg.eigh(np.cov(inside.T, bias=True))
-            if values[2] < 3 * max(values[1], FLOOR):
+            if values[2] < 3 * max(values[1], FLOOR_M2):
                 continue
-            across = (max(values[0], 0.0) + max(values[1], 0.0)) / 2 + FLOOR
+            across = (max(values[0], 0.0) + max(values[1], 0.0)) / 2 + FLOOR_M2
             out[cell] = inside.mean(axis=0), vectors[:, 2], across, across / (len(inside) * values[2])
         return out
 

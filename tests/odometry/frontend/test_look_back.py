@@ -27,13 +27,13 @@ from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
 from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.frontend.windows import WINDOW, WindowTracker, first_pose
+from lslam.odometry.frontend.windows import WINDOW_SCANS, WindowTracker, first_pose
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]
-COUNT, FIRST = WINDOW + 4, 5
+COUNT, FIRST = WINDOW_SCANS + 4, 5
 
 
 @cache
@@ -104,7 +104,7 @@ def test_the_world_stays_that_of_the_first_pose_and_no_later_step_changes() -> N
     assert np.abs(again[1] - once[1]).max() > 1e-5
 
 
-@pytest.mark.parametrize("left_off", [7, WINDOW + 2])
+@pytest.mark.parametrize("left_off", [7, WINDOW_SCANS + 2])
 def test_a_run_goes_on_in_the_same_world(tmp_path: Path, left_off: int) -> None:
     windows, loaded = windows_of("icp"), scans("icp", 0)
     known = [t for now in decided_by(windows, loaded[:left_off]) for t in now]
@@ -123,7 +123,7 @@ def create() -> Deskewing:
 
 def off_by_5_cm() -> list[Tracked]:
     """The scans of a window, the first of which lies beside its place."""
-    run = list(tracked("icp", 0, 1))[:WINDOW]
+    run = list(tracked("icp", 0, 1))[:WINDOW_SCANS]
     run[0] = run[0].at(se3.exp(np.array([0, 0.05, 0, 0, 0, 0])))
     return run
 
@@ -173,7 +173,7 @@ def test_it_stays_where_the_later_scans_leave_a_direction_open() -> None:
 
     run = [
         Tracked(loaded, ScanResult(k, loaded.stamp_ns, pose), MotionPrior.at_once(pose), (loaded.stamp_ns, pose))
-        for k in range(WINDOW)
+        for k in range(WINDOW_SCANS)
         for loaded, pose in [(scan(k), se3.exp(np.array([0.5 * k, 0, 0, 0, 0, 0])))]
     ]
     assert first_pose(run, FIRST, create) is run[0].result.T_world_lidar

@@ -22,14 +22,14 @@ from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
 from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.frontend.windows import WINDOW, WindowTracker
+from lslam.odometry.frontend.windows import WINDOW_SCANS, WindowTracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import Course
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]
-COUNT = WINDOW + 8
+COUNT = WINDOW_SCANS + 8
 
 
 def configured(method: str = "icp", *settings: str) -> Config:
@@ -84,7 +84,7 @@ def turn_error_deg(poses: Floats, scenario: str) -> float:
 
 def test_each_scan_is_decided_once_and_in_order_with_its_window() -> None:
     decided = walked(is_windowed=True)
-    assert [len(now) for now in decided] == [*[0] * (WINDOW - 1), WINDOW, *[0] * 8, 8]
+    assert [len(now) for now in decided] == [*[0] * (WINDOW_SCANS - 1), WINDOW_SCANS, *[0] * 8, 8]
     assert [t.result.index for now in decided for t in now] == list(range(COUNT))
     assert all(t.is_two_sided for now in decided for t in now)
 
@@ -106,7 +106,7 @@ def test_what_moves_evenly_or_cannot_follow_keeps_its_bytes(method: str) -> None
     np.testing.assert_array_equal(poses_of(along), poses_of(alone))
 
 
-@pytest.mark.parametrize("left_off", [7, WINDOW, WINDOW + 5])
+@pytest.mark.parametrize("left_off", [7, WINDOW_SCANS, WINDOW_SCANS + 5])
 def test_a_run_goes_on_from_where_its_window_began(tmp_path: Path, left_off: int) -> None:
     whole = poses_of(walked(is_windowed=True))
     windows = windows_of(configured())

@@ -12,7 +12,17 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import ImuStream
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.navigation_state import DOWN, FORCE, GYRO, PLACE, POSE, SIZE, SPEED, TURN, NavigationState
+from lslam.odometry.inertial.navigation_state import (
+    DOWN,
+    FORCE,
+    GYRO,
+    PLACE,
+    POSE,
+    SPEED,
+    STATE_SIZE,
+    TURN,
+    NavigationState,
+)
 
 Floats = NDArray[np.float64]
 STAMPS = np.arange(0, 100_000_001, 10_000_000)
@@ -47,7 +57,7 @@ def disturbed(known: NavigationState, x: Floats) -> NavigationState:
 
 
 def difference(a: NavigationState, b: NavigationState) -> Floats:
-    x = np.zeros(SIZE)
+    x = np.zeros(STATE_SIZE)
     x[PLACE] = b.T_world_imu[:3, 3] - a.T_world_imu[:3, 3]
     x[TURN] = so3.log(b.T_world_imu[:3, :3] @ a.T_world_imu[:3, :3].T)
     for part, name in ((SPEED, "velocity"), (DOWN, "gravity"), (FORCE, "accel_bias")):
@@ -61,13 +71,13 @@ def ahead(known: NavigationState, imu: ImuStream) -> NavigationState:
     return known.propagated(known.estimate.over(imu, ENDS))
 
 
-@pytest.mark.parametrize("direction", range(SIZE))
+@pytest.mark.parametrize("direction", range(STATE_SIZE))
 def test_covariance_propagation_equals_finite_differences_of_the_integration(direction: int) -> None:
-    imu, x = stream(), 1e-4 * np.eye(SIZE)[direction]
-    nothing = np.zeros((SIZE, SIZE))
+    imu, x = stream(), 1e-4 * np.eye(STATE_SIZE)[direction]
+    nothing = np.zeros((STATE_SIZE, STATE_SIZE))
     moved = difference(ahead(state(nothing), imu), ahead(disturbed(state(nothing), x), imu))
     added = ahead(state(np.outer(x, x)), imu).covariance - ahead(state(nothing), imu).covariance
-    kept = np.arange(SIZE)
+    kept = np.arange(STATE_SIZE)
     if direction >= GYRO.start:
         # What an error of the rate does to the directions of forces within a step is left out: 4e-5 m/s for 1 mrad/s.
         assert np.abs(moved[SPEED]).max() < 0.06 * 1e-4
@@ -77,7 +87,7 @@ def test_covariance_propagation_equals_finite_differences_of_the_integration(dir
 
 
 def test_process_noise_alone_increases_the_covariance() -> None:
-    grown = ahead(state(np.zeros((SIZE, SIZE))), stream()).covariance
+    grown = ahead(state(np.zeros((STATE_SIZE, STATE_SIZE))), stream()).covariance
     assert (np.diag(grown)[: GYRO.start + 3] > 0).all()
     assert (np.diag(grown)[GYRO.start + 3 :] == 0).all(), "axes of a device do not wander"
     np.testing.assert_array_equal(grown, grown.T)
@@ -86,9 +96,9 @@ def test_process_noise_alone_increases_the_covariance() -> None:
 def test_a_pose_update_is_conditioning_of_the_joint_gaussian() -> None:
     """Against the information form: the pose's own estimate replaces its prior, the rest follows."""
     rng = np.random.default_rng(7)
-    root = rng.normal(size=(SIZE, SIZE)) * 1e-3
+    root = rng.normal(size=(STATE_SIZE, STATE_SIZE)) * 1e-3
     root[DOWN] *= 1e-3  # gravity is known, so that its length teaches nothing more
-    known = state(root @ root.T + 1e-12 * np.eye(SIZE))
+    known = state(root @ root.T + 1e-12 * np.eye(STATE_SIZE))
     P = known.covariance
     points = np.diag([1e7, 1e6, 1e7, 1e8, 1e8, 1e7])
     information = np.linalg.inv(P)

@@ -14,7 +14,7 @@ from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA, SIZE, NavigationState
+from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA, STATE_SIZE, NavigationState
 from lslam.odometry.inertial.window import (
     EACH,
     SHARED,
@@ -177,7 +177,7 @@ def test_biases_and_velocity_are_found() -> None:
     np.testing.assert_allclose(newest.accel_bias, ACCEL_BIAS, atol=0.02)
     np.testing.assert_allclose(newest.velocity, true_velocity(2.4), atol=5e-3)
     assert abs(np.linalg.norm(window.gravity) - GRAVITY) < 0.03
-    state = window.newest(H, NavigationState(np.eye(4), like(), np.zeros((SIZE, SIZE))))
+    state = window.newest(H, NavigationState(np.eye(4), like(), np.zeros((STATE_SIZE, STATE_SIZE))))
     assert np.linalg.eigvalsh(state.covariance)[0] > 0
     np.testing.assert_array_equal(state.estimate.gyroscope.bias, newest.gyro_bias)
 
@@ -195,5 +195,5 @@ def test_an_unsolvable_window_is_unchanged_and_has_no_covariance() -> None:
     window = replace(window, past=replace(window.past, information=-window.past.information))
     found, H = window.solved(stream())
     np.testing.assert_array_equal(found.moments[0].T_world_imu, window.moments[0].T_world_imu)
-    newest = found.newest(H, NavigationState(np.eye(4), like(), np.zeros((SIZE, SIZE))))
+    newest = found.newest(H, NavigationState(np.eye(4), like(), np.zeros((STATE_SIZE, STATE_SIZE))))
     assert not np.isfinite(newest.covariance).all()

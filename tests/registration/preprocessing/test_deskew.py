@@ -10,7 +10,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan, Span
-from lslam.registration.preprocessing.deskew import KNOTS, deskew, deskew_points
+from lslam.registration.preprocessing.deskew import SWEEP_KNOTS, deskew, deskew_points
 from lslam.registration.preprocessing.prepare import prepare_points
 
 # 15 m/s and 150 deg/s, as a 0.1 s sweep sees them.
@@ -29,7 +29,7 @@ def cloud(n: int = 3000) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 @pytest.mark.parametrize("begin", [0.0, -0.05, -0.037, -0.1])
-@pytest.mark.parametrize("knots", [2, 11, KNOTS])
+@pytest.mark.parametrize("knots", [2, 11, SWEEP_KNOTS])
 def test_every_point_is_carried_by_the_pose_at_its_time(knots: int, begin: float) -> None:
     """To the stamp: where the sweep begins, in its middle, elsewhere, at its end."""
     points, times = cloud()
@@ -53,10 +53,10 @@ def test_what_has_no_times_or_no_motion_is_left_alone() -> None:
 @pytest.mark.parametrize("begin", [0.0, -0.05])
 def test_points_without_a_finite_time_are_unchanged_and_do_not_affect_others(begin: float) -> None:
     points, times = cloud(100)
-    good = deskew_points(points, times, sweep(KNOTS, begin=begin))
+    good = deskew_points(points, times, sweep(SWEEP_KNOTS, begin=begin))
     times[7] = np.nan
     assert Scan(points, 0, 0, None, times).span == Span(0.0, float(np.nanmax(times)))
-    moved = deskew_points(points, times, sweep(KNOTS, begin=begin))
+    moved = deskew_points(points, times, sweep(SWEEP_KNOTS, begin=begin))
     np.testing.assert_allclose(moved[7], points[7], atol=1e-5)
     np.testing.assert_array_equal(np.delete(moved, 7, 0), np.delete(good, 7, 0))
 
@@ -77,7 +77,7 @@ def test_centroids_are_deskewed_as_well_as_their_points() -> None:
     wall = np.column_stack([10 * np.cos(azimuth), np.full(len(times), -5.0), rng.uniform(-1, 3, len(times))])
     seen = se3.inverse(se3.exp(times[:, None].astype(float) / 0.1 * twist))
     raw = np.einsum("nij,nj->ni", seen[:, :3, :3], wall) + seen[:, :3, 3]
-    prior = MotionPrior(np.linspace(0, 0.1, KNOTS), se3.exp(np.linspace(0, 1, KNOTS)[:, None] * twist))
+    prior = MotionPrior(np.linspace(0, 0.1, SWEEP_KNOTS), se3.exp(np.linspace(0, 1, SWEEP_KNOTS)[:, None] * twist))
     prepared = prepare_points(raw, PreprocessConfig(), times=times)
     assert np.abs(prepared.source[:, 1] + 5).max() > 0.3
     straight = deskew(prepared, prior)

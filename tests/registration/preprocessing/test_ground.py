@@ -85,14 +85,14 @@ def test_a_roof_seen_from_above_is_no_ground() -> None:
 
 def test_the_envelope_is_the_lowest_cone_over_supported_cells() -> None:
     rng = np.random.default_rng(3)
-    height = np.where(rng.random((24, 24)) < 0.4, rng.normal(0, 0.1, (24, 24)), ground.EMPTY)
+    height = np.where(rng.random((24, 24)) < 0.4, rng.normal(0, 0.1, (24, 24)), ground.NO_HEIGHT)
     height[4, 5] = -9.0
     top = ground.envelope(height, 0.1, 0.25)
     i, j = np.indices(height.shape)
-    expected = np.full_like(height, ground.EMPTY)
-    for a, b in zip(*np.nonzero(height < ground.EMPTY), strict=True):
+    expected = np.full_like(height, ground.NO_HEIGHT)
+    for a, b in zip(*np.nonzero(height < ground.NO_HEIGHT), strict=True):
         near = height[max(a - 2, 0) : a + 3, max(b - 2, 0) : b + 3]
-        others = near[near < ground.EMPTY]
+        others = near[near < ground.NO_HEIGHT]
         low = (others < height[a, b] + 0.25 + 0.2).sum() - 1
         if low < 1 or 4 * low < len(others) - 1:
             continue

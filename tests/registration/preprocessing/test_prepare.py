@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.kernels import voxel
-from lslam.registration.preprocessing.prepare import COARSEST_SOURCE, PreparedPoints, gate_points, prepare_points
+from lslam.registration.preprocessing.prepare import COARSEST_SOURCE_M, PreparedPoints, gate_points, prepare_points
 
 UNTIMED = np.zeros(0, np.float32)
 
@@ -55,7 +55,7 @@ def test_sparse_scans_keep_all_their_map_points_and_wide_ones_stop_at_the_coarse
     assert len(sparse.source) == pytest.approx(len(sparse.map_points), rel=0.05)
     wide = np.random.default_rng(0).uniform(-90, 90, (200_000, 3)).astype(np.float32)
     config = PreprocessConfig(range_max=200.0)
-    coarsest = voxel.centroids(prepare_points(wide, config).map_points, UNTIMED, COARSEST_SOURCE)[0]
+    coarsest = voxel.centroids(prepare_points(wide, config).map_points, UNTIMED, COARSEST_SOURCE_M)[0]
     assert len(prepare_points(wide, config).source) == len(coarsest) > config.source_points_max
 
 

@@ -11,11 +11,11 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
 from lslam.core.kernels import voxel
 from lslam.registration.preprocessing.prepare import (
-    CLEAR,
     FIELD_OF_VIEW_SR,
-    MOSTLY,
+    MOST_REMOVED_SHARE,
     NO_TIMES,
-    WIDE_CELL,
+    SPARSE_CELLS_SHARE,
+    WIDE_CELL_M,
     on_surfaces,
     prepare_points,
 )
@@ -63,14 +63,14 @@ def test_cells_are_judged_as_numpy_judges_them(seed: int) -> None:
     ranges = np.linalg.norm(made.astype(np.float64), axis=1)
     line = LINE / np.sqrt(FIELD_OF_VIEW_SR / len(points))
     filled = counts * ranges >= LEAF * line
-    _, cell = np.unique(np.floor(made / WIDE_CELL), axis=0, return_inverse=True)
+    _, cell = np.unique(np.floor(made / WIDE_CELL_M), axis=0, return_inverse=True)
     around = np.bincount(cell.ravel(), counts * filled)[cell.ravel()]
-    expected = filled & (around * ranges >= WIDE_CELL * line)
+    expected = filled & (around * ranges >= WIDE_CELL_M * line)
     np.testing.assert_array_equal(kept, made[expected])
     assert (~filled).sum() > 0
     assert (filled & ~expected).sum() > 0
-    assert (~expected).mean() > CLEAR
-    assert counts[expected].sum() > MOSTLY * len(points)
+    assert (~expected).mean() > SPARSE_CELLS_SHARE
+    assert counts[expected].sum() > MOST_REMOVED_SHARE * len(points)
 
 
 @pytest.mark.parametrize("sensor", [(64, 2000, 2.0, -24.8), (64, 1024, 22.5, -22.5), (16, 1800, 15.0, -15.0)])
