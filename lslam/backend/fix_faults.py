@@ -23,9 +23,9 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.gnss import GnssStream
 
 # Fixes that heights alone reject, at least, as a share of all.
-LEAST_SHARE = 0.05
+REJECTED_SHARE = 0.05
 # Times as large as the next smaller one, a stated sigma is of another kind of fixes.
-APART = 4.0
+SIGMA_RATIO = 4.0
 # Share of the heights from which those left out are as plausible.
 AMBIGUOUS = 0.4
 
@@ -131,7 +131,7 @@ def _kinds(sigmas: Floats) -> list[Bools]:
     """Which of the fixes state alike, by their sigmas (F,): a receiver says one thing of a fixed solution, another of a float."""
     ordered = np.sort(sigmas)
     edges, begin = [], 0
-    for at in (np.flatnonzero(ordered[1:] > APART * ordered[:-1]) + 1).tolist():
+    for at in (np.flatnonzero(ordered[1:] > SIGMA_RATIO * ordered[:-1]) + 1).tolist():
         if min(at - begin, len(ordered) - at) >= FEWEST:
             edges.append(ordered[at])
             begin = at
@@ -155,7 +155,7 @@ def aligned(
     agrees = agreeing_heights(height_levels(level.residuals[:, 2], fixes.sigmas[:, 2]), fixes.sigmas[:, 2])
     has_jump = not agrees.all()
     gained = int(level.inliers.sum()) - (0 if alignment is None else int(alignment.inliers.sum()))
-    if not has_jump and gained >= max(3, LEAST_SHARE * len(fixes.stamps_ns)):
+    if not has_jump and gained >= max(3, REJECTED_SHARE * len(fixes.stamps_ns)):
         way = np.linalg.norm(fixes.antenna - np.median(fixes.antenna, axis=0), axis=1)
         judged = np.hypot(np.hypot(fixes.sigmas[:, 2], fixes.slack), min(up_sigma, float(np.deg2rad(2.0))) * way)
         agrees = agreeing_heights(level.residuals[:, 2], judged)

@@ -122,7 +122,7 @@ def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config)
 MEMORY_S = 20.0
 ROUGHNESS = 0.15  # m, of the floor
 # rad; a floor this much steeper than the world's horizon is a ramp or a roof (hdl_graph_slam takes 10 deg).
-STEEPEST = np.deg2rad(10.0)
+STEEPEST_RAD = np.deg2rad(10.0)
 # m; a floor farther from the usual height below the sensor is a roof or a hole (height_clip_range there).
 CLIP_M = 1.0
 # Largest difference of two measurements of one flat floor, m and rad.
@@ -164,7 +164,7 @@ def floor_planes(store: KeyframeStore, config: GraphConfig, up: Floats = Z, worl
     for keyframe in checking(store.keyframes):
         R, height = levelling(store.points(keyframe.number), ROUGHNESS, CELLS, up)
         normal = R[2]
-        if not np.isfinite(height) or world_up @ keyframe.T_world_lidar[:3, :3] @ normal < np.cos(STEEPEST):
+        if not np.isfinite(height) or world_up @ keyframe.T_world_lidar[:3, :3] @ normal < np.cos(STEEPEST_RAD):
             continue
         planes.append(FloorPlane(keyframe.number, normal, -height, float(np.deg2rad(config.floor_deg)), config.floor_m))
     usual = float(np.median([p.offset for p in planes])) if planes else 0.0

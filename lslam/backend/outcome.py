@@ -35,7 +35,7 @@ _OF_LOOPS = (
     "x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"
 )  # fmt: skip
 # Keyframes before and after each end of the loop whose clouds are shown.
-AROUND = 10
+CLOUD_KEYFRAMES = 10
 
 
 @dataclass(frozen=True)
@@ -269,6 +269,8 @@ def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopVie
 
 
 def _surroundings(poses: Floats, loop: LoopCandidate, store: KeyframeStore) -> LoopSurroundings:
-    older, newer = (range(max(end - AROUND, 0), min(end + AROUND + 1, len(store))) for end in (loop.a, loop.b))
+    older, newer = (
+        range(max(end - CLOUD_KEYFRAMES, 0), min(end + CLOUD_KEYFRAMES + 1, len(store))) for end in (loop.a, loop.b)
+    )
     points = np.concatenate([se3.apply(poses[k], store.points(k)) for k in sorted({*older, *newer})])
     return LoopSurroundings(points, poses[list(older), :2, 3], poses[list(newer), :2, 3], poses[loop.a, :2, 3])

@@ -12,14 +12,14 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs, Stamps
 from lslam.core.types.trajectory import Trajectory
 
-LEAST = 3
+LEAST_POSES = 3
 # Interpolation pays when truth has a pose at least every 0.6 estimate intervals, and stops at holes of 5 of its own.
 DENSER, HOLE = 0.6, 5
 LEAST_OVERLAP = 0.6  # of the shorter trajectory
 LEAST_SCORE = 0.8
 SAME_STAMPS_NS = 1_000_000
-WINDOW = 5
-AMBIGUOUS = 1.2
+WINDOW_POSES = 5
+SECOND_BEST_RATIO = 1.2
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ def associate(estimate: Trajectory, truth: Trajectory, max_diff: float = 0.01, o
     InputError when fewer than 3 poses match, with both time ranges, or when counts differ and there are no stamps.
     """
     for which, trajectory in (("estimate", estimate), ("ground truth", truth)):
-        if len(trajectory) < LEAST:
+        if len(trajectory) < LEAST_POSES:
             raise InputError(
-                f"{which} {trajectory.source or 'without a name'} has {len(trajectory)} poses, {LEAST} are needed "
+                f"{which} {trajectory.source or 'without a name'} has {len(trajectory)} poses, {LEAST_POSES} are needed "
                 f"(estimate: {time_range(estimate)}; ground truth: {time_range(truth)})"
             )
     if not (estimate.has_stamps and truth.has_stamps):
@@ -67,7 +67,7 @@ def associate(estimate: Trajectory, truth: Trajectory, max_diff: float = 0.01, o
         if offset_ns and len(matches.stamps_ns) < LEAST_OVERLAP * matches.possible:
             between = _interpolate(estimate, stamps, truth, limit, "ground truth interpolated at the moved stamps")
             matches = max(between, matches, key=lambda m: len(m.stamps_ns))
-    if len(matches.stamps_ns) < LEAST:
+    if len(matches.stamps_ns) < LEAST_POSES:
         raise InputError(_no_overlap(estimate, stamps, truth, len(matches.stamps_ns), max_diff))
     return matches
 
@@ -181,7 +181,7 @@ def _no_overlap(estimate: Trajectory, stamps: Stamps, truth: Trajectory, found: 
         )
     else:
         way_out = "they share no time: try --time-offset auto (or seconds) if one clock is shifted"
-    return f"only {found} poses match within {max_diff:g} s, {LEAST} are needed: {ranges}; {way_out}"
+    return f"only {found} poses match within {max_diff:g} s, {LEAST_POSES} are needed: {ranges}; {way_out}"
 
 
 def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float]:
@@ -196,8 +196,8 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
     InputError when a trajectory has no stamps or fewer than 3 poses, or when the motion does not determine the shift.
     """
     for which, t in (("estimate", estimate), ("ground truth", truth)):
-        if not t.has_stamps or len(t) < LEAST:
-            raise InputError(f"--time-offset auto: {which} {t.source} has no stamps or fewer than {LEAST} poses")
+        if not t.has_stamps or len(t) < LEAST_POSES:
+            raise InputError(f"--time-offset auto: {which} {t.source} has no stamps or fewer than {LEAST_POSES} poses")
     step = _step(estimate, truth)
     a, b = _rates(estimate, step), _rates(truth, step)
     if min(len(a), len(b)) < 10:
@@ -214,7 +214,7 @@ def estimate_offset(estimate: Trajectory, truth: Trajectory) -> tuple[int, float
     peaks = _peaks(scores, lags)
     refined = [(_refine(estimate, truth, zero + int(lags[p]) * step, step), p) for p in peaks]
     (cost, offset, best), *others = sorted((cost, offset, p) for (offset, cost), p in refined)
-    if others and others[0][0] <= AMBIGUOUS * cost + 1e-9:
+    if others and others[0][0] <= SECOND_BEST_RATIO * cost + 1e-9:
         raise InputError(
             f"--time-offset auto: {offset / 1e9:.3f} s and {others[0][1] / 1e9:.3f} s fit alike; give the offset in seconds"
         )
@@ -227,7 +227,7 @@ def _peaks(scores: Floats, lags: Longs) -> list[int]:
     for k in np.argsort(-scores, kind="stable")[:2000].tolist():
         if scores[k] < LEAST_SCORE or len(chosen) == 20:
             break
-        if all(abs(int(lags[k] - lags[c])) > 2 * WINDOW for c in chosen):
+        if all(abs(int(lags[k] - lags[c])) > 2 * WINDOW_POSES for c in chosen):
             chosen.append(k)
     return chosen
 
@@ -239,17 +239,17 @@ def _step(estimate: Trajectory, truth: Trajectory) -> int:
 
 
 def _rates(t: Trajectory, step: int, first: int | None = None, count: int | None = None) -> Floats:
-    """(M, 2) speed m/s and rotation rate rad/s, a sample every `step` ns, each over WINDOW samples against pose noise."""
+    """(M, 2) speed m/s and rotation rate rad/s, a sample every `step` ns, each over WINDOW_POSES samples against pose noise."""
     first = int(t.stamps_ns[0]) if first is None else first
     if count is None:
         count = int((t.stamps_ns[-1] - t.stamps_ns[0]) // step) + 1
-    if count <= WINDOW:
+    if count <= WINDOW_POSES:
         return np.zeros((0, 2))
     poses = se3.poses_at(t.stamps_ns, t.poses, first + step * np.arange(count))
-    start, end = poses[:-WINDOW], poses[WINDOW:]
+    start, end = poses[:-WINDOW_POSES], poses[WINDOW_POSES:]
     speed = np.linalg.norm(end[:, :3, 3] - start[:, :3, 3], axis=1)
     turn = so3.angle(np.swapaxes(start[:, :3, :3], -1, -2) @ end[:, :3, :3])
-    return np.stack([speed, turn], axis=1) * (1e9 / (WINDOW * step))
+    return np.stack([speed, turn], axis=1) * (1e9 / (WINDOW_POSES * step))
 
 
 def _correlation(a: Floats, b: Floats) -> tuple[Floats, Longs]:
@@ -289,7 +289,7 @@ def _refine(estimate: Trajectory, truth: Trajectory, start: int, step: int) -> t
     low = max(int(estimate.stamps_ns[0]), int(truth.stamps_ns[0]) - start + step)
     high = min(int(estimate.stamps_ns[-1]), int(truth.stamps_ns[-1]) - start - step)
     count = (high - low) // step + 1
-    if count < WINDOW + 3:
+    if count < WINDOW_POSES + 3:
         return start, 1.0
     own = _rates(estimate, step, low, count)
     scale = own.std(axis=0) + np.array([0.02, 0.002])
@@ -306,7 +306,7 @@ def _snap(estimate: Trajectory, truth: Trajectory, offset: int, step: int) -> in
     """Exact constant, ns, when both files have the same stamps on two clocks; else the offset as it is."""
     stamps = estimate.stamps_ns + offset
     i, j = nearest_one_to_one(stamps, truth.stamps_ns, step // 2)
-    if len(i) < LEAST:
+    if len(i) < LEAST_POSES:
         return offset
     rest = truth.stamps_ns[j] - stamps[i]
     middle = int(np.median(rest))

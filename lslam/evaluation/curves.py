@@ -19,8 +19,8 @@ NOT_REGISTRATION = ("read", "prepare", "standing", "keyframe", "integrity")
 LOST_FACTOR = 10.0
 # ... and more than Girolimetto takes for a result: its largest rmse that is one (LOAM, large eight) is 2.156 m.
 LOST_FLOOR_M = 2.2
-LEVEL = 0.95
-FLAT = 0.1  # what differs by less than a tenth is as good
+CONFIDENCE = 0.95
+FLAT_SHARE = 0.1  # what differs by less than a tenth is as good
 ELBOW = 1.5  # an error above so many times the plateau's is not on the plateau
 Rise = Literal["worse", "as good", "unknown"]
 FEWEST = 6
@@ -146,7 +146,7 @@ def median_over_seeds(table: Floats) -> Floats:
     return out
 
 
-def over_seeds(table: Floats, level: float = LEVEL) -> Interval:
+def over_seeds(table: Floats, level: float = CONFIDENCE) -> Interval:
     """Mean over the seeds (V, S) that have a number, with Student's t interval of `level`.
 
     Seeds are few, so the interval is wide: three of them stand for 4.3 standard errors either way. One has none.
@@ -188,7 +188,7 @@ def optimum(values: Floats, means: Floats, *, is_highest_best: bool = True) -> O
         return None
     values, score = values[known], means[known] if is_highest_best else 1 / means[known]
     best = int(np.argmax(score))
-    good = score >= (1 - FLAT) * score[best]
+    good = score >= (1 - FLAT_SHARE) * score[best]
     low = high = best
     while low > 0 and good[low - 1]:
         low -= 1
@@ -237,12 +237,12 @@ class Contrast:
     @property
     def is_more(self) -> bool:
         """Whether the first is larger by a tenth, and by more than the scatter over seeds."""
-        return self.exceeds(1) and self.mean > log(1 + FLAT)
+        return self.exceeds(1) and self.mean > log(1 + FLAT_SHARE)
 
     @property
     def is_no_more(self) -> bool:
         """Whether the first is larger by less than a tenth, scatter included."""
-        return self.stays_below(1 + FLAT)
+        return self.stays_below(1 + FLAT_SHARE)
 
 
 def contrast(first: Floats, second: Floats) -> Contrast:

@@ -33,14 +33,14 @@ METRICS: tuple[TrajectoryMetric[Any], ...] = (
 )
 __all__ = ["Evaluation", "evaluate"]
 log = logging.getLogger("lslam")
-STRAIGHT = 0.01
+STRAIGHT_SHARE = 0.01
 # Spread of the truth's positions per metre of the estimate's, and the unit that they then seem to have. What is left of a path in
 # km may be the motion of a lever arm.
 UNITS = ((1 / 0.33, 1 / 0.28, "feet"), (67.0, 150.0, "cm"), (670.0, 1500.0, "mm"), (0.0, 0.03, "km"))
 # An ATE that grows so much at another offset speaks against it; drift alone makes it grow or shrink a little.
-WORSE = 1.25
+WORSE_RATIO = 1.25
 # m; a spread below is noise.
-SPREAD = 5.0
+LEAST_SPREAD_M = 5.0
 # Chi-square of three degrees of freedom that chance exceeds once in a million times.
 UNLIKELY = 30.7
 
@@ -194,7 +194,7 @@ def _measure(
 def _other_unit(estimate: Floats, truth: Floats) -> list[str]:
     """Notes, if the spreads of both trajectories differ by the ratio of two units of length."""
     own, real = (float(np.linalg.norm(poses[:, :3, 3].std(axis=0))) for poses in (estimate, truth))
-    if max(own, real) < SPREAD or own <= 0:
+    if max(own, real) < LEAST_SPREAD_M or own <= 0:
         return []
     return [
         f"WRONG UNIT: the ground truth's positions spread over {real:.4g} m and the estimate's over {own:.4g} m (standard "
@@ -221,7 +221,7 @@ def _nearly_straight(truth: Floats, config: EvalConfig) -> list[str]:
     """Note when positions hardly constrain the rotation about the path, so that aligned rotation errors are unreliable."""
     centred = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     spread = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(truth))
-    if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT * spread[0]:
+    if not {"se3", "sim3"} & set(config.align) or not 1e-4 * spread[0] < spread[1] <= STRAIGHT_SHARE * spread[0]:
         return []
     return [
         f"the path is nearly straight ({spread[1]:.2g} m sideways, {spread[0]:.3g} m along, standard deviations): "
@@ -266,7 +266,7 @@ def _better_offset(estimate: Trajectory, truth: Trajectory, matches: Matches, co
         return []
     moved = associate(estimate, truth, config.max_diff, fit.offset_ns)
     now, then = (absolute_error(m.estimate, m.truth, "se3").translation for m in (matches, moved))
-    if now is None or then is None or then.rmse > WORSE * now.rmse:
+    if now is None or then is None or then.rmse > WORSE_RATIO * now.rmse:
         return []
     gain = f": ATE se3 {metres(then.rmse)} m, {metres(now.rmse)} m as they are" if then.rmse < now.rmse else ""
     return [

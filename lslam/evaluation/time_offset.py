@@ -26,7 +26,7 @@ BLOCK_S, PARTS, MIN_BLOCKS = 1.5, 12, 8
 CLEAR_SIGMAS, CLEAR_S = 5.0, 0.005
 # Noise of a way, m, and of a turn, rad, that is always allowed for.
 FLOORS = (1e-4, 1e-5)
-HUBER = 2.0
+HUBER_SIGMAS = 2.0
 HOLES = 5
 
 
@@ -101,7 +101,7 @@ def _linearise(
     r = own[use] - at
     J = (after - before) / (2 * reach)
     scales = np.maximum(1.4826 * np.median(np.abs(r - np.median(r, axis=0)), axis=0), FLOORS[: r.shape[1]])
-    w = np.minimum(HUBER * scales / np.maximum(np.abs(r), 1e-12), 1.0) / scales**2
+    w = np.minimum(HUBER_SIGMAS * scales / np.maximum(np.abs(r), 1e-12), 1.0) / scales**2
     information = float(np.sum(w * J * J))
     if information <= 0:
         return None

@@ -29,7 +29,7 @@ from lslam.evaluation.curves import (
 
 R2 = 0.95
 OWN_SHARE = 0.8  # of the change of all stages, for a parameter that acts on one of them
-LEAST_CHANGE = 0.1  # of registration's time: below it nothing was acted on
+LEAST_TIME_SHARE = 0.1  # of registration's time: below it nothing was acted on
 FEWEST_VALUES = 3
 UNITS = {"translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s"}
 _EQUAL = 1e-9  # R2 of laws that fit alike
@@ -125,7 +125,7 @@ def judge_acts_only_on(finding: ExpectedFinding, result: CurveResult) -> Judged:
     if level is None:
         return "undecided", f"fewer than {FEWEST_VALUES} values were timed"
     whole = sum(change.values())
-    if not level or whole < LEAST_CHANGE * level:
+    if not level or whole < LEAST_TIME_SHARE * level:
         return "undecided", f"registration changes by {whole:.2g} of {level:.3g} ms only"
     said = ", ".join(f"{name} by {ms:.3g}" for name, ms in sorted(change.items(), key=lambda item: -item[1])[:3])
     share = _own_share(finding, change)

@@ -21,8 +21,8 @@ SQUARE, ABOVE = 1.0, 0.2
 # m between two things, seen from above: beams of one ring are closer on a thing, and from ring to ring none is asked.
 GAP = 0.3
 # m from the sensor along each axis: farther, a thing is a few points.
-REACH = 100.0
-_SIDE = int(2 * REACH / SQUARE) + 2
+REACH_M = 100.0
+_SIDE = int(2 * REACH_M / SQUARE) + 2
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def things_of(points: NDArray[np.float32], chosen: Bools) -> Longs:
     from scipy import ndimage
 
     labels = np.zeros(len(points), np.int64)
-    x, y = np.floor((points[chosen, :2] + REACH) / GAP).astype(np.int64).T
-    taken = np.zeros((int(2 * REACH / GAP) + 1,) * 2, np.bool_)
+    x, y = np.floor((points[chosen, :2] + REACH_M) / GAP).astype(np.int64).T
+    taken = np.zeros((int(2 * REACH_M / GAP) + 1,) * 2, np.bool_)
     taken[x, y] = True
     numbered, _ = ndimage.label(taken, np.ones((3, 3)))
     labels[chosen] = numbered[x, y]
@@ -99,7 +99,7 @@ def whole(moves: Bools, labels: Longs, share: float, least: int) -> Bools:
 
 def _squares(near: NDArray[np.float32], sensor: Floats) -> tuple[Longs, Longs]:
     """(2,) corner square of the area within reach, and (N,) index of each point's square in its flattened image."""
-    first = np.floor((sensor[:2] - REACH) / SQUARE).astype(np.int64)
+    first = np.floor((sensor[:2] - REACH_M) / SQUARE).astype(np.int64)
     at = np.floor((near[:, :2] + sensor[:2]) / SQUARE).astype(np.int64) - first
     return first, at[:, 0] * _SIDE + at[:, 1]
 
@@ -107,7 +107,7 @@ def _squares(near: NDArray[np.float32], sensor: Floats) -> tuple[Longs, Longs]:
 def _within_reach(points: NDArray[np.float32]) -> Bools:
     """(N,) whether a point is within reach; False for NaN."""
     x, y, z = np.abs(points).T
-    return np.asarray((x < REACH) & (y < REACH) & (z < REACH))
+    return np.asarray((x < REACH_M) & (y < REACH_M) & (z < REACH_M))
 
 
 # Scans before and after that are asked: at 10 Hz a pedestrian has left its place after 0.3 s, a lorry after 2.5 s. Every
@@ -116,7 +116,7 @@ OFFSETS = tuple(range(3, 26))
 # How far behind a point must lie what another scan sees there: m, and m per m of range for poses that are turned.
 MARGIN, SLOPE = 0.15, 0.01
 # Share of that by which ground seen at a point's range may lie above or below it and still be it.
-STEP = 0.3
+STEP_SHARE = 0.3
 # Where this share of the points in a cube of so many m moves, the rest of them moves, too, ...
 CUBE, SHARE = 0.5, 0.3
 # ... and where this share of a thing does, and so many points, all of it: few beams seldom look through where one was.
@@ -273,7 +273,7 @@ class Cleaner:
             low, inverse = self._grid.low, 1 / self._grid.size
             poses = np.array([look.T_world_lidar for look in others]).reshape(-1, 4, 4)
             for k, (look, T) in enumerate(zip(others, se3.relative(poses, T_world_lidar), strict=True)):
-                vote(points, T, look.image, low, inverse, MARGIN, SLOPE, STEP, len(others) - k, free, hit)
+                vote(points, T, look.image, low, inverse, MARGIN, SLOPE, STEP_SHARE, len(others) - k, free, hit)
         return free, hit
 
 

@@ -13,12 +13,12 @@ from lslam.core.types.run_record import Crispness, MapDifference
 from lslam.maps.merge import MergedMap
 
 RADIUS = 0.5  # m
-LEAST = 10  # points in a neighbourhood
+LEAST_POINTS = 10  # points in a neighbourhood
 SAMPLES = 50_000
 THRESHOLD = 0.2  # m
 
 
-def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples: int = SAMPLES) -> Crispness:
+def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST_POINTS, samples: int = SAMPLES) -> Crispness:
     """Score a map. A merged one may exceed memory, any other is read as a whole.
 
     Parameters
@@ -54,7 +54,7 @@ def crispness(cloud: Cloud, radius: float = RADIUS, least: int = LEAST, samples:
     return Crispness(entropy, variance, used, sampled, len(cloud), radius, least)
 
 
-def plane_variances(points: Floats, queries: slice, radius: float = RADIUS, least: int = LEAST) -> Floats:
+def plane_variances(points: Floats, queries: slice, radius: float = RADIUS, least: int = LEAST_POINTS) -> Floats:
     """(Q,) m2, variance of the points (N, 3) about the plane through those around each query; NaN where these are few."""
     from lslam.maps.kernels.crispness import cell_keys, shapes
 

@@ -39,14 +39,14 @@ from lslam.registration.solver import solve
 # Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5
 ONLY_START = "the baseline starts the matches of buildings there and gives the keyframe no prior"
-SPACING = 0.25  # m between the points of an outline, and the grid of a flattened scan
+OUTLINE_STEP_M = 0.25  # m between the points of an outline, and the grid of a flattened scan
 HEIGHTS = (0.2, 0.7, 1.2, 1.7)  # m
 NDT_VOXEL, VGICP_VOXEL = 2.0, 1.0  # m; hdl_graph_slam's NDT resolution, fast_gicp's voxel
 WIDTH, STEPS = 2.0, 40  # m, where the kernel opens; Gauss-Newton steps at most
 NOISE = 0.1  # m
 LEAST_POINTS = 20
 LEAST_OVERLAP = 0.1  # share of the points with a correspondence
-FARTHEST = 5.0  # m from the prior; a result beyond has not converged
+FARTHEST_M = 5.0  # m from the prior; a result beyond has not converged
 FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
@@ -152,9 +152,9 @@ class FlatFit:
 
 
 def flatten_scan(cloud: NDArray[np.float32], reach: float) -> Floats:
-    """Points (M, 2), m, of a level scan (N, 3) above the sensor's horizon within `reach`, m, one per cell of `SPACING`."""
+    """Points (M, 2), m, of a level scan (N, 3) above the sensor's horizon within `reach`, m, one per cell of `OUTLINE_STEP_M`."""
     flat = cloud[(cloud[:, 2] > 0) & (np.abs(cloud[:, :2]).max(axis=1, initial=0.0) < reach), :2].astype(np.float64)
-    _, first = np.unique(np.floor(flat / SPACING).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(np.floor(flat / OUTLINE_STEP_M).astype(np.int64), axis=0, return_index=True)
     return np.asarray(flat[np.sort(first)])
 
 
@@ -162,7 +162,7 @@ def outline_points(walls: Floats) -> Floats:
     """(N, 2) points along walls (T, 2, 2), m."""
     found = []
     for a, b in walls:
-        shares = np.linspace(0, 1, max(int(np.linalg.norm(b - a) / SPACING), 1) + 1)[:-1, None]
+        shares = np.linspace(0, 1, max(int(np.linalg.norm(b - a) / OUTLINE_STEP_M), 1) + 1)[:-1, None]
         found.append(a + shares * (b - a))
     return np.concatenate(found) if found else np.zeros((0, 2))
 
@@ -191,7 +191,7 @@ def _align(
     annealing, c = Annealing(WIDTH, 0.5, 0.8, STEPS), RegistrationConfig(sigma=NOISE, blob_weight=1.0, weak_share=0.0)
     found = solve((ground,), points, se2.to_se3(prior), annealing, c, residual=residual_named(residual))
     pose = se2.of_se3(found.T_world_lidar)
-    if not found.ok or found.overlap < LEAST_OVERLAP or np.linalg.norm(pose[:2] - prior[:2]) > FARTHEST:
+    if not found.ok or found.overlap < LEAST_OVERLAP or np.linalg.norm(pose[:2] - prior[:2]) > FARTHEST_M:
         return None
     away = np.asarray(cKDTree(target).query(se2.apply(pose, source))[0])
     near = away[away <= FAR]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lslam.core.kernels import ground
 from lslam.core.labels import CLASSES
 from lslam.core.types.arrays import Bools, Floats, Longs
-from lslam.osm.walls import CELL, ROUGHNESS_M, SLOPE, THICKNESS, lowest_levels
+from lslam.osm.walls import CELL_M, ROUGHNESS_M, SLOPE, THICKNESS, lowest_levels
 
 _GROUND, _WALL, _POLE = CLASSES["other-ground"], CLASSES["building"], CLASSES["pole"]
 _VEGETATION, _VEHICLE, _OTHER = CLASSES["vegetation"], CLASSES["car"], CLASSES["unlabeled"]
@@ -22,7 +22,7 @@ NEAR_M = 10.0  # m about the sensor, where the ground is surely seen
 CUBE_M = 0.4  # m; three of them to a side are the neighbourhood of a point
 FLATNESS = 6.0  # times the variance across a plane that it has along its narrower side, or it is a line
 UPRIGHT_SINE = np.sin(np.radians(20.0))  # largest vertical component of the normal of a wall
-LEAST_POINTS = 5.0  # points in a neighbourhood, with fewer it has no shape
+SHAPED_POINTS = 5.0  # points in a neighbourhood, with fewer it has no shape
 VEHICLE_HEIGHTS_M = 0.9, 2.6  # m above the ground, but for lorries
 VEHICLE_LENGTHS_M, VEHICLE_WIDTHS_M = (1.5, 6.5), (0.5, 2.6)  # m; of the visible part of a vehicle
 WALL_SHARE = 0.5  # share of the points in a column of a wall that lie on upright planes
@@ -47,12 +47,12 @@ def _heights(cloud: NDArray[np.float32]) -> Floats:
         return np.zeros(0)
     level, half = lowest_levels(cloud)
     # What panes mirror seems to lie far below: no street falls so from where the sensor is.
-    away = CELL * np.hypot(*(np.indices(level.shape) - (half - 0.5)))
+    away = CELL_M * np.hypot(*(np.indices(level.shape) - (half - 0.5)))
     here = level[(away < NEAR_M) & (level < ground.NO_HEIGHT)]
     if len(here):
         level[level < np.median(here) - SLOPE * away - ROUGHNESS_M] = ground.NO_HEIGHT
-    top = np.asarray(ground.envelope(level, SLOPE * CELL, ROUGHNESS_M)).reshape(level.shape)
-    i, j = (np.floor(cloud[:, :2] / CELL).astype(np.int64) + half).T
+    top = np.asarray(ground.envelope(level, SLOPE * CELL_M, ROUGHNESS_M)).reshape(level.shape)
+    i, j = (np.floor(cloud[:, :2] / CELL_M).astype(np.int64) + half).T
     return np.asarray(cloud[:, 2] - top[i, j], np.float64)
 
 
@@ -99,7 +99,7 @@ def _shapes(points: Floats, keys: Longs, member: Longs) -> tuple[Bools, Bools, B
     for k, (i, j) in enumerate(pairs):
         covariance[:, i, j] = covariance[:, j, i] = total[:, 4 + k] / total[:, 0] - mean[:, i] * mean[:, j]
     values, vectors = np.linalg.eigh(covariance)
-    is_known = total[:, 0] >= LEAST_POINTS
+    is_known = total[:, 0] >= SHAPED_POINTS
     is_flat = is_known & (values[:, 0] < THICKNESS**2) & (values[:, 1] > FLATNESS * np.maximum(values[:, 0], 0.0))
     return is_flat, is_flat & (np.abs(vectors[:, 2, 0]) < UPRIGHT_SINE), is_known & ~is_flat
 

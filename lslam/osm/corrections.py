@@ -35,13 +35,13 @@ from lslam.osm.wall_match import LIKENESS
 from lslam.osm.walls import walls_of
 
 VIEWS = 3  # keyframes that must agree
-NEAR = 1.5  # m; a building with walls seen within it of its outline is not absent
-STEP = 1.0  # m between the points of a wall that rays are drawn to
-WIDE = 3.0  # m; least length of walls seen through an absent building
-DEPTH = 0.5  # m that a ray must pass inside an outline at least
+SEEN_WALL_M = 1.5  # m; a building with walls seen within it of its outline is not absent
+WALL_STEP_M = 1.0  # m between the points of a wall that rays are drawn to
+ABSENT_WALLS_M = 3.0  # m; least length of walls seen through an absent building
+LEAST_DEPTH_M = 0.5  # m that a ray must pass inside an outline at least
 ONE_LINE = 0.5  # m; walls seen within it of one line are merged
 ONE_WAY = np.sin(np.radians(10.0))
-LONG = 6.0  # m; least length of a new wall, longer than a hedge, a van or a sign
+NEW_WALL_M = 6.0  # m; least length of a new wall, longer than a hedge, a van or a sign
 log = logging.getLogger("lslam")
 BUILDINGS_GEOJSON, BUILDINGS_OSM = "buildings.geojson", "buildings.osm"
 # m and rad; prior sigmas of a building that moves with all others only.
@@ -73,10 +73,10 @@ def absent_buildings(
     seen = np.concatenate(everything) if everything else np.zeros((0, 2))
     if not len(seen) or not shapes:
         return found
-    near, _ = STRtree(points(seen)).query([s.buffer(NEAR) for s in shapes], predicate="intersects")
+    near, _ = STRtree(points(seen)).query([s.buffer(SEEN_WALL_M) for s in shapes], predicate="intersects")
     is_near = np.isin(np.arange(len(shapes)), near)
     candidates = [k for k in range(len(shapes)) if not is_near[k] and not is_canopy(buildings[k])]
-    cores = [shapes[k].buffer(-DEPTH / 2) for k in candidates]
+    cores = [shapes[k].buffer(-LEAST_DEPTH_M / 2) for k in candidates]
     counts = np.zeros(len(candidates), np.int64)
     tree = STRtree(cores)
     for look, samples in zip(checking(looks), everything, strict=True):
@@ -85,7 +85,7 @@ def absent_buildings(
         hits = np.zeros((len(samples), len(candidates)), np.int64)
         np.add.at(hits, (ray % max(len(samples), 1), core), 1)
         # The rays from all positions of the sensor to the wall pass through the building.
-        counts += (hits == len(look.views)).sum(axis=0) * STEP >= WIDE
+        counts += (hits == len(look.views)).sum(axis=0) * WALL_STEP_M >= ABSENT_WALLS_M
     found[candidates] = counts >= VIEWS
     return found
 
@@ -105,7 +105,7 @@ def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], po
         rows = np.ascontiguousarray(look.walls.reshape(-1, 4))
         # The outside of a wall that is seen at a grazing angle is uncertain: both directions are matched.
         pairs = [
-            wall_matching.fit(side, known, np.zeros(3), NEAR, LIKENESS, False)[2]
+            wall_matching.fit(side, known, np.zeros(3), SEEN_WALL_M, LIKENESS, False)[2]
             for side in (rows, np.ascontiguousarray(rows[:, [2, 3, 0, 1]]))
         ]
         is_inside = ground.contains(points(look.walls.mean(axis=1))) if len(rows) else np.zeros(0, bool)
@@ -115,7 +115,7 @@ def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], po
                     break
             else:
                 lines.append(_Line(wall, look.keyframe))
-    kept = [line.segment for line in lines if len(line.keyframes) >= VIEWS and line.length >= LONG]
+    kept = [line.segment for line in lines if len(line.keyframes) >= VIEWS and line.length >= NEW_WALL_M]
     order = sorted(kept, key=lambda s: -float(np.linalg.norm(s[1] - s[0])))
     return np.array(order).reshape(-1, 2, 2)
 
@@ -131,11 +131,16 @@ class _Line:
         self.keyframes = {keyframe}
 
     def takes(self, wall: Floats, keyframe: int) -> bool:
-        """Merge a wall that lies on the line, within `NEAR` of the segment; True then."""
+        """Merge a wall that lies on the line, within `SEEN_WALL_M` of the segment; True then."""
         away = wall - self._from
         s, d = away @ self._u, away @ [-self._u[1], self._u[0]]
         leaning = abs(d[1] - d[0]) > ONE_WAY * abs(s[1] - s[0])
-        if leaning or np.abs(d).max() > ONE_LINE or s.min() > self._high + NEAR or s.max() < self._low - NEAR:
+        if (
+            leaning
+            or np.abs(d).max() > ONE_LINE
+            or s.min() > self._high + SEEN_WALL_M
+            or s.max() < self._low - SEEN_WALL_M
+        ):
             return False
         self._low, self._high = min(self._low, float(s.min())), max(self._high, float(s.max()))
         self.length = self._high - self._low
@@ -160,8 +165,8 @@ def _placed(sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> lis
 
 
 def _samples(walls: Floats) -> Floats:
-    """Points (N, 2), m, on all walls, about `STEP` apart."""
-    counts = [int(np.linalg.norm(wall[1] - wall[0]) / STEP) + 1 for wall in walls]
+    """Points (N, 2), m, on all walls, about `WALL_STEP_M` apart."""
+    counts = [int(np.linalg.norm(wall[1] - wall[0]) / WALL_STEP_M) + 1 for wall in walls]
     shares = [(np.arange(n) + 0.5)[:, None] / n for n in counts]
     found = [wall[0] + share * (wall[1] - wall[0]) for wall, share in zip(walls, shares, strict=True)]
     return np.concatenate(found) if found else np.zeros((0, 2))

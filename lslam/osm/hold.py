@@ -29,7 +29,7 @@ from lslam.osm.wall_match import match_buildings
 
 log = logging.getLogger("lslam")
 # Iterations of the drift estimate: the drift within a submap is not visible in its walls at first.
-ROUNDS = 5
+HOLD_ROUNDS = 5
 # Modes in which the buildings of the map do not move relative to each other.
 RIGID_MODES = ("prior", "rigid")
 # m, sigma of a wall in these modes: the rounding of a survey.
@@ -113,7 +113,7 @@ def find_on_map(
     if located.problem or not matcher_named(config.osm.matcher).reveals_drift or is_straight:
         return located, held
     before: WallDrift | None = None
-    for _ in range(ROUNDS):
+    for _ in range(HOLD_ROUNDS):
         with clocks[len(store) - 1].stage("drift"):
             seen = sightings(located, held.poses, config)
             drift = find_wall_drift(held, seen, *_wall_sigmas(config.osm), config.graph, before)

@@ -31,16 +31,16 @@ from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.classes import classify
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
-from lslam.osm.wall_match import START_WALLS, WINDOW, find_heading, match_buildings, match_keyframe, shares
+from lslam.osm.wall_match import SEARCH_SIGMAS, START_WALLS, find_heading, match_buildings, match_keyframe, shares
 from lslam.osm.walls import OsmMap, find_walls
 from lslam.registration.preprocessing.ground import Z, up_of, world_up_of
 
 log = logging.getLogger("lslam")
 
 # Sigmas of the map beyond which the track is lost, and a match has to observe all three coordinates.
-LOST = 4.0
+LOST_RATIO = 4.0
 # Chi-square quantile within which a match agrees with the others.
-AGREEING = 0.95
+AGREEING_SHARE = 0.95
 # Factor by which submaps grow, and how often, until the match of the start is unambiguous.
 GROWTH, TRIES = 2, 4
 
@@ -196,7 +196,7 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
     """The match with its verdict."""
     if match.reason:
         return match
-    if track.sigma[0] > LOST * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
+    if track.sigma[0] > LOST_RATIO * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
         return replace(match, reason="too few walls for a relocalisation")
     squared, rank = track.squared(match.pose, match.information)
     limit = quantile(graph.probability, rank)
@@ -233,7 +233,7 @@ def _place(
     right = [
         i
         for i, (match, far) in enumerate(zip(matches, squared, strict=True))
-        if match.rank == 3 and track.is_accurate(match.information) and far <= quantile(AGREEING, 3)
+        if match.rank == 3 and track.is_accurate(match.information) and far <= quantile(AGREEING_SHARE, 3)
     ]
     at = min(right, key=lambda i: abs(numbers[i] - first.keyframe), default=0)
     there = np.append(matches[at].pose[:2], laid[at, 2] + turn)
@@ -298,7 +298,7 @@ def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, confi
 
 def known_start(config: OsmConfig) -> FirstPose:
     """The start by the origin and heading of the configuration, with their sigmas."""
-    radius, turn = config.start_radius / WINDOW, np.radians(config.start_heading_deg) / WINDOW
+    radius, turn = config.start_radius / SEARCH_SIGMAS, np.radians(config.start_heading_deg) / SEARCH_SIGMAS
     return FirstPose(first_pose(config), np.array([radius, radius, turn]))
 
 

@@ -17,17 +17,17 @@ from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.building import Building, about, footprint_polygon, is_canopy
 
-TOUCHING = 0.05  # m; walls of neighbours at most this far apart on the map are a party wall
-SHARED = 0.5  # m; least length of a party wall
-SLACK = 0.005  # m; by which each of two buildings may overlap the other: half the tolerance
-STEEPEST = np.radians(60.0)  # largest rotation of a building (Del Tufo)
-LARGEST = 5.0  # m; largest displacement of a building
+TOUCHING_M = 0.05  # m; walls of neighbours at most this far apart on the map are a party wall
+PARTY_WALL_M = 0.5  # m; least length of a party wall
+OVERLAP_M = 0.005  # m; by which each of two buildings may overlap the other: half the tolerance
+LARGEST_TURN_RAD = np.radians(60.0)  # largest rotation of a building (Del Tufo)
+LARGEST_MOVE_M = 5.0  # m; largest displacement of a building
 FLUSH_WORTH = 1.0  # m; cost of a move that aligns no walls, so that aligned walls are preferred
 PARALLEL = np.cos(np.radians(10.0))
-SHORTEST = 0.3  # m; shorter walls are not aligned
-ROUNDS = 20  # most rounds of separation
+SHORTEST_WALL_M = 0.3  # m; shorter walls are not aligned
+SEPARATION_ROUNDS = 20  # most rounds of separation
 STEPS = 10  # of Gauss-Newton
-HARD = 1e-4  # m; one sigma of a contact
+CONTACT_SIGMA_M = 1e-4  # m; one sigma of a contact
 NESTED = 0.5  # share of the smaller building's area; a larger overlap on the map is a building part or a copy
 log = logging.getLogger("lslam")
 
@@ -43,7 +43,7 @@ class Contact:
 
 
 class Solid:
-    """Geometry of a building: its shape, its walls, and its area less `SLACK`."""
+    """Geometry of a building: its shape, its walls, and its area less `OVERLAP_M`."""
 
     def __init__(self, number: int, building: Building) -> None:
         from shapely import MultiPolygon, make_valid
@@ -51,7 +51,7 @@ class Solid:
         self.number = number
         self.middle = building.middle
         shape = make_valid(MultiPolygon([footprint_polygon(f) for f in building.footprints]))
-        self.shape, self.core = shape, shape.buffer(-SLACK, join_style="mitre")
+        self.shape, self.core = shape, shape.buffer(-OVERLAP_M, join_style="mitre")
         rings = [ring for f in building.footprints for ring in f.rings]
         # Wall k runs from corner k to corner after[k].
         self.walls = np.concatenate([np.stack([r, np.roll(r, -1, axis=0)], axis=1) for r in rings])
@@ -65,25 +65,25 @@ class Solid:
         return np.asarray(self.walls @ R.T + shift)
 
     def core_at(self, displacement: Floats) -> Any:
-        """The displaced area less `SLACK`, of shapely."""
+        """The displaced area less `OVERLAP_M`, of shapely."""
         return _transformed(self.core, *about(self.middle, displacement))
 
 
 def party_contacts(one: Solid, other: Solid) -> list[Contact]:
     """Contacts of the party walls of `one` and `other` on the map; none where the two overlap."""
-    if one.shape.distance(other.shape) > TOUCHING or one.core.intersects(other.core):
+    if one.shape.distance(other.shape) > TOUCHING_M or one.core.intersects(other.core):
         return []
     found = []
     for wall in one.walls:
         for facing in other.walls:
             u, along = _direction(facing)
             away = wall - facing[0]
-            if along < SHARED or (wall[1] - wall[0]) @ u > -PARALLEL * np.linalg.norm(wall[1] - wall[0]):
+            if along < PARTY_WALL_M or (wall[1] - wall[0]) @ u > -PARALLEL * np.linalg.norm(wall[1] - wall[0]):
                 continue
-            if np.abs(away @ [-u[1], u[0]]).max() > TOUCHING:
+            if np.abs(away @ [-u[1], u[0]]).max() > TOUCHING_M:
                 continue
             s = np.clip(away @ u, 0.0, along)
-            if abs(s[1] - s[0]) >= SHARED:
+            if abs(s[1] - s[0]) >= PARTY_WALL_M:
                 found += [Contact(one.number, facing[0] + t * u, other.number, facing) for t in s]
     return found
 
@@ -91,7 +91,7 @@ def party_contacts(one: Solid, other: Solid) -> list[Contact]:
 def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Contact]:
     """Contacts after the smallest move of `one` that separates the two, displaced by `at` and `other_at` (3,).
 
-    Empty when no move of less than `LARGEST` m and `STEEPEST` separates the two.
+    Empty when no move of less than `LARGEST_MOVE_M` m and `LARGEST_TURN_RAD` separates the two.
     """
     from shapely import prepare
 
@@ -99,7 +99,7 @@ def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Con
     core, obstacle = one.core_at(at), other.core_at(other_at)
     prepare(obstacle)
     moves = [*_alignments(one, ours, other, theirs), *_touches(ours, theirs)]
-    for move in sorted((m for m in moves if m.price < LARGEST + FLUSH_WORTH), key=lambda m: m.price):
+    for move in sorted((m for m in moves if m.price < LARGEST_MOVE_M + FLUSH_WORTH), key=lambda m: m.price):
         if not _transformed(core, move.rotation, move.shift).intersects(obstacle):
             return [_on_map(contact, one, other) for contact in move.contacts]
     return []
@@ -127,7 +127,7 @@ def _alignments(one: Solid, ours: Floats, other: Solid, theirs: Floats) -> Itera
             v, along = _direction(facing)
             # Walls that face each other have opposite directions.
             turn = np.arctan2(u[1] * v[0] - u[0] * v[1], -(u @ v))
-            if min(length, along) < SHORTEST or abs(turn) > STEEPEST:
+            if min(length, along) < SHORTEST_WALL_M or abs(turn) > LARGEST_TURN_RAD:
                 continue
             rotation, _ = about(middle, np.array([0.0, 0.0, turn]))
             turned = middle + (ours[:, 0] - middle) @ rotation.T
@@ -145,7 +145,7 @@ def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
     for side, corners, walls in ((0, ours[:, 0], theirs), (1, theirs[:, 0], ours)):
         for k, wall in enumerate(walls):
             u, length = _direction(wall)
-            if length < SHORTEST:
+            if length < SHORTEST_WALL_M:
                 continue
             n = np.array([u[1], -u[0]])
             depth = (wall[0] - corners) @ n
@@ -217,7 +217,7 @@ def remove_overlaps(buildings: Sequence[Building], displacements: Floats, inform
     contacts = {(i, j): party_contacts(solids[i], solids[j]) for i, j in _neighbours(solid_ground)}
     inseparable: set[tuple[int, int]] = set()
     moved = _constrained(solids, wanted, information, contacts)
-    for _ in checking(range(ROUNDS)):
+    for _ in checking(range(SEPARATION_ROUNDS)):
         pairs = [pair for pair in _overlapping(solid_ground, moved) if pair not in nested and pair not in inseparable]
         if not pairs:
             break
@@ -245,7 +245,7 @@ def _neighbours(solids: Sequence[Solid]) -> list[tuple[int, int]]:
     from shapely import STRtree
 
     shapes = [s.shape for s in solids]
-    return _pairs(solids, STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING))
+    return _pairs(solids, STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING_M))
 
 
 def _pairs(solids: Sequence[Solid], found: Longs) -> list[tuple[int, int]]:
@@ -292,8 +292,8 @@ def _group(members: list[int], middles: Floats, wanted: Floats, information: Flo
             i, j = place[contact.owner], place[contact.other]
             found = _residual(contact, middles[i], moved[i], middles[j], moved[j])
             values[row], rows[row, 3 * i : 3 * i + 3], rows[row, 3 * j : 3 * j + 3] = found
-        normal = known + rows.T @ rows / HARD**2
-        gradient = known @ (moved - wanted).ravel() + rows.T @ values / HARD**2
+        normal = known + rows.T @ rows / CONTACT_SIGMA_M**2
+        gradient = known @ (moved - wanted).ravel() + rows.T @ values / CONTACT_SIGMA_M**2
         step = np.linalg.solve(normal, gradient).reshape(-1, 3)
         moved -= step
         if np.abs(step).max() < 1e-7:

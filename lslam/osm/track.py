@@ -14,7 +14,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.building import KeyframeMatch
 
 # m, correlation length of odometry's drift.
-MEMORY = 100.0
+MEMORY_M = 100.0
 # Directions with less than this share of the largest information are unobserved.
 FREE = 1e-9
 # Alignment of a run with its matches: iterations, and degrees of freedom of the residuals (Student's t) against wrong ones.
@@ -44,7 +44,7 @@ class OsmTrack:
         moved = se2.compose(self.pose, step)
         ahead: Floats = np.eye(3)
         ahead[:2, 2] = [-(moved[1] - self.pose[1]), moved[0] - self.pose[0]]
-        self.covariance = ahead @ self.covariance @ ahead.T + np.diag(self._drift * way * MEMORY)
+        self.covariance = ahead @ self.covariance @ ahead.T + np.diag(self._drift * way * MEMORY_M)
         self.pose = moved
 
     def begin(self, pose: Floats, information: Floats) -> None:
@@ -76,7 +76,7 @@ class OsmTrack:
         Returns the rotation, rad, about the first pose, and the squared Mahalanobis distances (M,) of the matches.
         """
         weights = np.stack([
-            self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY)
+            self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY_M)
             for m, way in zip(matches, ways, strict=True)
         ])  # fmt: skip
         real, pivot = np.stack([m.pose for m in matches]), np.append(poses[0, :2], 0.0)

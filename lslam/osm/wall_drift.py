@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.backend.graph.drift import MEMORY, SIZES, correct_drift, linear_basis, rate_roots, walk_root
+from lslam.backend.graph.drift import MEMORY_M, SIZES, correct_drift, linear_basis, rate_roots, walk_root
 from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
 from lslam.core.config.backend import GraphConfig
@@ -31,9 +31,9 @@ SCALES = (0.25, 0.5, 1.0)
 SELDOM = 0.95
 # Hyperparameters of drift, degrees of freedom of the likelihood ratio test: scale and constant share. Rates are marginalised.
 FITTED = 2
-ROUNDS = 6
+REWEIGHTINGS = 6
 # m between knots of varying rates, and the largest number of knots.
-APART, MOST = 20.0, 40
+KNOTS_APART_M, MOST = 20.0, 40
 SETTLED = 0.1  # of the expected squared Mahalanobis length of the rates
 
 
@@ -229,14 +229,14 @@ def _fitted(
     """As `find_wall_drift`, for constant or for varying rates alone."""
     assert graph.start_sigma is not None
     length = float(graph.distances[-1])
-    apart = min(max(APART, length / MOST), MEMORY) if is_varying else MEMORY
+    apart = min(max(KNOTS_APART_M, length / MOST), MEMORY_M) if is_varying else MEMORY_M
     at_knots = linear_basis(graph.distances, apart)
     effects = _effects(graph, at_knots)
     taken = np.zeros(3 * at_knots.shape[1]) if before is None else before.knots.ravel()
     fit = DriftFit(graph, seen, effects, taken, *sigmas, np.append(graph.start_sigma, [graph.shift_sigma] * 2))
     roots = [walk_root(length, config, PLANAR, apart)] if is_varying else rate_roots(length, config, PLANAR)
     sizes = _likeliest(fit, roots)
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTINGS):
         fit.reweight(sizes)
         sizes = _likeliest(fit, roots)
     found, _ = fit.rates(sizes)

@@ -22,10 +22,10 @@ from lslam.core.types.constraint import Verdict
 from lslam.osm.kernels import wall_matching
 from lslam.osm.walls import OsmMap, find_walls
 
-WINDOW = 3.0  # sigmas of the prior that are searched
-REACH = 20.0  # m; a virtual edge lies at most so far beyond the ends of its walls
+SEARCH_SIGMAS = 3.0  # sigmas of the prior that are searched
+EDGE_REACH_M = 20.0  # m; a virtual edge lies at most so far beyond the ends of its walls
 SHARPEST = np.radians(30.0)  # between two walls that make a corner
-SPREAD = np.radians(8.0)  # by which the corners of a pair may differ
+CORNER_SPREAD_RAD = np.radians(8.0)  # by which the corners of a pair may differ
 LIKENESS = np.cos(np.radians(25.0))  # between the directions of a pair of walls
 CELL = np.array([0.75, 0.75, np.radians(4.0)])  # of the votes
 CORNERS = 40
@@ -37,15 +37,15 @@ SHORT = 4.0  # m; a wall of this length has half the weight of an infinite one
 # the walls of one building have no such errors among themselves.
 GATES = np.array([2.5, 2.2, 1.9, 1.6, 1.4, 1.2, 1.2])
 FINE_GATES = np.array([2.0, 1.5, 1.0, 0.7, 0.5, 0.4, 0.4])
-MORE = 30  # most iterations with the last gate, until convergence
-WIDE = np.array([6.0, 4.5, 3.0])  # first gates from the prior itself: an error in heading displaces far walls
+LAST_ITERATIONS = 30  # most iterations with the last gate, until convergence
+FIRST_GATES = np.array([6.0, 4.5, 3.0])  # first gates from the prior itself: an error in heading displaces far walls
 FAINT = 1e-3  # factor on the prior's weight in the fit, since the graph has the prior too
 START_WALLS = 4  # least walls of a start: the two of one corner would fit in many places of a town
-SLACK = np.array([0.5, 0.5, 0.03])  # m, m, rad; by which refinement may leave the window
+REFINED_SLACK = np.array([0.5, 0.5, 0.03])  # m, m, rad; by which refinement may leave the window
 NEAR_SAME, LIKE_SAME = 1.5, np.radians(6.0)  # m and rad; poses that differ less are the same
 BESIDE = 2.0  # m between the poses that are tried across parallel walls, the width of the first gates
 ALIGNED = np.sin(np.radians(12.0)) ** 2  # least information of an observed direction, as a part of the largest
-LONGEST = 60.0  # m from the walls seen; the map beyond is left out
+VISIBLE_M = 60.0  # m from the walls seen; the map beyond is left out
 
 
 @dataclass(frozen=True)
@@ -83,15 +83,15 @@ def match_walls(
 ) -> WallMatch | None:
     """Match `source` (S, 2, 2) with `target` (T, 2, 2), directed segments in m, near the pose `prior` (3,) x, y, yaw.
 
-    The window is `WINDOW` times `sigma` (3,), m, m, rad. Del Tufo's global match has the walls of a submap as source and those
-    of all buildings near as target. The local match has the walls of one building as source and those of the submap as target,
-    `by_coverage`, because most of the building is not seen.
+    The window is `SEARCH_SIGMAS` times `sigma` (3,), m, m, rad. Del Tufo's global match has the walls of a submap as source
+    and those of all buildings near as target. The local match has the walls of one building as source and those of the submap
+    as target, `by_coverage`, because most of the building is not seen.
 
     Returns None when the coverage is too small. An ambiguous match is returned, with `is_ambiguous`.
     """
     config = config or OsmConfig()
     at, spread = np.asarray(prior, np.float64), np.asarray(sigma, np.float64)
-    window = np.append(WINDOW * spread[:2], min(WINDOW * spread[2], np.pi))
+    window = np.append(SEARCH_SIGMAS * spread[:2], min(SEARCH_SIGMAS * spread[2], np.pi))
     trust = FAINT * config.wall_sigma**2 / np.maximum(spread, 1e-6) ** 2
     return _best(_rows(source), _rows(target), at, window, trust, config, by_coverage)
 
@@ -122,7 +122,7 @@ def _best(
     if not len(seen) or not len(known):
         return None
     gates = FINE_GATES if by_coverage else GATES
-    starts = [(at, np.concatenate([WIDE, gates]))]
+    starts = [(at, np.concatenate([FIRST_GATES, gates]))]
     starts += [(pose, gates) for pose in _proposals(seen, known, at, window, by_coverage)]
 
     def laid(starts: list[tuple[Floats, Floats]]) -> list[WallMatch]:
@@ -148,7 +148,7 @@ def _rows(segments: NDArray[Any]) -> Floats:
 
 def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floats, Longs]:
     """The target walls within reach of the source, and their numbers."""
-    reach = min(float(np.abs(seen).max(initial=0.0)) * np.sqrt(2), LONGEST * 2) + slack + 5.0
+    reach = min(float(np.abs(seen).max(initial=0.0)) * np.sqrt(2), VISIBLE_M * 2) + slack + 5.0
     a, b = known[:, :2] - at[:2], known[:, 2:] - at[:2]
     along = b - a
     share = np.clip(-(a * along).sum(1) / np.maximum((along * along).sum(1), 1e-12), 0, 1)
@@ -158,14 +158,14 @@ def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floa
 
 def _proposals(seen: Floats, known: Floats, at: Floats, window: Floats, by_coverage: bool) -> Floats:
     """Poses (K, 3) with many votes of pairs of corners, those of least distance between the walls first."""
-    ours, theirs = (wall_matching.corners(walls, REACH, SHARPEST) for walls in (seen, known))
+    ours, theirs = (wall_matching.corners(walls, EDGE_REACH_M, SHARPEST) for walls in (seen, known))
     if not len(ours) or not len(theirs):
         return np.zeros((0, 3))
     # The corners of largest weight are enough.
     ours = ours[np.argsort(-ours[:, 4], kind="stable")[:CORNERS]]
     is_round = bool(window[2] >= np.pi - 1e-9)
     cell = np.where(is_round, [*CELL[:2], 2 * np.pi / 90 * (1 + 1e-9)], CELL)
-    grid = wall_matching.votes(ours, theirs, at, window, cell, SPREAD)
+    grid = wall_matching.votes(ours, theirs, at, window, cell, CORNER_SPREAD_RAD)
     if is_round:
         grid = np.ascontiguousarray(grid[:, :, :90])
     poses = wall_matching.peaks(grid, at, PROPOSALS, is_round)
@@ -187,10 +187,10 @@ def _refined(
 ) -> WallMatch | None:  # fmt: skip
     """The pose refined by lines; None when it leaves the window or no wall has a partner."""
     pose, normal, centre, rms, pair = wall_matching.refine(
-        seen, known, pose, at, trust, gates, MORE, LIKENESS, SHORT, by_coverage
+        seen, known, pose, at, trust, gates, LAST_ITERATIONS, LIKENESS, SHORT, by_coverage
     )
     away = np.array([*(pose[:2] - at[:2]), (pose[2] - at[2] + np.pi) % (2 * np.pi) - np.pi])
-    if (np.abs(away) > window + SLACK).any() or not (pair >= 0).any():
+    if (np.abs(away) > window + REFINED_SLACK).any() or not (pair >= 0).any():
         return None
     # The error of a wall on the map does not decrease with the number of points on it.
     planar, free, rank = _deflated(normal / config.wall_sigma**2)
@@ -264,7 +264,7 @@ def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> Keyfr
     """Match `view`, walls with a prior pose and its sigma, with the buildings near. `reason` says why a match is rejected."""
     if not len(view.walls):
         return replace(view, reason="no walls seen")
-    reach = config.use_radius + WINDOW * float(np.hypot(view.sigma[0], view.sigma[1]))
+    reach = config.use_radius + SEARCH_SIGMAS * float(np.hypot(view.sigma[0], view.sigma[1]))
     numbers = osm.walls_near(view.prior[:2], reach)
     if not len(numbers):
         return replace(view, reason="no building near")

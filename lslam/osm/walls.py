@@ -20,18 +20,18 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
 from lslam.osm.kernels import segments
 
-CELL = 2.0  # m; of the grid in which the ground is found
+CELL_M = 2.0  # m; of the grid in which the ground is found
 SLOPE = 0.3  # m per m; steepest street
 ROUGHNESS_M = 0.3  # m; of the ground within a cell
 NEIGHBOURHOOD = 0.6  # m; half the window in which the points of a wall lie on a plane
 THICKNESS = 0.1  # m; largest standard deviation across that plane
-STEP = 0.5  # m; three of them reach from the last such neighbourhood of a wall to its corner
+WALL_STEP_M = 0.5  # m; three of them reach from the last such neighbourhood of a wall to its corner
 THIN = 0.25  # m; points above one another within it are merged, with their count
 AGREEMENT = np.cos(np.radians(20.0))  # cosine of the angle between a point's plane and the line
 TRIES = 12  # RANSAC hypotheses per segment
 MOST = 200  # most segments
 HIGHEST = 1e4  # m; points higher or lower, or not finite, are left out
-STRAIGHT = 0.1  # m; corners of a footprint nearer to the line through their neighbours are removed
+STRAIGHT_M = 0.1  # m; corners of a footprint nearer to the line through their neighbours are removed
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def find_walls(
     tries = np.random.default_rng(0).integers(0, 2**31, (MOST, TRIES))
     found = segments.find_segments(
         flat, every, tries, config.wall_tolerance, AGREEMENT, config.wall_gap, float(config.min_cluster),
-        config.min_length, STEP,
+        config.min_length, WALL_STEP_M,
     )  # fmt: skip
     seen_from = np.zeros((1, 2)) if views is None else np.asarray(views, np.float64)[:, :2]
     return Walls(_directed(found[:, :4].reshape(-1, 2, 2), seen_from), found[:, 4].astype(np.int64), found[:, 5])
@@ -112,8 +112,8 @@ def walls_of(buildings: Iterable[Building]) -> tuple[Floats, Longs]:
 
 def lowest_levels(cloud: NDArray[np.float32]) -> tuple[Floats, int]:
     """(2 half, 2 half) height, m, of the lowest point in each cell about the sensor, `NO_HEIGHT` without points; and half."""
-    half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / CELL)) + 1
-    lowest = ground.lowest(cloud, np.eye(3), CELL, half)
+    half = int(np.ceil(float(np.abs(cloud[:, :2]).max()) / CELL_M)) + 1
+    lowest = ground.lowest(cloud, np.eye(3), CELL_M, half)
     return np.where(lowest >= 0, cloud[lowest, 2].astype(np.float64), ground.NO_HEIGHT).reshape(
         2 * half, 2 * half
     ), half
@@ -122,7 +122,7 @@ def lowest_levels(cloud: NDArray[np.float32]) -> tuple[Floats, int]:
 def _high(cloud: NDArray[np.float32], height: float) -> Longs:
     """Indices of the points more than `height` m above the ground."""
     level, half = lowest_levels(cloud)
-    return ground.above(cloud, np.eye(3), CELL, half, ground.envelope(level, SLOPE * CELL, ROUGHNESS_M), height)
+    return ground.above(cloud, np.eye(3), CELL_M, half, ground.envelope(level, SLOPE * CELL_M, ROUGHNESS_M), height)
 
 
 def _directed(found: Floats, views: Floats) -> Floats:
@@ -144,7 +144,7 @@ def _simplified(footprint: Footprint) -> Footprint:
         # Simplification keeps the first node: the farthest one is a corner.
         corners = np.asarray(ring.coords, np.float64)[:-1]
         corners = np.roll(corners, -int(np.argmax(np.linalg.norm(corners - corners.mean(0), axis=1))), axis=0)
-        rings.append(np.asarray(Polygon(corners).simplify(STRAIGHT).exterior.coords, np.float64)[:-1])
+        rings.append(np.asarray(Polygon(corners).simplify(STRAIGHT_M).exterior.coords, np.float64)[:-1])
     return Footprint(rings[0], tuple(rings[1:])) if all(len(ring) >= 3 for ring in rings) else footprint
 
 

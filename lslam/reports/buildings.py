@@ -20,7 +20,7 @@ from lslam.reports.svg import MOST_POINTS, Track, plane_chart
 
 MOST_WALLS = 2500  # drawn; the page stays small
 MOST_ROWS = 60
-AROUND = 30.0  # m round the way that are drawn
+DRAWN_M = 30.0  # m round the way that are drawn
 KINDS = ("steady", "wandering")  # of drift, as the manifest has them
 
 
@@ -152,7 +152,7 @@ def _dots(xy: Floats) -> Floats:
 
 
 def _is_near(building: Building, way: Floats) -> bool:
-    low, high = way.min(axis=0) - AROUND, way.max(axis=0) + AROUND
+    low, high = way.min(axis=0) - DRAWN_M, way.max(axis=0) + DRAWN_M
     return bool(((building.middle >= low) & (building.middle <= high)).all())
 
 

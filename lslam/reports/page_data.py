@@ -311,7 +311,7 @@ def map_figure(
 
 
 # m about the sensor that are drawn of one scan: beyond, sixteen beams leave points that no eye puts together.
-REACH = 40.0
+DRAWN_REACH_M = 40.0
 LEGEND = (("s1", "edges"), ("s2", "planar points"))
 
 
@@ -319,14 +319,14 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
     """Figures of the features of one scan, the feature map, and the number of features per scan; empty without features."""
     if view is None:
         return []
-    crop = Crop(0.0, 0.0, 2 * REACH)
+    crop = Crop(0.0, 0.0, 2 * DRAWN_REACH_M)
     scan = plane_chart(
         [], f"features of scan {view.scan}", backdrop=_backdrop(view.around, crop),
         dots=[("s2", crop.inside(view.planes)), ("s1", crop.inside(view.edges))],
     )  # fmt: skip
     low, high = view.map_planes[:, :2].min(axis=0, initial=np.inf), view.map_planes[:, :2].max(axis=0, initial=-np.inf)
     if not np.isfinite([low, high]).all():
-        low, high = np.full(2, -REACH), np.full(2, REACH)
+        low, high = np.full(2, -DRAWN_REACH_M), np.full(2, DRAWN_REACH_M)
     centre = (low + high) / 2
     around = Crop(float(centre[0]), float(centre[1]), float((high - low).max()) + 1.0)
     edges = view.map_edges[:: max(1, -(-len(view.map_edges) // MOST_POINTS)), :2]

@@ -12,7 +12,7 @@ import numpy as np
 from lslam.core.config.config import unit_of, with_unit
 from lslam.core.types.arrays import Floats
 from lslam.core.types.study import CurveResult, Law, StudyResult, StudyRow
-from lslam.evaluation.curves import FLAT, NOT_REGISTRATION, band, normalise, registration_ms
+from lslam.evaluation.curves import FLAT_SHARE, NOT_REGISTRATION, band, normalise, registration_ms
 from lslam.reports.picture import COLOURS, house_style, label, pictures
 
 POINTS = ("o", ".", "x")  # markers; lines without say nothing
@@ -199,7 +199,7 @@ def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) 
         for k, (r, look) in enumerate(_with_looks(result, shown)):
             values = normalise(r.medians[name])
             plot.plot(r.curve.values, values, label=r.curve.label, **look)
-            flat = np.flatnonzero(values >= 1 - FLAT)
+            flat = np.flatnonzero(values >= 1 - FLAT_SHARE)
             if len(shown) <= len(COLOURS):
                 plot.plot(r.curve.values[flat], np.full(len(flat), -0.04 * (k + 1)), "s", ms=3.5, color=look["color"])
         plot.set_yticks(np.linspace(0, 1, 6))

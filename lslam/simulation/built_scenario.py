@@ -44,7 +44,7 @@ SOLID = (Surface.ROAD, Surface.PAVEMENT, Surface.LAWN, Surface.WALL, Surface.GLA
 NAMES = {Surface.ROAD: "the ground", Surface.PAVEMENT: "the ground", Surface.LAWN: "the ground"}
 HALF_WIDTH = 0.7  # m on both sides of the path that must be free as well
 LOWEST = 0.3  # m above the ground
-STEP = 0.05  # s
+STEP_S = 0.05  # s
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def check_path(scene: RayScene, city: City, poses: Callable[[NDArray[Any]], Floa
 
     Rays are cast between successive instants along the path and along one line on either side of it.
     """
-    times = np.arange(0.0, duration, STEP)
+    times = np.arange(0.0, duration, STEP_S)
     T = poses(times)
     height = T[:, 2, 3] - city.terrain.height(T[:, :2, 3])
     low = np.flatnonzero(height < LOWEST)

@@ -15,13 +15,13 @@ from lslam.simulation.terrain import Terrain
 
 # A LiDAR's beam of 3 mrad lights a spot some 3 cm wide and 20 cm long on the ground 10 m away: smaller bumps it averages.
 BUMP = 0.25  # m from one bump of the ground to the next
-NEAR = 35.0  # m round the path with every bump: as far as rays 3 deg below level meet the ground
+BUMPS_M = 35.0  # m round the path with every bump: as far as rays 3 deg below level meet the ground
 COARSE = 1.0  # m between bumps farther away
-LARGEST = 4_000_000  # bumps that fit into memory
-MARGIN = 80.0  # m of ground round the path: to behind the houses
+MOST_BUMPS = 4_000_000  # bumps that fit into memory
+MARGIN_M = 80.0  # m of ground round the path: to behind the houses
 ENDS = 40.0  # m that the wall goes on beyond the path
 WALL_AWAY = (12.0, 22.0)  # m from the path
-WALL_HEIGHT = (0.9, 1.1)
+WALL_HEIGHTS_M = (0.9, 1.1)
 WALL_THICKNESS = 0.24
 TREES_BEHIND = (2.5, 4.5)  # m
 TREES_APART = (6.0, 11.0)
@@ -48,7 +48,7 @@ def build_carpark(
     side, away = (1 if walls.random() < 0.5 else -1), half + walls.uniform(*WALL_AWAY)
     builder = MeshBuilder()
     _add_ground(builder, low, high, terrain, roughness, ground)
-    top = walls.uniform(*WALL_HEIGHT)
+    top = walls.uniform(*WALL_HEIGHTS_M)
     add_wall(builder, axis, terrain, axis.sample(2.0), side * away, top, Surface.WALL, thickness=WALL_THICKNESS)
     _add_trees(builder, axis, terrain, layout, side * away, trees)
     first = half + cars.uniform(*FIRST_ROW)
@@ -65,7 +65,7 @@ def _add_ground(
 ) -> None:
     """Add ground without holes, with random bumps."""
     x, y = (_grid_lines(float(low[k]), float(high[k])) for k in (0, 1))
-    if len(x) * len(y) > LARGEST:
+    if len(x) * len(y) > MOST_BUMPS:
         raise UsageError(
             f"a car park of {np.ptp(x):.0f} x {np.ptp(y):.0f} m with a bump every {BUMP:g} m is too large: choose a shorter path"
         )
@@ -76,10 +76,10 @@ def _add_ground(
 
 
 def _grid_lines(low: float, high: float) -> Floats:
-    """Coordinates of the ground's grid lines along one axis: dense up to `NEAR` m beyond `low` and `high`."""
-    count = int(np.ceil((high - low + 2 * NEAR) / BUMP))
-    fine = low - NEAR + BUMP * np.arange(count + 1)
-    beyond = np.arange(COARSE, MARGIN - NEAR + COARSE, COARSE)
+    """Coordinates of the ground's grid lines along one axis: dense up to `BUMPS_M` m beyond `low` and `high`."""
+    count = int(np.ceil((high - low + 2 * BUMPS_M) / BUMP))
+    fine = low - BUMPS_M + BUMP * np.arange(count + 1)
+    beyond = np.arange(COARSE, MARGIN_M - BUMPS_M + COARSE, COARSE)
     return np.concatenate([fine[0] - beyond[::-1], fine, fine[-1] + beyond])
 
 

@@ -19,7 +19,7 @@ from lslam.simulation.scene_mesh import MeshBuilder, SceneMesh, Surface, grid_fa
 from lslam.simulation.terrain import Terrain
 
 KERB = 0.12  # m
-MARGIN = 60.0  # m of ground beyond the street on every side
+MARGIN_M = 60.0  # m of ground beyond the street on every side
 
 
 class Layout(Section):
@@ -181,7 +181,7 @@ def add_ground(
     from scipy.spatial import cKDTree
 
     middle = np.concatenate([street.position(street.sample(0.5)) for street in streets])
-    low, high = middle.min(0) - MARGIN, middle.max(0) + MARGIN
+    low, high = middle.min(0) - MARGIN_M, middle.max(0) + MARGIN_M
     x, y = (np.arange(low[k], high[k] + 1.0, 1.0) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     z = terrain.height(xy) + level + rng.normal(0, 0.015, xy.shape[:2])

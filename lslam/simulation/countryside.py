@@ -15,12 +15,12 @@ from lslam.simulation.terrain import Terrain
 
 RAIL = (0.45, 0.75)  # m, the lower and the upper edge of a guard rail
 VERGE = -0.06  # m, of grass beside a road without kerbs
-WALL_HEIGHT = 6.0  # m, of a corridor
+WALL_HEIGHT_M = 6.0  # m, of a corridor
 OPENINGS = (135.0, 155.0)  # m from the middle of one opening of a corridor to the next
 OPENING = 28.0  # m of an opening
 DEEP = 32.0  # m on both sides in which trees stand
-APART = 1.1  # m from one trunk to the next, at least
-NEAREST = 1.0  # m from the edge of the way
+TRUNKS_APART_M = 1.1  # m from one trunk to the next, at least
+NEAREST_TRUNK_M = 1.0  # m from the edge of the way
 HEDGE = 12.0  # m of way for every hedge that may stand beside it
 LODGES = 90.0  # m of way from one house to the next
 
@@ -69,12 +69,12 @@ def build_corridor(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np
     for side in (1, -1):
         for start, end in ends.reshape(-1, 2):
             s = np.append(np.arange(start, end - 1.0, 2.0), end)
-            add_wall(builder, street, terrain, s, side * inside, WALL_HEIGHT, Surface.WALL)
+            add_wall(builder, street, terrain, s, side * inside, WALL_HEIGHT_M, Surface.WALL)
             near, far = street.beside(s, side * (inside - 0.2)), street.beside(s, side * (inside + 0.2))
             footprints.append(np.concatenate([near, far[::-1]]))
-            heights.append(WALL_HEIGHT)
+            heights.append(WALL_HEIGHT_M)
             for s_end in (start + 0.2, end - 0.2):
-                low, high = [-0.25, -0.3, -0.5], [0.25, 0.3, WALL_HEIGHT + 0.1]
+                low, high = [-0.25, -0.3, -0.5], [0.25, 0.3, WALL_HEIGHT_M + 0.1]
                 _put(builder, street, terrain, s_end, side * inside, low, high, Surface.WALL)
         for middle in openings.tolist():
             outline, height = _fill_opening(builder, street, terrain, layout, middle, side, rng)
@@ -255,12 +255,12 @@ def _add_trees(
     houses = np.array([[*f.mean(axis=0), np.linalg.norm(f - f.mean(axis=0), axis=1).max()] for f in footprints])
     for side in (1, -1):
         for s in np.sort(rng.uniform(0, street.length, count)):
-            offset = layout.band + NEAREST + DEEP * rng.uniform() ** 1.5
+            offset = layout.band + NEAREST_TRUNK_M + DEEP * rng.uniform() ** 1.5
             xy = street.beside(np.array([s]), side * offset)[0]
             part = furniture.tree(rng, layout.volumes)
-            if rng.random() >= layout.trees or float(tree.query(xy)[0]) < layout.band + NEAREST:
+            if rng.random() >= layout.trees or float(tree.query(xy)[0]) < layout.band + NEAREST_TRUNK_M:
                 continue
-            if len(taken) and portable.hypot(*(taken[-64:] - xy).T).min() < APART:
+            if len(taken) and portable.hypot(*(taken[-64:] - xy).T).min() < TRUNKS_APART_M:
                 continue
             if len(houses) and (portable.hypot(*(houses[:, :2] - xy).T) < houses[:, 2] + 1.5).any():
                 continue

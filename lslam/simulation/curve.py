@@ -50,7 +50,7 @@ def smoothed(values: NDArray[Any], sigma: float, mode: Literal["reflect", "wrap"
     return np.asarray(correlate1d(np.asarray(values, np.float64), weights / weights.sum(), axis=0, mode=mode))
 
 
-SPACING = 0.5  # m between the spline's knots
+KNOT_STEP_M = 0.5  # m between the spline's knots
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,9 @@ def stretched(curve: RouteCurve, by: float) -> RouteCurve:
 
 
 def _resample(points: Floats) -> tuple[Floats, float]:
-    """The polyline resampled at even distances near `SPACING`, and that distance, m."""
+    """The polyline resampled at even distances near `KNOT_STEP_M`, and that distance, m."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    count = max(int(np.round(along[-1] / SPACING)), 12)
+    count = max(int(np.round(along[-1] / KNOT_STEP_M)), 12)
     at = np.linspace(0, along[-1], count + 1)
     return np.stack([np.interp(at, along, points[:, k]) for k in (0, 1)], axis=1), float(at[1])
 

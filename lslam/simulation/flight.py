@@ -146,7 +146,7 @@ HALF = np.array([10.0, 4.2])  # m, of an eight along the hall and across
 DIP = 1.05  # m up and down: through the middle it swoops, or its thrust would vanish where the eight straightens
 LOOK = 0.6  # rad, by which it looks to both sides
 UPWARDS = np.array([0.0, 0.0, GRAVITY])
-STEP = 0.01  # s between the knots of its spline
+KNOT_STEP_S = 0.01  # s between the knots of its spline
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,7 @@ def eight_flight(
     Raises UsageError where that needs more than `limit` m/s2 of thrust.
     """
     duration = HOVER + GROWING + VIOLENT
-    t = np.arange(0.0, duration + 6 * STEP, STEP)
+    t = np.arange(0.0, duration + 6 * KNOT_STEP_S, KNOT_STEP_S)
     half = HALF * rng.uniform(0.97, 1.03, 2)
     side, phase = (1.0 if rng.random() < 0.5 else -1.0), rng.uniform(0, 2 * np.pi)
     pulse = speed / float(portable.hypot(half[0], 2 * half[1]))

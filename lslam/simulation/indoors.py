@@ -11,7 +11,7 @@ from lslam.simulation.curve import RouteCurve, rounded_rectangle, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface
 from lslam.simulation.terrain import Terrain
 
-SIDE = 12.0  # m from the middle line to the walls
+HALL_SIDE_M = 12.0  # m from the middle line to the walls
 END = 1.0  # m that the hall is longer than its line at either end
 HEIGHT = 11.0
 BAY = 7.5  # m from column to column, and from beam to beam
@@ -26,15 +26,17 @@ def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> 
     middle = float(ends[0, 1])
     builder = MeshBuilder()
     # What is above a start is no roof that one would be caught under.
-    builder.add_box([low, middle - SIDE, -0.3], [high, middle + SIDE, 0.0], Surface.ROAD)
-    builder.add_box([low, middle - SIDE, HEIGHT], [high, middle + SIDE, HEIGHT + 0.3], Surface.PAVEMENT)
-    for y in (-SIDE, SIDE):
+    builder.add_box([low, middle - HALL_SIDE_M, -0.3], [high, middle + HALL_SIDE_M, 0.0], Surface.ROAD)
+    builder.add_box([low, middle - HALL_SIDE_M, HEIGHT], [high, middle + HALL_SIDE_M, HEIGHT + 0.3], Surface.PAVEMENT)
+    for y in (-HALL_SIDE_M, HALL_SIDE_M):
         builder.add_box([low, middle + y - 0.15, 0.0], [high, middle + y + 0.15, HEIGHT], Surface.WALL)
     for x in (low, high):
-        builder.add_box([x - 0.15, middle - SIDE, 0.0], [x + 0.15, middle + SIDE, HEIGHT], Surface.WALL)
+        builder.add_box([x - 0.15, middle - HALL_SIDE_M, 0.0], [x + 0.15, middle + HALL_SIDE_M, HEIGHT], Surface.WALL)
     for x in np.arange(low + rng.uniform(2, 4), high - 1.0, BAY).tolist():
-        builder.add_box([x - 0.15, middle - SIDE, HEIGHT - 0.8], [x + 0.15, middle + SIDE, HEIGHT], Surface.WALL)
-        for y in (middle - SIDE + 0.4, middle + SIDE - 0.4):
+        builder.add_box(
+            [x - 0.15, middle - HALL_SIDE_M, HEIGHT - 0.8], [x + 0.15, middle + HALL_SIDE_M, HEIGHT], Surface.WALL
+        )
+        for y in (middle - HALL_SIDE_M + 0.4, middle + HALL_SIDE_M - 0.4):
             builder.add_box([x - 0.2, y - 0.25, 0.0], [x + 0.2, y + 0.25, HEIGHT], Surface.WALL)
     for side in (-1, 1):
         _add_racks(builder, low, high, middle, side, rng)
@@ -42,7 +44,14 @@ def build_hall(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> 
         at = np.array([x + rng.uniform(-1.5, 1.5), middle + rng.uniform(-AISLE, AISLE)])
         size = rng.uniform([0.4, 0.4, 0.6], [1.0, 1.0, LOW])
         builder.add_box([*(at - size[:2]), 0.0], [*(at + size[:2]), size[2]], Surface.FENCE)
-    outline = np.array([[low, middle - SIDE], [high, middle - SIDE], [high, middle + SIDE], [low, middle + SIDE]])
+    outline = np.array(
+        [
+            [low, middle - HALL_SIDE_M],
+            [high, middle - HALL_SIDE_M],
+            [high, middle + HALL_SIDE_M],
+            [low, middle + HALL_SIDE_M],
+        ]
+    )
     return City(builder.build(), terrain, line, [outline], [HEIGHT + 0.3])
 
 
@@ -53,13 +62,13 @@ def _add_racks(
     x = low + rng.uniform(0.5, 3.0)
     while x < high - 3.0:
         length, depth = min(rng.uniform(2.0, 6.0), high - 0.5 - x), rng.uniform(0.8, 2.0)
-        front = rng.uniform(AISLE, SIDE - 1.0 - depth)
+        front = rng.uniform(AISLE, HALL_SIDE_M - 1.0 - depth)
         y = sorted((middle + side * front, middle + side * (front + depth)))
         builder.add_box([x, y[0], 0.0], [x + length, y[1], rng.uniform(1.5, 6.0)], Surface.FENCE)
         x += length + rng.uniform(0.8, 4.0)
 
 
-SIZE = np.array([5.0, 4.0, 2.6])  # m, clear
+ROOM_M = np.array([5.0, 4.0, 2.6])  # m, clear
 LOOP = (1.8, 1.2, 0.5)  # m along and across, and radius of its corners
 TABLE = (1.2, 0.7, 0.75)  # m
 SHELVES, BOXES = 7, 16
@@ -72,21 +81,21 @@ def room_line() -> RouteCurve:
 
 def build_room(line: RouteCurve, terrain: Terrain, rng: np.random.Generator) -> City:
     """Build the room round `room_line`; the seed decides where its furniture stands."""
-    builder, half = MeshBuilder(), SIZE / 2
-    low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], SIZE[2]])
+    builder, half = MeshBuilder(), ROOM_M / 2
+    low, high = np.array([-half[0], -half[1], 0.0]), np.array([half[0], half[1], ROOM_M[2]])
     # What is above a start is no roof that one would be caught under.
-    for z in (0.0, SIZE[2]):
+    for z in (0.0, ROOM_M[2]):
         builder.add_box([low[0], low[1], z - 0.1], [high[0], high[1], z], Surface.PAVEMENT)
     for axis in (0, 1):
         for side in (low, high):
             a, b = low - 0.1, high + 0.1
-            a[axis], b[axis], a[2], b[2] = side[axis] - 0.05, side[axis] + 0.05, 0.0, SIZE[2]
+            a[axis], b[axis], a[2], b[2] = side[axis] - 0.05, side[axis] + 0.05, 0.0, ROOM_M[2]
             builder.add_box(a, b, Surface.WALL)
     _add_shelves(builder, rng)
     corner = half[:2] * rng.choice([-1.0, 1.0], 2)
     _add_table(builder, corner - np.sign(corner) * (np.array(TABLE[:2]) / 2 + 0.05), rng)
     outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
-    return City(builder.build(), terrain, line, [outline], [SIZE[2]])
+    return City(builder.build(), terrain, line, [outline], [ROOM_M[2]])
 
 
 def _add_shelves(builder: MeshBuilder, rng: np.random.Generator) -> None:
@@ -95,9 +104,9 @@ def _add_shelves(builder: MeshBuilder, rng: np.random.Generator) -> None:
         axis, side = int(rng.integers(0, 2)), float(rng.choice([-1.0, 1.0]))
         depth, width, height = rng.uniform(0.2, 0.4), rng.uniform(0.4, 1.2), rng.uniform(0.4, 1.9)
         a, b = np.zeros(3), np.zeros(3)
-        wall = side * SIZE[axis] / 2
+        wall = side * ROOM_M[axis] / 2
         a[axis], b[axis] = sorted((wall, wall - side * depth))
-        along = rng.uniform(-1, 1) * (SIZE[1 - axis] / 2 - width / 2)
+        along = rng.uniform(-1, 1) * (ROOM_M[1 - axis] / 2 - width / 2)
         a[1 - axis], b[1 - axis], b[2] = along - width / 2, along + width / 2, height
         builder.add_box(a, b, Surface.FENCE)
         at = a + (b - a) * rng.uniform(0.1, 0.6, 3)

@@ -18,7 +18,7 @@ from lslam.core.geometry import portable, se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import interpolating_spline
 
-SPACING = 0.02  # s between the knots: scans at 10 Hz fall on knots, where the spline meets the path exactly
+KNOT_STEP_S = 0.02  # s between the knots: scans at 10 Hz fall on knots, where the spline meets the path exactly
 STANDING_ACCELERATION = 2.0  # m/s2, the most that moving off from a standing start adds
 _EDGE = 1e-6  # s by which a query may overstep the ends: rounding of stamps to ns
 SINES = 12  # on each axis
@@ -132,7 +132,7 @@ class StandingStart:
         return np.asarray(self.ramp * grown + np.maximum(since - self.ramp, 0))
 
 
-def smooth_motion(path: PosePath, spacing: float = SPACING) -> Motion:
+def smooth_motion(path: PosePath, spacing: float = KNOT_STEP_S) -> Motion:
     """Differentiable motion through the poses of `path` every `spacing` s."""
     knots = np.arange(max(int(path.duration / spacing), 8) + 1) * spacing
     # A last step that is shorter than half of the others would make the spline swing.

@@ -21,7 +21,7 @@ from lslam.simulation.terrain import Terrain
 MODELS = 6  # different cars and different people
 BUS = (11.0, 2.5, 3.3)  # m
 LANE = 3.2  # m
-NEAREST = 2.3  # m that the middle of anything moving keeps from the LiDAR's line on the ground
+NEAREST_M = 2.3  # m that the middle of anything moving keeps from the LiDAR's line on the ground
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def add_traffic(
     pavement: float,
     speed: float,
 ) -> list[Mover]:
-    """Cars and pedestrians on `streets`; none comes within `NEAREST` m of the LiDAR's `line`.
+    """Cars and pedestrians on `streets`; none comes within `NEAREST_M` m of the LiDAR's `line`.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def _keeps_clear(body: Mover, times: Floats, ego: Floats) -> bool:
     apart = portable.hypot(*(at - ego[:, :3, 3])[:, :2].T)
     # What flies high above is in nobody's way.
     beside = np.abs(at[:, 2] - ego[:, 2, 3]) < 3.5
-    return not bool(np.any(beside & (apart < NEAREST)))
+    return not bool(np.any(beside & (apart < NEAREST_M)))
 
 
 def _limb(low: Floats, high: Floats, half: float) -> list[list[Floats]]:

@@ -12,19 +12,19 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
-from lslam.simulation.city import KERB, MARGIN, City, Layout, Lots, add_garden_trees, add_street_furniture
+from lslam.simulation.city import KERB, MARGIN_M, City, Layout, Lots, add_garden_trees, add_street_furniture
 from lslam.simulation.curve import RouteCurve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 from lslam.simulation.town import CAR_LENGTH, Network, Places, add_road
 
-CELL = 1.0  # m, of the ground
+GROUND_CELL_M = 1.0  # m, of the ground
 MOST_CELLS = 1_500_000
 BESIDE_KERB = 0.05  # m that the grass ends below the pavement
 UNDER_ROAD = 0.2  # m that the ground lies lower where a road covers it
 AIR = {True: 1.0, False: 0.5}  # m between walls and a parked car, or anything else
-DEPTH = 0.5  # m, walls reach below the lowest ground at their foot
-STOREY = 3.0  # m
+FOUNDATION_M = 0.5  # m, walls reach below the lowest ground at their foot
+STOREY_M = 3.0  # m
 PARAPET = 0.4  # m of wall above a flat roof
 OVERHANG = 0.3  # m, eaves beyond the walls
 SLAB = 0.2  # m, the roof of a canopy
@@ -110,8 +110,8 @@ def _add_ground(
     places = [footprint.outer for building in buildings for footprint in building.footprints]
     places += [street.position(street.sample(2.0)) for street in (network.streets if network else ())]
     everything = np.concatenate(places)
-    low, high = everything.min(0) - MARGIN, everything.max(0) + MARGIN
-    cell = max(CELL, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
+    low, high = everything.min(0) - MARGIN_M, everything.max(0) + MARGIN_M
+    cell = max(GROUND_CELL_M, float(np.sqrt(np.prod(high - low) / MOST_CELLS)))
     x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     z = terrain.height(xy) + rng.normal(0, 0.01, xy.shape[:2])
@@ -179,7 +179,7 @@ def likely_height(building: Building, rng: np.random.Generator) -> float:
     """Plausible height, m, for a building without height tags: small ones are garages, large ones have more storeys."""
     if building.area < 45:
         return round(float(rng.uniform(2.4, 3.0)), 1)
-    return STOREY * float(rng.integers(2, 4 if building.area < 250 else 6))
+    return STOREY_M * float(rng.integers(2, 4 if building.area < 250 else 6))
 
 
 def extrude(builder: MeshBuilder, building: Building, low: float, high: float, rng: np.random.Generator) -> None:
@@ -201,9 +201,9 @@ def extrude(builder: MeshBuilder, building: Building, low: float, high: float, r
     top, base = high + building.height, high + building.base
     for footprint in building.footprints:
         if is_canopy(building):
-            _canopy(builder, footprint, low - DEPTH, top)
+            _canopy(builder, footprint, low - FOUNDATION_M, top)
             continue
-        bottom = base if building.base > 0 else low - DEPTH
+        bottom = base if building.base > 0 else low - FOUNDATION_M
         gable = _gable(building, footprint, style)
         eaves = top if gable is None else top - gable.rise
         for ring in footprint.rings:
@@ -237,13 +237,13 @@ def _facade(
         return np.stack([at(u0, i0, z0), at(u1, i1, z1), at(u1, i1, z2), at(u0, i0, z3)], axis=1)
 
     count = int((length - 1.0) // style.spacing)
-    storeys = int((top - floor - 0.2) // STOREY)
+    storeys = int((top - floor - 0.2) // STOREY_M)
     if count < 1 or storeys < 1:
         builder.add_quads(quads(0.0, length, (bottom, bottom, top, top), 0.0, 0.0), Surface.WALL)
         return
     centres = length / 2 + (np.arange(count) - (count - 1) / 2) * style.spacing
     left, right = centres - style.window / 2, centres + style.window / 2
-    sills = (floor + style.sill + STOREY * np.arange(storeys))[:, None]
+    sills = (floor + style.sill + STOREY_M * np.arange(storeys))[:, None]
     heads = sills + (style.head - style.sill)
     bands = np.append(bottom, heads), np.append(sills, top)
     r = style.recess

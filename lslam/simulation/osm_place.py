@@ -29,12 +29,12 @@ from lslam.simulation.terrain import Terrain
 log = logging.getLogger("lslam")
 
 
-REACH = 150.0  # m from the path: what stands farther away, no LiDAR here sees
+VISIBLE_M = 150.0  # m from the path: what stands farther away, no LiDAR here sees
 SIDE_ROADS = 100.0  # m from the path
-FARTHEST = 10_000.0  # m from the origin: beyond, single precision would blur the walls
+FARTHEST_M = 10_000.0  # m from the origin: beyond, single precision would blur the walls
 ELBOW_ROOM = 1.3  # m between a street's lane and the walls beside it
 _PROBE = 0.2  # s
-CELL = 1.0  # m, of the raster of distances to walls
+DISTANCE_CELL_M = 1.0  # m, of the raster of distances to walls
 SHIFT = 4.0  # m between the places that are tried
 HEADINGS = 72
 SEEN = 50.0  # m: a place on the line counts when a wall is that near; nothing is known farther from the map
@@ -45,9 +45,9 @@ DRIVABLE = (
 WALKABLE = (*DRIVABLE, "pedestrian", "footway", "path", "cycleway", "track")
 HEADROOM = 3.0  # m; below a building that begins higher one passes
 BUILT_UP = 60.0  # m from a building: beyond, a route would leave what the extract shows
-LONGEST = 1500.0  # m of a route found by ourselves
-SHORTEST = 20.0  # m of a road worth paving
-ROUNDING = 3.0  # m, of the corners of ways
+LONGEST_ROUTE_M = 1500.0  # m of a route found by ourselves
+SHORTEST_ROAD_M = 20.0  # m of a road worth paving
+CORNER_RADIUS_M = 3.0  # m, of the corners of ways
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def read_extract(path: Path, origin: NDArray[Any] | None = None) -> MapExtract:
     data, extract = read_buildings(path, origin)
     corners = np.concatenate([footprint.outer for b in extract.buildings for footprint in b.footprints])
     away = float(np.linalg.norm(corners, axis=1).min())
-    if away > FARTHEST:
+    if away > FARTHEST_M:
         lat, lon = extract.origin[:2]
         raise InputError(
             f"{path}: its nearest building is {away / 1000:.1f} km away from the origin ({lat:.5f},{lon:.5f}): check --origin"
@@ -100,7 +100,7 @@ def city_of_map(
     found, layout, flies = extract.buildings, scenario.layout, scenario.carrier == "drone"
     buildings = found.buildings
     if route is not None:
-        buildings = buildings_near(found, route.line.position(route.line.sample(5.0)), REACH)
+        buildings = buildings_near(found, route.line.position(route.line.sample(5.0)), VISIBLE_M)
     # Below a flight there are only the roads of the map: it may pass over anything.
     driven = [] if route is None or flies else [route.street]
     roads = side_roads(
@@ -205,23 +205,23 @@ def _distances(buildings: Sequence[Building]) -> tuple[Floats, NDArray[np.float3
     from scipy.ndimage import distance_transform_edt
     from shapely import contains_xy
 
-    solid = solid_ground(buildings, 0.5 * CELL)
+    solid = solid_ground(buildings, 0.5 * DISTANCE_CELL_M)
     bounds = np.array(solid.bounds).reshape(2, 2) + np.array([[-SEEN], [SEEN]])
-    x, y = (np.arange(bounds[0, k], bounds[1, k], CELL) for k in (0, 1))
+    x, y = (np.arange(bounds[0, k], bounds[1, k], DISTANCE_CELL_M) for k in (0, 1))
     inside = contains_xy(solid, *np.meshgrid(x, y, indexing="ij"))
-    return bounds[0], np.asarray(CELL * distance_transform_edt(~inside), np.float32)
+    return bounds[0], np.asarray(DISTANCE_CELL_M * distance_transform_edt(~inside), np.float32)
 
 
 def _free_shifts(line: Floats, low: Floats, distance: NDArray[np.float32], margin: float) -> tuple[Floats, Longs]:
     """Shifts (M, 2) on a grid that keep all of `line` (N, 2) on free ground, and how many of its points are near walls then."""
-    size = CELL * np.array(distance.shape)
+    size = DISTANCE_CELL_M * np.array(distance.shape)
     x, y = (np.arange(low[k], low[k] + size[k], SHIFT) for k in (0, 1))
     shifts = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     seen = np.zeros(len(shifts), np.int64)
     # From far apart to near: most shifts fail at the first few points.
     order = np.concatenate([np.arange(k, len(line), 16) for k in range(16)])
     for point in line[order]:
-        cell = np.floor((shifts + point - low) / CELL).astype(np.int64)
+        cell = np.floor((shifts + point - low) / DISTANCE_CELL_M).astype(np.int64)
         on_map = ((cell >= 0) & (cell < distance.shape)).all(axis=1)
         away = distance[tuple(np.where(on_map[:, None], cell, 0).T)]
         free = on_map & (away > margin)
@@ -273,7 +273,7 @@ def find_route(
     if line is None or _length(line) < 50:
         return None
     # A right angle smoothed by sigma has the radius 0.89 sigma.
-    curve = smooth_curve(line, closed=False, smoothing=max(ROUNDING, 1.2 * radius))
+    curve = smooth_curve(line, closed=False, smoothing=max(CORNER_RADIUS_M, 1.2 * radius))
     s = curve.sample(1.0)
     clear = np.asarray(distance(points(curve.position(s)), walls)) > margin
     good = clear & (np.abs(curve.curvature(s)) * radius < 1)
@@ -282,7 +282,7 @@ def find_route(
     if not len(runs):
         return None
     begin, end = runs[int(np.argmax(runs[:, 1] - runs[:, 0]))]
-    end = min(end, begin + int(LONGEST))
+    end = min(end, begin + int(LONGEST_ROUTE_M))
     return curve.position(s[begin:end]) if end - begin >= 50 else None
 
 
@@ -299,8 +299,10 @@ def side_roads(
         line = LineString(along.position(along.sample(1.0)))
         lines = lines.intersection(line.buffer(reach)).difference(line.buffer(apart, cap_style="flat"))
     merged = line_merge(lines) if lines.geom_type == "MultiLineString" else lines
-    parts = [p for p in getattr(merged, "geoms", [merged]) if p.geom_type == "LineString" and p.length >= SHORTEST]
-    return [smooth_curve(np.array(part.coords), closed=False, smoothing=ROUNDING) for part in parts]
+    parts = [
+        p for p in getattr(merged, "geoms", [merged]) if p.geom_type == "LineString" and p.length >= SHORTEST_ROAD_M
+    ]
+    return [smooth_curve(np.array(part.coords), closed=False, smoothing=CORNER_RADIUS_M) for part in parts]
 
 
 def _is_open_ground(tags: Mapping[str, str]) -> bool:

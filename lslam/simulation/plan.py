@@ -13,7 +13,7 @@ from lslam.simulation.scene_mesh import RayScene, Surface
 
 Image = NDArray[np.uint8]
 
-LARGEST = 2000  # pixels on a side
+LARGEST_PIXELS = 2000  # pixels on a side
 FINEST = 0.1  # m per pixel
 BORDER = 25.0  # m round buildings and path
 FINE, COARSE = 10, 50  # m between the lines of the grid
@@ -66,7 +66,7 @@ class ScenePlan:
 def plan_of(scene: RayScene, city: City, line: Floats) -> ScenePlan:
     """Top view of `city` with the path `line` (M, 3), m, in the city frame; (0, 3) for none."""
     low, high = _extent(city, line)
-    pixel = max(float((high - low).max()) / LARGEST, FINEST)
+    pixel = max(float((high - low).max()) / LARGEST_PIXELS, FINEST)
     image, surfaces = _view(scene, low, high, pixel)
     _draw_grid(image, low, pixel)
     if len(line):

@@ -25,7 +25,7 @@ LAYERS = 8  # surfaces of volumes that a beam passes, at most
 _BEYOND = np.float32(1e-3)  # m behind a surface from which a ray goes on
 VOLUMES = (Surface.CROWN, Surface.HEDGE)
 Array = NDArray[np.float32]
-CELL = 0.15  # m of one bump of a surface's texture
+BUMP_M = 0.15  # m of one bump of a surface's texture
 FLATTEST = 0.1  # cosine of incidence: what is met still flatter errs no more than there
 REFERENCE = 0.4  # share of light that comes back at which a LiDAR's ranges are calibrated
 SLANT = 2.0  # times the step of a slanted surface between two rays: more is an edge
@@ -223,8 +223,8 @@ def range_walk(returns: Returns, brightness: Array) -> Array:
 
 
 def texture(places: Array) -> Array:
-    """(N,) standard normal surface heights at (N, 3) places, m: one per cell of `CELL` m, the same on every visit."""
-    cell = np.floor(places / np.float32(CELL)).astype(np.int32)
+    """(N,) standard normal surface heights at (N, 3) places, m: one per cell of `BUMP_M` m, the same on every visit."""
+    cell = np.floor(places / np.float32(BUMP_M)).astype(np.int32)
     # Teschner et al. 2003, a hash of cells in space; int32 wraps.
     mix = cell[:, 0] * np.int32(73856093) ^ cell[:, 1] * np.int32(19349663) ^ cell[:, 2] * np.int32(83492791)
     return np.asarray(_bumps()[(mix ^ (mix >> 15)) & (_TABLE - 1)])

@@ -24,12 +24,12 @@ from lslam.simulation.scenario_files import SHAPES, Scenario, out_and_back
 from lslam.simulation.terrain import flat
 
 SPARE = 60.0  # m of street before the start and after the end of an open line
-TURN = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock
+TURN_RADIUS_M = 6.0  # m, radius of the U-turn of an out-and-back: a car on full lock
 HALL = 46.0  # m that eights are flown in, when no length is given
 HOLD = 5.0  # s at full speed on each of its straights, at least
-LONGEST = 3000.0  # m that many scans make of it: the fine ground beside it must fit into memory
+LONGEST_M = 3000.0  # m that many scans make of it: the fine ground beside it must fit into memory
 TIGHTEST = {"car": 3.0, "drone": 1.0, "walker": 0.3}  # m, radius of a bend
-APART = 3.0  # m between the way-points taken from a trajectory
+WAYPOINTS_APART_M = 3.0  # m between the way-points taken from a trajectory
 LONGEST_STEP_M = 50_000.0  # m between neighbours
 
 
@@ -160,13 +160,13 @@ def _street(rng: np.random.Generator) -> Route:
 def _out_and_back(scenario: Scenario, scans: int | None) -> Route:
     """Path of the scenario's length, or long enough to reach the speed and brake for the turn, or for `scans`."""
     profile, path = speed_profile(scenario), scenario.path
-    slow = min(profile.cruise, float(np.sqrt(profile.lateral * TURN)))
+    slow = min(profile.cruise, float(np.sqrt(profile.lateral * TURN_RADIUS_M)))
     speeding = (profile.cruise**2 - profile.start**2) / (2 * profile.acceleration)
     braking = (profile.cruise**2 - slow**2) / (2 * profile.braking)
-    length = max(path.length or 0.0, 2 * (speeding + HOLD * profile.cruise + braking) + np.pi * TURN)
-    longest = max(LONGEST, length)
+    length = max(path.length or 0.0, 2 * (speeding + HOLD * profile.cruise + braking) + np.pi * TURN_RADIUS_M)
+    longest = max(LONGEST_M, length)
     while True:
-        street = smooth_curve(out_and_back(length, TURN), False, path.smoothing)
+        street = smooth_curve(out_and_back(length, TURN_RADIUS_M), False, path.smoothing)
         line = beside(street, -path.lane)
         still = suspension(np.random.default_rng(0), 0.0, 0.0)
         takes = drive(line, flat(), profile, line.length, scenario.lidar_height, still).duration
@@ -308,7 +308,7 @@ def _from_trajectory(path: Path) -> WayPoints:
     xy = np.column_stack([p[:, 2], -p[:, 0]]) if trajectory.frame == "cam0" else p[:, :2]
     kept = [0]
     for i in range(len(xy)):
-        if portable.norm(xy[i] - xy[kept[-1]]) >= APART:
+        if portable.norm(xy[i] - xy[kept[-1]]) >= WAYPOINTS_APART_M:
             kept.append(i)
     xy = xy[kept] - xy[0]
     if len(xy) > 1:

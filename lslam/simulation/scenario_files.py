@@ -26,7 +26,7 @@ from lslam.simulation.returns import Returns
 
 Shape = Callable[[np.random.Generator], Floats]
 
-STEP = 1.0  # m between the points of arcs
+ARC_M = 1.0  # m between the points of arcs
 _CLOSED = [(0, 0), (190, 0), (235, 25), (235, 150), (120, 150), (120, 95), (0, 95)]
 _OPEN = [(0, 0), (125, 0), (125, 105), (260, 125), (300, 190)]
 _RESIDENTIAL = [
@@ -73,7 +73,7 @@ def _arc(corner: Floats, a: Floats, b: Floats, half: float, reach: float) -> Flo
     centre = corner + middle * radius / portable.sin(half)
     start, end = corner + reach * a - centre, corner + reach * b - centre
     turn = portable.arctan2(start[0] * end[1] - start[1] * end[0], portable.dot(start, end))
-    count = max(int(abs(turn) * radius / STEP), 3)
+    count = max(int(abs(turn) * radius / ARC_M), 3)
     angle = portable.arctan2(start[1], start[0]) + np.linspace(0, turn, count + 1)
     return np.asarray(centre + radius * np.stack([portable.cos(angle), portable.sin(angle)], axis=1))
 
@@ -98,18 +98,18 @@ def _until_shared(line: Floats) -> Floats:
 
 def spiral(approach: float, radius: float, turns: float) -> Floats:
     """Line (N, 2), m: a straight approach along +x, then `turns` left turns at a nearly constant radius."""
-    angle = np.linspace(0, 2 * np.pi * turns, int(2 * np.pi * turns * radius / STEP))
+    angle = np.linspace(0, 2 * np.pi * turns, int(2 * np.pi * turns * radius / ARC_M))
     # The radius shrinks a little, so that it is nearly but not quite a helix.
     r = radius * (1 - 0.06 * angle / angle[-1])
     circle = np.stack([r * portable.sin(angle), radius - r * portable.cos(angle)], axis=1)
-    straight = np.column_stack([np.arange(-approach, -0.5 * STEP, STEP), np.zeros(int(np.ceil(approach / STEP)))])
+    straight = np.column_stack([np.arange(-approach, -0.5 * ARC_M, ARC_M), np.zeros(int(np.ceil(approach / ARC_M)))])
     return np.concatenate([straight, circle])
 
 
 def out_and_back(length: float, radius: float) -> Floats:
     """Line (N, 2), m: along +x, a left U-turn of `radius` m, and back; `length` m in all, 10 m of it straight."""
     straight = max(0.5 * (length - np.pi * radius), 5.0)
-    angle = np.linspace(-np.pi / 2, np.pi / 2, max(int(np.pi * radius / STEP), 8) + 1)
+    angle = np.linspace(-np.pi / 2, np.pi / 2, max(int(np.pi * radius / ARC_M), 8) + 1)
     turn = np.array([straight, radius]) + radius * np.stack([portable.cos(angle), portable.sin(angle)], axis=1)
     return np.concatenate([[[0.0, 0.0]], turn, [[0.0, 2 * radius]]])
 

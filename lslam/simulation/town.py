@@ -24,9 +24,9 @@ from lslam.simulation.curve import RouteCurve, smooth_curve
 from lslam.simulation.scene_mesh import MeshBuilder, Surface, grid_faces
 from lslam.simulation.terrain import Terrain
 
-SHORTEST = 30.0  # m of a side street
-LONGEST = 110.0
-ROW = 12.0  # m left between streets for a row of houses
+SHORTEST_SIDE_M = 30.0  # m of a side street
+LONGEST_SIDE_M = 110.0
+ROW_M = 12.0  # m left between streets for a row of houses
 CAR_LENGTH = 5.2  # m kept between the middles of parked cars
 
 
@@ -109,7 +109,7 @@ class Places:
 
 def _shorten(street: RouteCurve, by: float) -> RouteCurve:
     """Open street without its first and last metres; returned unchanged if it is too short."""
-    if street.closed or street.length < 2 * by + SHORTEST / 2:
+    if street.closed or street.length < 2 * by + SHORTEST_SIDE_M / 2:
         return street
     s = np.linspace(by, street.length - by, max(int(street.length), 12))
     return smooth_curve(street.position(s), closed=False)
@@ -129,7 +129,7 @@ def _side_streets(
             while s < street.length - 0.3 * spacing:
                 at = np.array([s])
                 s += spacing * rng.uniform(0.75, 1.3)
-                turn, length = rng.normal(0, 0.07), rng.uniform(0.5, 1.0) * LONGEST
+                turn, length = rng.normal(0, 0.07), rng.uniform(0.5, 1.0) * LONGEST_SIDE_M
                 if abs(float(street.curvature(at)[0])) > 0.02:
                     continue
                 tangent = street.tangent(at)[0] * side
@@ -147,11 +147,11 @@ def _until_met(start: Floats, ray: Floats, length: float, taken: Any, layout: La
     steps = np.arange(0.0, length, 0.5)
     points = start + steps[:, None] * ray
     away = np.asarray(taken.query(points)[0])
-    room = 2 * layout.band + ROW
+    room = 2 * layout.band + ROW_M
     clear = steps > 1.25 * room
     met = np.flatnonzero(clear & (away < 0.5))
     end = int(met[0]) + 1 if len(met) else len(steps)
-    if steps[end - 1] < SHORTEST:
+    if steps[end - 1] < SHORTEST_SIDE_M:
         return None
     # Only where it meets another street may it come near to one: beside it there would be no room for houses.
     near = np.count_nonzero(clear[:end] & (away[:end] < room)) * 0.5

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.outcome import AROUND, BackEnd, view_loop
+from lslam.backend.outcome import CLOUD_KEYFRAMES, BackEnd, view_loop
 from lslam.core.geometry import se3
 from lslam.core.types.constraint import Constraint, LoopCandidate, Verdict
 from lslam.core.types.run_record import RunRecord
@@ -66,9 +66,9 @@ def test_the_loop_that_was_corrected_most_is_shown(record: RunRecord, store: Key
     back = se3.inverse(record.T_final_odometry)
     walls = [se3.apply(back, place.points)[:, 1] for place in (view.before, view.after)]
     np.testing.assert_allclose(walls[1], WALL, atol=1e-5)
-    drifted = WALL + DRIFT * np.r_[0 : 5 + AROUND + 1, 54 - AROUND : COUNT]
+    drifted = WALL + DRIFT * np.r_[0 : 5 + CLOUD_KEYFRAMES + 1, 54 - CLOUD_KEYFRAMES : COUNT]
     np.testing.assert_allclose(np.unique(walls[0].round(4)), drifted, atol=1e-3)
-    assert (len(view.after.older), len(view.after.newer)) == (5 + AROUND + 1, COUNT - 54 + AROUND)
+    assert (len(view.after.older), len(view.after.newer)) == (5 + CLOUD_KEYFRAMES + 1, COUNT - 54 + CLOUD_KEYFRAMES)
     np.testing.assert_allclose(view.after.centre, record.trajectory.positions[10, :2])
 
 

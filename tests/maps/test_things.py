@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lslam.maps.clean import ABOVE, GAP, REACH, SQUARE, Floor, floor_of, standing, things_of, whole
+from lslam.maps.clean import ABOVE, GAP, REACH_M, SQUARE, Floor, floor_of, standing, things_of, whole
 
 SENSOR = np.array([1234.5, -987.25, 40.0])
 
@@ -60,13 +60,13 @@ def test_floors_are_the_lowest_of_each_square_whoever_saw_it() -> None:
     clouds[0][:2] = [[np.nan] * 3, [np.inf] * 3]
     lowest: dict[tuple[int, int], float] = {}
     for points, sensor in zip(clouds, sensors, strict=True):
-        for p in points[np.abs(points).max(axis=1) < REACH]:
+        for p in points[np.abs(points).max(axis=1) < REACH_M]:
             square = tuple(np.floor((p[:2] + sensor[:2]) / SQUARE).astype(int).tolist())
             lowest[square] = min(lowest.get(square, np.inf), float(p[2] + sensor[2]))
     points, floors = clouds[0], [floor_of(p, s) for p, s in zip(clouds, sensors, strict=True)]
     labels = things_in(points, SENSOR, floors)
     for p, label in zip(points, labels, strict=True):
-        if not np.abs(p).max() < REACH:
+        if not np.abs(p).max() < REACH_M:
             assert label == 0
             continue
         x, y = np.floor((p[:2] + SENSOR[:2]) / SQUARE).astype(int)
@@ -85,7 +85,7 @@ def test_two_things_are_one_only_by_what_is_chosen() -> None:
 
 
 def test_nothing_in_reach_is_nothing() -> None:
-    far = np.full((5, 3), 2 * REACH, np.float32)
+    far = np.full((5, 3), 2 * REACH_M, np.float32)
     for points in (far, far[:0], far * np.float32(np.nan)):
         assert things_in(points, SENSOR, [floor_of(points, SENSOR)]).tolist() == [0] * len(points)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from test_wall_drift import MAP, SEEN, WAY, odometry, sighted
 
-from lslam.backend.graph.drift import LASTING, MEMORY, SIZES, linear_basis, rate_roots, walk_root
+from lslam.backend.graph.drift import LASTING, MEMORY_M, SIZES, linear_basis, rate_roots, walk_root
 from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.problem import PoseGraph
 from lslam.core.config.backend import GraphConfig
@@ -140,13 +140,13 @@ def test_five_copies_with_weight_one_fifth_equal_one() -> None:
 
 @pytest.mark.parametrize(("length", "apart"), [(366.0, 20.0), (2000.0, 50.0)])
 def test_wandering_rates_have_the_variance_of_a_random_walk(length: float, apart: float) -> None:
-    """Its variance grows with the way, and over `MEMORY` it is that of rates that last as long."""
+    """Its variance grows with the way, and over `MEMORY_M` it is that of rates that last as long."""
     way = np.arange(0.0, length, 2.0)
     moves = 2.0 * np.cumsum(linear_basis(way, apart), axis=0)
     root = walk_root(float(way[-1]), GraphConfig(), PLANAR, apart)[::3, ::3]
     variance = np.einsum("kn,nm,km->k", moves, root @ root.T, moves)
     middle = slice(len(way) // 3, 2 * len(way) // 3)
-    np.testing.assert_allclose(variance[middle], 0.01**2 * MEMORY * way[1:][middle], rtol=0.2)
+    np.testing.assert_allclose(variance[middle], 0.01**2 * MEMORY_M * way[1:][middle], rtol=0.2)
 
 
 @pytest.mark.parametrize("seed", [0, 2])

@@ -13,7 +13,7 @@ from shapely.affinity import rotate, scale, translate
 from wall_scenes import box_at
 
 from lslam.core.types.building import Building, Footprint, footprint_polygon
-from lslam.osm.overlap import STEEPEST, Untangled, remove_overlaps
+from lslam.osm.overlap import LARGEST_TURN_RAD, Untangled, remove_overlaps
 
 Floats = NDArray[np.float64]
 
@@ -110,7 +110,7 @@ def test_rotations_to_align_party_walls_are_bounded() -> None:
     found = remove_overlaps(pair, np.array([[0, 0, 0], [0, 0, np.radians(45)]]), information([True, False]))
     check_apart(pair, found)
     assert np.abs(found.displacements[:, 2] - [0, np.radians(45)]).max() < np.radians(1)
-    assert np.degrees(STEEPEST) == pytest.approx(60)
+    assert np.degrees(LARGEST_TURN_RAD) == pytest.approx(60)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -7,7 +7,7 @@ import pytest
 
 import lslam
 from lslam.core.geometry import se3
-from lslam.simulation.indoors import SIZE
+from lslam.simulation.indoors import ROOM_M
 from lslam.simulation.scenarios import simulate
 
 
@@ -15,7 +15,9 @@ from lslam.simulation.scenarios import simulate
 def test_all_points_lie_in_the_room_and_half_of_them_within_three_metres(seed: int) -> None:
     drive = simulate("room", seed=seed, count=3, lidar="os1-16", motion_compensated=True)
     points = np.concatenate([se3.apply(drive.city_poses[i], drive.scan(i).points) for i in range(3)])
-    assert np.mean((np.abs(points[:, :2]) < SIZE[:2] / 2 + 0.1).all(axis=1) & (points[:, 2] < SIZE[2] + 0.1)) > 0.999
+    assert (
+        np.mean((np.abs(points[:, :2]) < ROOM_M[:2] / 2 + 0.1).all(axis=1) & (points[:, 2] < ROOM_M[2] + 0.1)) > 0.999
+    )
     assert 1.0 < np.median(np.linalg.norm(drive.scan(0).points, axis=1)) < 3.0
 
 

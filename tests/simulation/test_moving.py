@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lslam.simulation.curve import smooth_curve
 from lslam.simulation.lidar import MovingMesh, Roof, trace
 from lslam.simulation.lidar_models import LIDARS, LidarModel
-from lslam.simulation.moving import NEAREST, Mover, add_traffic, moving_meshes, pedestrian
+from lslam.simulation.moving import NEAREST_M, Mover, add_traffic, moving_meshes, pedestrian
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.scene_mesh import MeshBuilder, RayScene, SceneMesh, Surface
 from lslam.simulation.terrain import flat, rolling
@@ -259,7 +259,7 @@ def test_traffic_keeps_clear_of_the_line() -> None:
         at = mover.poses(times)[:, :3, 3]
         present = at[:, 2] > -100
         apart = np.linalg.norm((at - line(times)[:, :3, 3])[present, :2], axis=1)
-        assert apart.min(initial=np.inf) > NEAREST - 0.5
+        assert apart.min(initial=np.inf) > NEAREST_M - 0.5
     assert any(mover.offset == 1.7 and mover.speed < 0 for mover in movers)
 
 

@@ -22,7 +22,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 
 # Neighbours that each loop closure is tested against, and the share that must agree.
-NEIGHBOURS, SHARE = 16, 0.5
+COMPARED_LOOPS, SHARE = 16, 0.5
 # m and rad, error of a loop closure beyond its covariance: its scans are deskewed and downsampled.
 SLACK_M, SLACK_RAD = 0.03, np.deg2rad(0.1)
 # Positions sampled on the way between two keyframes.
@@ -116,7 +116,7 @@ def _voted_out(graph: PoseGraph, ends: Ends, drift: Drift, limit: float) -> list
     from scipy.spatial import cKDTree
 
     where = np.column_stack([drift.distances[ends.a], drift.distances[ends.b]])
-    k = min(NEIGHBOURS, len(where) - 1)
+    k = min(COMPARED_LOOPS, len(where) - 1)
     _, neighbours = cKDTree(where).query(where, k + 1, p=1)
     others = np.array([row[row != i][:k] for i, row in enumerate(np.asarray(neighbours))])
     first = np.repeat(np.arange(len(where)), k)

@@ -22,7 +22,7 @@ from lslam.core.types.constraint import Constraint
 # Loop closures used at most, evenly spread, and bounds of the factor on the drift's variance.
 MOST, SMALLEST, LARGEST = 300, 1e-8, 1e8
 # m, correlation length of a rate.
-MEMORY = 100.0
+MEMORY_M = 100.0
 # Hyperparameters tried: share of the variance of rates that is constant over the run, and scale of the configured drift.
 LASTING, SIZES = (0.5, 0.9, 0.99), (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 
@@ -200,7 +200,7 @@ def _length(constraint: Constraint) -> float:
     return float(np.linalg.norm(constraint.T_a_b[:3, 3]))
 
 
-def linear_basis(distances: Floats, apart: float = MEMORY) -> Floats:
+def linear_basis(distances: Floats, apart: float = MEMORY_M) -> Floats:
     """(K-1, n) linear (hat) basis functions of the knots, halfway between keyframes reached after `distances` (K,), m.
 
     apart : m from knot to knot at the most
@@ -210,7 +210,7 @@ def linear_basis(distances: Floats, apart: float = MEMORY) -> Floats:
 
 
 def rate_roots(
-    length: float, config: GraphConfig, axes: list[int], lasting: tuple[float, ...] = LASTING, apart: float = MEMORY,
+    length: float, config: GraphConfig, axes: list[int], lasting: tuple[float, ...] = LASTING, apart: float = MEMORY_M,
     is_smooth: bool = True,
 ) -> list[Floats]:  # fmt: skip
     """(n d, n d) each, square roots of the prior covariance of the rates at the knots over `length` m, per constant share.
@@ -220,16 +220,16 @@ def rate_roots(
     is_smooth : whether the varying part has a squared exponential kernel; else it is a Markov process
     """
     knots = _knots(length, apart)
-    gap = np.abs(knots[:, None] - knots) / MEMORY
+    gap = np.abs(knots[:, None] - knots) / MEMORY_M
     alike = np.exp(-0.5 * gap**2 if is_smooth else -gap)
     size = _prior_sigmas(config, axes)
     return [np.asarray(np.kron(np.linalg.cholesky(share + (1.0 - share) * alike), size)) for share in lasting]
 
 
 def walk_root(length: float, config: GraphConfig, axes: list[int], apart: float) -> Floats:
-    """(n d, n d) as `rate_roots`, of independent rates: a random walk, over `MEMORY` as far as constant rates."""
+    """(n d, n d) as `rate_roots`, of independent rates: a random walk, over `MEMORY_M` as far as constant rates."""
     knots = _knots(length, apart)
-    times = np.sqrt(MEMORY / (knots[1] - knots[0]))
+    times = np.sqrt(MEMORY_M / (knots[1] - knots[0]))
     return np.asarray(np.kron(times * np.eye(len(knots)), _prior_sigmas(config, axes)))
 
 

@@ -30,7 +30,7 @@ TILT = [3, 4]
 # First key of the correlated noise of fixes, beyond all others.
 FIX_NOISE = 1 << 40
 # Correlation times after which an error is independent.
-LONG = 20.0
+CORRELATION_TIMES = 20.0
 # Least sigmas of a constraint, m and rad, for the optimiser's arithmetic.
 SMALLEST = np.array([1e-4, 1e-4, 1e-4, 1e-5, 1e-5, 1e-5])
 
@@ -238,7 +238,7 @@ def _add_fix_noise(factors: Any, fix_noise: GaussMarkovNoise) -> None:
     """
     import gtsam
 
-    steps = np.minimum(np.diff(fix_noise.seconds) / fix_noise.memory, LONG)
+    steps = np.minimum(np.diff(fix_noise.seconds) / fix_noise.memory, CORRELATION_TIMES)
     memory, driven = np.exp(-steps), -np.expm1(-2 * steps)
     own = np.append(1.0, 1 / (1 + memory))
     own[:-1] -= memory / (1 + memory)

@@ -21,13 +21,13 @@ from lslam.core.types.arrays import Bools, Floats
 # Size of the covariance: more fixes are averaged in groups.
 MOST = 60
 # Step of logarithms: finer than any of these numbers can be estimated.
-STEP = 0.1
+LOG_STEP = 0.1
 # Factors on odometry's drift.
-FACTORS = np.concatenate([[0.0], np.exp(np.arange(np.log(1e-3), np.log(1e5), STEP))])
+FACTORS = np.concatenate([[0.0], np.exp(np.arange(np.log(1e-3), np.log(1e5), LOG_STEP))])
 # Gain of the likelihood that pays for the one parameter of drift (Akaike 1974), where fixes are believed.
 AKAIKE = 1.0
 # Window of the median filter against outliers that the alignment accepts.
-AROUND = 7
+SMOOTHED_FIXES = 7
 # Instants of the error in the graph, at most; a fix has that of the nearest.
 INSTANTS = 2000
 # Least white share of the variance, against singular covariances of perfect fixes.
@@ -109,7 +109,7 @@ def _near_neighbours(scaled: Floats, probability: float) -> Bools:
     """(F,) inliers of `scaled` (F, 2) residuals about their running median."""
     from scipy.ndimage import median_filter
 
-    off = scaled - median_filter(scaled, size=(AROUND, 1), mode="reflect")
+    off = scaled - median_filter(scaled, size=(SMOOTHED_FIXES, 1), mode="reflect")
     return np.asarray((off**2).sum(axis=1) <= quantile(probability, 2))
 
 
@@ -171,7 +171,7 @@ def _interpolated(grid: Floats, likelihoods: Floats, axis: int) -> tuple[Floats,
 
     if len(grid) == 1:
         return grid, likelihoods
-    dense = np.geomspace(grid[0], grid[-1], 1 + round(float(np.log(grid[-1] / grid[0])) / STEP))
+    dense = np.geomspace(grid[0], grid[-1], 1 + round(float(np.log(grid[-1] / grid[0])) / LOG_STEP))
     return dense, np.asarray(CubicSpline(np.log(grid), likelihoods, axis=axis)(np.log(dense)))
 
 

@@ -17,7 +17,7 @@ from lslam.core.types.arrays import Bools, Floats
 # RANSAC samples, and the least distance of a pair as a share of the largest.
 TRIALS, APART_SHARE = 500, 0.5
 # Least share of inliers.
-MAJORITY = 0.5
+MAJORITY_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def align(
     # Repeated, since outliers of the first fit may be inliers of the refined one.
     for _ in range(3):
         inliers = _fits(T, a, fixes, judged)
-        if inliers.sum() < max(min_fixes, MAJORITY * len(a)):
+        if inliers.sum() < max(min_fixes, MAJORITY_SHARE * len(a)):
             return None
         T = _refined(T, a[inliers], fixes[inliers], judged[inliers], up_sigma)
     T_enu_world = T @ se3.make(level, np.zeros(3))

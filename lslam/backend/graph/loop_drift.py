@@ -32,13 +32,13 @@ WALKS = (0.0, 1e-4, 1e-3, 0.01, 0.1, 1.0, 10.0, 100.0)
 # them. A smooth prior would be overconfident there.
 LASTS = (0.0, *LASTING, 0.9999)
 # m from knot to knot, above which varying rates differ from a random walk, and intervals at the most.
-APART, PARTS = 50.0, 100
+KNOTS_APART_M, MOST_KNOTS = 50.0, 100
 # Iterations, each linearised about the last estimate.
-ROUNDS = 4
+REWEIGHTINGS = 4
 # Keyframes whose Jacobians are held in memory at a time.
-PART = 256
+BLOCK_KEYFRAMES = 256
 # Least independent share of each variance, against rounding.
-LEAST = 1e-12
+LEAST_OWN_SHARE = 1e-12
 
 
 def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
@@ -60,7 +60,7 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
     does_last = np.repeat(LASTS, len(SIZES)) > 0.5
     straight, drift = graph, np.zeros(6 * at_knots.shape[1])
     turned = np.tile(np.eye(3), (len(graph) - 1, 1, 1))
-    for _ in range(ROUNDS):
+    for _ in range(REWEIGHTINGS):
         fit = _Fit(straight, loops, drift, turned, config)
         gain = float(fit.negative_log_likelihood[:, 0].min() - fit.negative_log_likelihood[:, 1:][:, does_last].min())
         if gain <= 0.0:
@@ -146,14 +146,14 @@ class _Fit:
 
 def _apart(distances: Floats) -> float:
     """m from knot to knot."""
-    return max(APART, float(distances[-1]) / PARTS)
+    return max(KNOTS_APART_M, float(distances[-1]) / MOST_KNOTS)
 
 
 def _negative_log_likelihood(S: Floats, off: Floats) -> float:
     """Twice the negative log-likelihood of `off` (N,) with the covariance S, up to a constant."""
     from scipy.linalg import solve_triangular
 
-    L = np.linalg.cholesky(S + LEAST * np.diag(np.diag(S)))
+    L = np.linalg.cholesky(S + LEAST_OWN_SHARE * np.diag(np.diag(S)))
     whitened = solve_triangular(L, off, lower=True, check_finite=False)
     return float(2.0 * np.log(np.diag(L)).sum() + whitened @ whitened)
 
@@ -174,8 +174,8 @@ def _effects(poses: Floats, distances: Floats, turned: Floats) -> Iterator[tuple
     passed = np.diff(distances)[:, None] * linear_basis(distances, _apart(distances))
     passed, turned = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, turned))
     before = np.zeros((6, passed.shape[1], 6))
-    for begin in checking(range(0, len(poses), PART)):
-        k = slice(begin, min(begin + PART, len(poses)))
+    for begin in checking(range(0, len(poses), BLOCK_KEYFRAMES)):
+        k = slice(begin, min(begin + BLOCK_KEYFRAMES, len(poses)))
         step = np.tile(np.eye(6), (k.stop - k.start, 1, 1))
         step[:, :3, :3] = turned[k]
         step[:, :3, 3:] = so3.hat(poses[k, :3, 3])

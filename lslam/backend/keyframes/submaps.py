@@ -54,7 +54,7 @@ def submap_labels(store: KeyframeStore, number: int, size: int) -> NDArray[np.ui
 
 
 # Keyframes in whose clouds the ground is looked for: rings of a sensor on its side cross it in a line, those of 20 m cover it.
-KEYFRAMES = 10
+GROUND_KEYFRAMES = 10
 
 
 def mounted_up(store: KeyframeStore, poses: Floats, config: PreprocessConfig) -> Floats:
@@ -64,7 +64,7 @@ def mounted_up(store: KeyframeStore, poses: Floats, config: PreprocessConfig) ->
     """
     if config.up is not None or not len(store):
         return world_up_of(config, poses[0]) if len(poses) else Z
-    middle = min(KEYFRAMES, len(store)) // 2
+    middle = min(GROUND_KEYFRAMES, len(store)) // 2
     frame = np.eye(4)
     frame[:3, 3] = poses[middle, :3, 3]
-    return find_up(submap(store, poses, middle, KEYFRAMES, T_world_frame=frame)).direction
+    return find_up(submap(store, poses, middle, GROUND_KEYFRAMES, T_world_frame=frame)).direction

@@ -12,18 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.backend.localization.prior_map import PriorMap
-from lslam.backend.loops.bev_correlation import CELL, BevGrid, Image, Spectrum, blurred, correlate, spectrum
+from lslam.backend.loops.bev_correlation import CELL_M, BevGrid, Image, Spectrum, blurred, correlate, spectrum
 from lslam.backend.loops.level_submap import LevelSubmap, make_level_submap
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
 
 # m about the sensor that is compared, and rad between two headings: a cell's width at half of it.
-WINDOW, TURN_STEP = 60.0, np.deg2rad(3.0)
+WINDOW_M, TURN_STEP = 60.0, np.deg2rad(3.0)
 # Least share of the submap's structure that must lie where the map was observed.
-SHARED = 0.5
+SHARED_SHARE = 0.5
 # m between two guesses, and how many there are at most.
-APART, GUESSES = 6.0, 10
+GUESSES_APART_M, GUESSES = 6.0, 10
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class PlaceSearch:
         from scipy import fft
 
         self.whole = make_level_submap(prior_map.points, config)
-        reach = float(np.abs(prior_map.points[:, :2]).max()) + WINDOW
-        self.grid = BevGrid(int(fft.next_fast_len(int(np.ceil(2 * reach / CELL)), real=True)))
+        reach = float(np.abs(prior_map.points[:, :2]).max()) + WINDOW_M
+        self.grid = BevGrid(int(fft.next_fast_len(int(np.ceil(2 * reach / CELL_M)), real=True)))
         seen = self.grid.cover(self.whole.non_ground, self.whole.ground)
         image = _centred(blurred(self.grid.heights(self.whole.non_ground)), seen)
         self._image, self._squares, self._seen = spectrum(image), spectrum(image**2), spectrum(seen)
@@ -53,9 +53,9 @@ class PlaceSearch:
 
     def is_near(self, position: Floats, radius: float) -> bool:
         """Whether the map was observed anywhere within `radius` m of a position (2,), level axes."""
-        at = (np.arange(self.grid.size) - self.grid.size // 2 + 0.5) * CELL
+        at = (np.arange(self.grid.size) - self.grid.size // 2 + 0.5) * CELL_M
         away2 = (at[:, None] - position[0]) ** 2 + (at[None, :] - position[1]) ** 2
-        return bool(self.is_seen.reshape(away2.shape)[away2 <= max(radius, CELL) ** 2].any())
+        return bool(self.is_seen.reshape(away2.shape)[away2 <= max(radius, CELL_M) ** 2].any())
 
     def guesses(self, query: LevelSubmap, region: Region | None = None) -> list[Floats]:
         """T_level_query (4, 4), level axes of both, of the best correlations, best first; empty without upright structure.
@@ -63,7 +63,7 @@ class PlaceSearch:
         Zero-mean normalised cross-correlation over the cells that both observed: free ground against a wall counts as much as
         a wall against free ground.
         """
-        near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < WINDOW**2] for p in (query.non_ground, query.ground))
+        near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < WINDOW_M**2] for p in (query.non_ground, query.ground))
         if not len(near):
             return []
         yaws = np.arange(0.0, 2 * np.pi - 1e-9, TURN_STEP)
@@ -88,7 +88,7 @@ class PlaceSearch:
         own = correlate(self._seen, structure, size)
         other = correlate(self._squares, spectrum(cover), size)
         score = correlate(self._image, spectrum(turned), size) / np.sqrt(np.maximum(own * other, 1.0))
-        score[own < SHARED * max(float((turned**2).sum()), 1.0)] = 0.0
+        score[own < SHARED_SHARE * max(float((turned**2).sum()), 1.0)] = 0.0
         return np.asarray(score)
 
     def _peaks(self, score: Image, turn: Image, region: Region | None) -> list[tuple[Floats, float]]:
@@ -97,12 +97,14 @@ class PlaceSearch:
         rest = score.copy()
         if region is not None:
             x, y = region.centre[:2]
-            rest[(shifts[:, None] - x) ** 2 + (shifts[None, :] - y) ** 2 > max(region.radius, CELL) ** 2] = 0.0
+            rest[(shifts[:, None] - x) ** 2 + (shifts[None, :] - y) ** 2 > max(region.radius, CELL_M) ** 2] = 0.0
         peaks: list[tuple[Floats, float]] = []
         while len(peaks) < GUESSES and rest.max() > 0:
             r, c = np.unravel_index(int(rest.argmax()), rest.shape)
             peaks.append((np.array([shifts[r], shifts[c]]), float(turn[r, c])))
-            rest[np.ix_(np.abs(shifts - shifts[r]) < APART, np.abs(shifts - shifts[c]) < APART)] = 0.0
+            rest[np.ix_(np.abs(shifts - shifts[r]) < GUESSES_APART_M, np.abs(shifts - shifts[c]) < GUESSES_APART_M)] = (
+                0.0
+            )
         return peaks
 
     def _pose(self, query: LevelSubmap, shift: Floats, yaw: float) -> Floats:

@@ -21,7 +21,7 @@ from lslam.registration.local_map import LocalMap
 from lslam.registration.preprocessing.ground import Z
 
 # m, edge of the blocks that points are sorted into; the local map is made anew where the sensor enters another.
-BLOCK = 32.0
+BLOCK_M = 32.0
 # Local maps kept: a drive along the border of two blocks needs both.
 KEPT = 3
 # Points that the vertical is estimated from, at most, and that one insertion takes.
@@ -47,7 +47,7 @@ class PriorMap:
     origin: Floats = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        blocks = np.floor(self.points[:, :2] / BLOCK).astype(np.int64)
+        blocks = np.floor(self.points[:, :2] / BLOCK_M).astype(np.int64)
         self._low = blocks.min(axis=0)
         self._shape = blocks.max(axis=0) - self._low + 1
         numbers = (blocks[:, 0] - self._low[0]) * self._shape[1] + blocks[:, 1] - self._low[1]
@@ -60,7 +60,7 @@ class PriorMap:
 
     def around(self, centre: Floats, reach: float) -> Points:
         """Points (M, 3), m, of the blocks within `reach` m of `centre` (2,) or (3,), level axes."""
-        low, high = (np.floor((centre[:2] + s * reach) / BLOCK).astype(np.int64) - self._low for s in (-1, 1))
+        low, high = (np.floor((centre[:2] + s * reach) / BLOCK_M).astype(np.int64) - self._low for s in (-1, 1))
         low, high = np.maximum(low, 0), np.minimum(high, self._shape - 1)
         if (low > high).any():
             return np.zeros((0, 3), np.float32)
@@ -117,7 +117,7 @@ class LocalView:
 
     def at(self, position: Floats) -> MapAlignment:
         """Alignment with the map round a position (3,), level axes."""
-        block = (int(np.floor(position[0] / BLOCK)), int(np.floor(position[1] / BLOCK)))
+        block = (int(np.floor(position[0] / BLOCK_M)), int(np.floor(position[1] / BLOCK_M)))
         if block not in self._alignments:
             self._alignments[block] = self._make(block)
         self._alignments.move_to_end(block)
@@ -127,11 +127,11 @@ class LocalView:
 
     def _make(self, block: Sequence[int]) -> MapAlignment:
         c = self._config
-        centre = (np.array(block) + 0.5) * BLOCK
+        centre = (np.array(block) + 0.5) * BLOCK_M
         # Nobody knows which beams saw a point of a finished map.
         target = LocalMap(
             c.voxel_size, coarse_factor=c.coarse_factor, min_points=c.min_points, planarity=c.planarity,
             count_cap=c.count_cap, reach=np.inf, breadth=0.0,
         )  # fmt: skip
-        insert_all(target, self._map.around(centre, self._reach + BLOCK / 2))
+        insert_all(target, self._map.around(centre, self._reach + BLOCK_M / 2))
         return MapAlignment(target, c)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.keyframes.submaps import mounted_up, submap
-from lslam.backend.localization.place_search import APART, PlaceSearch, Region
+from lslam.backend.localization.place_search import GUESSES_APART_M, PlaceSearch, Region
 from lslam.backend.localization.prior_map import MAP_MIN_INLIERS
 from lslam.backend.loops.level_submap import LevelSubmap, find_up, level_rotation, make_level_submap
 from lslam.core.config.config import Config
@@ -26,9 +26,9 @@ from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 
 # m between two keyframes that are tried.
-SPACING = 6.0
+SPACING_M = 6.0
 # Keyframes that must agree on the start, so that one look-alike does not decide.
-AGREEING = 2
+AGREEING_STARTS = 2
 # Of what a keyframe sees, this part must lie where the map has it, when no other of its drive agrees.
 MAJORITY = 0.5
 # Every so many-th source point serves to rank the guesses, and the kernel they are caught with, m.
@@ -79,7 +79,7 @@ class Start:
     @property
     def has_agreement(self) -> bool:
         """Whether several keyframes say so."""
-        return self.votes >= AGREEING
+        return self.votes >= AGREEING_STARTS
 
     @property
     def has_majority(self) -> bool:
@@ -112,7 +112,7 @@ class PlaceFinder:
             vote = self.vote(b, self._region(b, prior))
             if vote is not None:
                 votes.append(vote)
-            agreed = self._agreed(votes, AGREEING)
+            agreed = self._agreed(votes, AGREEING_STARTS)
             if agreed is not None:
                 return replace(agreed, tried=tried)
         # A drive too short for two keyframes has the word of one.
@@ -164,7 +164,7 @@ class PlaceFinder:
         """Keyframes to try."""
         last = -np.inf
         for b, way in enumerate(self._distances):
-            if way - last >= SPACING:
+            if way - last >= SPACING_M:
                 last = float(way)
                 yield b
 
@@ -222,7 +222,7 @@ class PlaceFinder:
         gap = se3.relative(one.T_level_odometry @ self._poses[b], other.T_level_odometry @ self._poses[b])
         move, turn = self._drift(one.keyframe, b)
         is_near = float(np.linalg.norm(gap[:3, 3])) < SAME_M + move
-        return is_near and move < APART and float(so3.angle(gap[:3, :3])) < np.deg2rad(SAME_DEG) + turn
+        return is_near and move < GUESSES_APART_M and float(so3.angle(gap[:3, :3])) < np.deg2rad(SAME_DEG) + turn
 
     def _agreed(self, votes: list[Vote], least: int) -> Start | None:
         """The start that at least so many keyframes vote for, and more than twice as many as for any other."""

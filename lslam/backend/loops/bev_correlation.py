@@ -14,9 +14,9 @@ Image = NDArray[np.float32]
 Spectrum = NDArray[np.complex64]
 
 # m; a heading error of half a search step moves a wall by one cell at most.
-CELL = 1.0
+CELL_M = 1.0
 # Voxels per cell that count, at most: taller structure is no more distinctive.
-TALLEST = 6.0
+MOST_VOXELS = 6.0
 UNTURNED: Floats = np.eye(2)
 
 
@@ -28,21 +28,21 @@ class BevGrid:
 
     def cells_of(self, points: Floats) -> tuple[Longs, Bools]:
         """Flat cell of each point (N, 3), m, 0 outside, and whether it lies inside."""
-        cells = np.floor(points[:, :2] / CELL).astype(np.int64) + self.size // 2
+        cells = np.floor(points[:, :2] / CELL_M).astype(np.int64) + self.size // 2
         inside = np.asarray(((cells >= 0) & (cells < self.size)).all(axis=1))
         return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
 
     def heights(self, points: Floats, R: Floats = UNTURNED) -> Image:
-        """(size, size) occupied voxels per cell, up to `TALLEST`; points are means of voxels, turned by R (2, 2) first."""
+        """(size, size) occupied voxels per cell, up to `MOST_VOXELS`; points are means of voxels, turned by R (2, 2) first."""
         counts = np.zeros((self.size, self.size), np.float32)
-        bev.count(points, R, CELL, TALLEST, counts)
+        bev.count(points, R, CELL_M, MOST_VOXELS, counts)
         return counts
 
     def cover(self, *clouds: Floats, R: Floats = UNTURNED) -> Image:
         """(size, size) visibility: 1 in cells that hold a point, turned by R (2, 2), and in their neighbours, else 0."""
         covered = np.zeros((self.size, self.size), np.float32)
         for points in clouds:
-            bev.mark(points, R, CELL, covered)
+            bev.mark(points, R, CELL_M, covered)
         return covered
 
     def lowest(self, points: Floats) -> Floats:
@@ -54,7 +54,7 @@ class BevGrid:
 
     def shifts(self) -> Floats:
         """(size,) m that row or column k of a correlation stands for."""
-        return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * CELL)))
+        return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * CELL_M)))
 
 
 def blurred(image: Image) -> Image:

@@ -36,7 +36,7 @@ from lslam.core.types.trajectory import Keyframe
 from lslam.registration.preprocessing.ground import Z
 
 # m; two passes of a street lie so far apart at most.
-NEAR = 8.0
+NEAR_M = 8.0
 # m and rad, least gate of odometry: what two registrations of the same place differ by.
 LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
 # rad between the headings that are searched; beyond the widest gate they lie about the descriptor's own.
@@ -77,7 +77,7 @@ class Detector:
         self._clouds = SharedResults(self._make_level, CLOUDS)
         self._submaps = SharedResults(self._make_submap, KEPT)
         # Submaps overlap: the first keyframe of every few metres represents those after it.
-        steps = np.floor(self.uncertainty.distances / (NEAR / 2))
+        steps = np.floor(self.uncertainty.distances / (NEAR_M / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
         bound = config.memory_places if config.memory == "bounded" else None
         places = np.cumsum(self._is_described) - 1
@@ -184,15 +184,15 @@ class Detector:
         """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
         among = self._allowed(b, self.memory.before(b))
         if self.config.radius is None:
-            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR, self.config.sigmas)
+            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR_M, self.config.sigmas)
         return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
 
     def _allowed(self, b: int, among: Longs) -> Longs:
         """Those that no forbidden pair lies at: so near along the way the same surfaces are taken for the same place."""
         distances = self.uncertainty.distances
         for older, newer in self.forbidden:
-            if abs(distances[b] - distances[newer]) <= NEAR:
-                among = among[np.abs(distances[among] - distances[older]) > NEAR]
+            if abs(distances[b] - distances[newer]) <= NEAR_M:
+                among = among[np.abs(distances[among] - distances[older]) > NEAR_M]
         return among
 
     def _thinned(self, older: Longs, b: int, wait: float) -> LoopCandidate:
@@ -216,7 +216,7 @@ class Detector:
         near = self._nearest(older, b)
         reach = self._reach_between(near, b)
         nearest = np.array([near])
-        if reach < NEAR:
+        if reach < NEAR_M:
             away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
             about = older[away <= away.min() + reach]
             chosen = self._matches(b, nearest)
@@ -228,7 +228,7 @@ class Detector:
 
     def _elsewhere(self, matches: list[PlaceMatch], chosen: list[PlaceMatch]) -> list[PlaceMatch]:
         """Those of the matches that are not at the place of a chosen one."""
-        return [m for m in matches if all(self._away(m.number, c.number) > NEAR / 2 for c in chosen)]
+        return [m for m in matches if all(self._away(m.number, c.number) > NEAR_M / 2 for c in chosen)]
 
     def _alike(self, b: int, older: Longs) -> list[PlaceMatch]:
         """Those of the `older` that look like keyframe `b`: the most similar and its rivals."""
@@ -248,7 +248,7 @@ class Detector:
         """The first few matches, none near another."""
         chosen: list[PlaceMatch] = []
         for match in matches:
-            if len(chosen) < RIVALS and all(self._away(match.number, k.number) > NEAR for k in chosen):
+            if len(chosen) < RIVALS and all(self._away(match.number, k.number) > NEAR_M for k in chosen):
                 chosen.append(match)
         return chosen
 

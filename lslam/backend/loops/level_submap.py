@@ -65,7 +65,7 @@ SOURCE_POINTS = 4000
 # Voxels allocated at first; a map needs room for as many more as points are inserted at once.
 CAPACITY = 1 << 15
 # Cosine; planes within 25 degrees of horizontal are ground and ceilings, which constrain no horizontal shift.
-LEVEL = float(np.cos(np.deg2rad(25)))
+LEVEL_COSINE = float(np.cos(np.deg2rad(25)))
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
         fine.insert(points[first : first + CAPACITY // 4], np.eye(4))
     kind = fine.planes[:, 7]
     solid = np.flatnonzero((fine.keys != gaussians.FREE) & (kind > gaussians.EMPTY))
-    is_level = (kind[solid] >= 0) & (np.abs(fine.planes[solid, 5]) > LEVEL)
+    is_level = (kind[solid] >= 0) & (np.abs(fine.planes[solid, 5]) > LEVEL_COSINE)
     step = max(int(np.ceil(len(solid) / SOURCE_POINTS)), 1)
     chosen, is_upright = solid[::step], ~is_level[::step]
     return LevelSubmap(

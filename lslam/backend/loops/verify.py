@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lslam.backend.loops.bev_correlation import CELL, BevGrid, Image, blurred, correlate, spectrum
+from lslam.backend.loops.bev_correlation import CELL_M, BevGrid, Image, blurred, correlate, spectrum
 from lslam.backend.loops.level_submap import LevelSubmap
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
@@ -25,9 +25,9 @@ SMALL, LARGE = BevGrid(128), BevGrid(256)
 # m, radius of the compared window, at most and at least; the rest of the image is room for the shift.
 WIDEST, NARROWEST = 60.0, 40.0
 # Least share of the window's non-ground cells that lie where the other submap was observed.
-SHARED = 0.25
+SHARED_SHARE = 0.25
 # m between two guesses, the least score relative to the best, and how many there are at most.
-APART, NEARLY, STARTS = 4.0, 0.7, 5
+STARTS_APART_M, NEARLY, STARTS = 4.0, 0.7, 5
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ def find_initial_guesses(
     shifts of one heading are correlated by FFT. Empty without non-ground points.
     """
     far = float(np.linalg.norm(expected[:2])) + reach
-    grid = SMALL if far + NARROWEST <= SMALL.size * CELL / 2 else LARGE
-    window = min(grid.size * CELL / 2 - far, WIDEST)
+    grid = SMALL if far + NARROWEST <= SMALL.size * CELL_M / 2 else LARGE
+    window = min(grid.size * CELL_M / 2 - far, WIDEST)
     image = blurred(grid.heights(a.non_ground))
     A, A2, A_seen = spectrum(image), spectrum(image**2), spectrum(grid.cover(a.non_ground, a.ground))
     near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.non_ground, b.ground))
@@ -59,7 +59,7 @@ def find_initial_guesses(
         own = correlate(A_seen, spectrum(turned**2), grid.size)
         other = correlate(A2, spectrum(grid.cover(near, floor, R=R)), grid.size)
         score = correlate(A, spectrum(turned), grid.size) / np.sqrt(np.maximum(own * other, 1.0))
-        score[own < SHARED * max(float((turned**2).sum()), 1.0)] = 0.0
+        score[own < SHARED_SHARE * max(float((turned**2).sum()), 1.0)] = 0.0
         better = score > best
         best, turn = np.where(better, score, best), np.where(better, np.float32(yaw), turn)
     return [
@@ -76,13 +76,13 @@ def _peaks(
     Not only local maxima: along a ridge, as of a street, other cells score as well as the maximum.
     """
     away2 = (shifts[:, None] - expected[0]) ** 2 + (shifts[None, :] - expected[1]) ** 2
-    rest = np.where(away2 <= max(reach, CELL) ** 2, score, np.float32(0))
+    rest = np.where(away2 <= max(reach, CELL_M) ** 2, score, np.float32(0))
     best = float(rest.max())
     peaks: list[tuple[Floats, float, float]] = []
     while len(peaks) < STARTS and rest.max() > NEARLY * best:
         r, c = np.unravel_index(int(rest.argmax()), rest.shape)
         peaks.append((np.array([shifts[r], shifts[c]]), float(turn[r, c]), float(score[r, c])))
-        rest[(shifts[:, None] - shifts[r]) ** 2 + (shifts[None, :] - shifts[c]) ** 2 < APART**2] = 0
+        rest[(shifts[:, None] - shifts[r]) ** 2 + (shifts[None, :] - shifts[c]) ** 2 < STARTS_APART_M**2] = 0
     return peaks
 
 
@@ -175,7 +175,7 @@ class Verifier:
         comparable = int((inside & view[cells]).sum())
         width = 2 * self.registration.kernel_min
         inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
-        return 0.0 if comparable < SHARED * len(upright.source) else inliers / comparable
+        return 0.0 if comparable < SHARED_SHARE * len(upright.source) else inliers / comparable
 
     def _judge(self, a: LevelSubmap, b: LevelSubmap, result: RegistrationResult) -> Verification:
         """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""

@@ -12,7 +12,7 @@ from lslam.core.types.arrays import Floats, Longs
 # Places of one verified loop that are retrieved at each new place, as in the paper.
 RETRIEVED = 2
 # Places on either side of a verified loop that it retrieves and protects from transfer.
-NEIGHBOURS = 10
+LOOP_PLACES = 10
 
 
 class WorkingMemory:
@@ -97,7 +97,7 @@ class WorkingMemory:
     def _retrieve(self, loop: int) -> None:
         """Enter a few neighbours of the loop's older place, the nearest along the way first."""
         entered = 0
-        for step in range(1, NEIGHBOURS + 1):
+        for step in range(1, LOOP_PLACES + 1):
             for place in (loop + step, loop - step):
                 before = len(self._members)
                 if entered < RETRIEVED and 0 <= place < self._newest:
@@ -107,7 +107,7 @@ class WorkingMemory:
     def _transfer(self, bound: int) -> None:
         """Transfer the places of least weight beyond the bound, but not recent ones and those about the last loop."""
         recent = self._distances[self._begins[self._newest]] - self._recent_m
-        about = (math.inf, -math.inf) if self._loop is None else (self._loop - NEIGHBOURS, self._loop + NEIGHBOURS)
+        about = (math.inf, -math.inf) if self._loop is None else (self._loop - LOOP_PLACES, self._loop + LOOP_PLACES)
         at = 0
         while len(self._members) > bound and at < len(self._order):
             _, place = self._order[at]

@@ -16,7 +16,7 @@ from lslam.core.types.constraint import Verdict
 MatchKind = Literal["edges", "lines", "none"]
 # `seen`: scans hold it; `unseen`: no scan says anything, it follows the map; `absent`: scans look through where it should be.
 BuildingStatus = Literal["seen", "unseen", "absent"]
-NEAR = 0.5  # m; what `BuildingCorrection.confidence` counts as in its place
+INLIER_M = 0.5  # m; what `BuildingCorrection.confidence` counts as in its place
 
 
 @dataclass(frozen=True)
@@ -239,9 +239,9 @@ class BuildingCorrection:
 
     @property
     def confidence(self) -> float:
-        """Probability, by the covariance, that it stands within `NEAR` m of its place along both axes of its uncertainty."""
+        """Probability, by the covariance, that it stands within `INLIER_M` m of its place along both axes of its uncertainty."""
         variances = np.maximum(np.linalg.eigvalsh(self.covariance[:2, :2]), 1e-12)
-        return float(np.prod([erf(NEAR / sqrt(2 * v)) for v in variances]))
+        return float(np.prod([erf(INLIER_M / sqrt(2 * v)) for v in variances]))
 
 
 @dataclass(frozen=True)

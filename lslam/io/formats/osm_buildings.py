@@ -19,10 +19,10 @@ from lslam.core.types.building import Building, Footprint, footprints_of
 from lslam.io.formats.osm_data import OsmData, Relation, Way
 from lslam.io.formats.osm_files import read_osm
 
-FARTHEST = 100e3  # m
-STOREY = 3.0  # m, docs/conventions.md
+FARTHEST_M = 100e3  # m
+STOREY_M = 3.0  # m, docs/conventions.md
 FOOT = 0.3048  # m
-TALLEST = 1000.0  # m; what is higher is a slip of the pen
+TALLEST_M = 1000.0  # m; what is higher is a slip of the pen
 NodeIds = tuple[int, ...]
 
 
@@ -71,7 +71,7 @@ def buildings_of(data: OsmData, origin: NDArray[Any], source: str = "the extract
     """
     at = np.asarray(origin, np.float64)
     where = _Positions(data, at)
-    if data.nodes and not (away := where.distance()) < FARTHEST:
+    if data.nodes and not (away := where.distance()) < FARTHEST_M:
         far = "more than a continent" if not np.isfinite(away) else distance_text(away)
         raise InputError(f"{source} lies {far} away from the origin: {right_place(at, _is_swapped(data, at))}")
     skipped: Counter[str] = Counter()
@@ -181,7 +181,7 @@ def _building(osm_id: str, footprints: tuple[Footprint, ...], tags: Mapping[str,
 
 def _is_swapped(data: OsmData, origin: Floats) -> bool:
     """Whether data and origin would agree if latitude and longitude were swapped."""
-    return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST
+    return abs(float(origin[1])) <= 90 and _Positions(data, origin[[1, 0, 2]]).distance() < FARTHEST_M
 
 
 def right_place(origin: Floats, is_swapped: bool = False) -> str:
@@ -204,8 +204,8 @@ def height_of(tags: Mapping[str, str]) -> float | None:
     height = _length(tags.get("height", ""))
     if height is None:
         levels = _number(tags.get("building:levels", ""))
-        height = None if levels is None else levels * STOREY
-    return height if height is not None and 0 < height < TALLEST else None
+        height = None if levels is None else levels * STOREY_M
+    return height if height is not None and 0 < height < TALLEST_M else None
 
 
 def base_of(tags: Mapping[str, str]) -> float:
@@ -215,8 +215,8 @@ def base_of(tags: Mapping[str, str]) -> float:
     """
     base = _length(tags.get("min_height", ""))
     if base is None:
-        base = (_number(tags.get("building:min_level", "")) or 0.0) * STOREY
-    return base if 0 < base < (height_of(tags) or TALLEST) else 0.0
+        base = (_number(tags.get("building:min_level", "")) or 0.0) * STOREY_M
+    return base if 0 < base < (height_of(tags) or TALLEST_M) else 0.0
 
 
 def is_underground(tags: Mapping[str, str]) -> bool:

@@ -77,8 +77,8 @@ def test_what_is_tried_does_not_show(monkeypatch: pytest.MonkeyPatch, percent: f
     for (few, walk), (many, fine) in zip(*found, strict=True):
         assert few is not None
         assert many is not None
-        assert few.memory == pytest.approx(many.memory, rel=1.5 * fix_noise.STEP)
-        assert walk == pytest.approx(fine, rel=1.5 * fix_noise.STEP)
+        assert few.memory == pytest.approx(many.memory, rel=1.5 * fix_noise.LOG_STEP)
+        assert walk == pytest.approx(fine, rel=1.5 * fix_noise.LOG_STEP)
 
 
 def test_wrong_fixes_do_not_change_the_common_part() -> None:

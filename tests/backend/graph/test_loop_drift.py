@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from lslam.backend.added_drift import with_drift
 from lslam.backend.graph import loop_drift
 from lslam.backend.graph.drift import SIZES, correct_drift, drift_covariance, linear_basis, rate_roots
-from lslam.backend.graph.loop_drift import APART, LASTS, PARTS, WALKS, without_loop_drift
+from lslam.backend.graph.loop_drift import KNOTS_APART_M, LASTS, MOST_KNOTS, WALKS, without_loop_drift
 from lslam.backend.graph.pose_graph import optimise, with_distances
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.core.config.backend import DebugConfig, GraphConfig
@@ -181,7 +181,7 @@ def test_a_long_way_takes_little_memory() -> None:
     """15 km: what each rate does to each keyframe, written out at once, takes 200 MB."""
     real = truth(2000, 6, radius=400.0)
     graph = with_distances(graph_of(real, 40, 0, np.random.default_rng(0), 6))
-    columns = 6 * (PARTS + 1)
+    columns = 6 * (MOST_KNOTS + 1)
     tracemalloc.start()
     fit = loop_drift._Fit(graph, graph.loops, np.zeros(columns), np.tile(np.eye(3), (len(graph) - 1, 1, 1)), CONFIG)
     _, covariance, walk = fit.likeliest()
@@ -199,11 +199,11 @@ def test_estimation_in_parts_equals_estimation_at_once(monkeypatch: pytest.Monke
         Constraint(a, b, se3.relative(graph.poses[a], graph.poses[b]), np.diag(LOOP**2))
         for a, b in ((3, 33), (9, 29), (10, 40), (19, 60))
     ]
-    found = np.random.default_rng(0).normal(0, 1e-3, 6 * linear_basis(graph.distances, APART).shape[1])
+    found = np.random.default_rng(0).normal(0, 1e-3, 6 * linear_basis(graph.distances, KNOTS_APART_M).shape[1])
     turned = so3.exp(np.random.default_rng(1).normal(0, 0.3, (len(graph) - 1, 3)))
     told = []
     for part in (256, 10):
-        monkeypatch.setattr(loop_drift, "PART", part)
+        monkeypatch.setattr(loop_drift, "BLOCK_KEYFRAMES", part)
         fit = loop_drift._Fit(graph, loops, found, turned, CONFIG)
         rates, covariance, walk = fit.likeliest()
         told.append((fit.negative_log_likelihood, rates, fit.spread(covariance, walk)))
@@ -238,7 +238,7 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
         Constraint(a, b, measured(se3.relative(real[a], real[b]), LOOP, np.random.default_rng(a)), np.diag(LOOP**2))
         for a, b in ((1, 16), (4, 18), (9, 30))
     ]
-    at_knots = linear_basis(graph.distances, APART)
+    at_knots = linear_basis(graph.distances, KNOTS_APART_M)
     count, small = 6 * at_knots.shape[1], 1e-5
     turned = so3.exp(np.random.default_rng(1).normal(0, 0.3, (len(graph) - 1, 3)))
     fit = loop_drift._Fit(graph, loops, np.zeros(count), turned, CONFIG)
@@ -291,7 +291,7 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
     def negative_log_likelihood(S: Floats) -> float:
         return float(np.linalg.slogdet(S)[1] + zero @ np.linalg.solve(S, zero))
 
-    roots = rate_roots(float(graph.distances[-1]), CONFIG, list(range(6)), LASTS, APART, is_smooth=False)
+    roots = rate_roots(float(graph.distances[-1]), CONFIG, list(range(6)), LASTS, KNOTS_APART_M, is_smooth=False)
     for w in (0, 3, 6):
         alone = known + WALKS[w] * walk
         assert fit.negative_log_likelihood[w, 0] == pytest.approx(negative_log_likelihood(alone), rel=1e-3)

@@ -8,7 +8,7 @@ from known_town import pose, seen, town
 from numpy.typing import NDArray
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import KEYFRAMES, mounted_up
+from lslam.backend.keyframes.submaps import GROUND_KEYFRAMES, mounted_up
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.trajectory import Keyframe
@@ -19,7 +19,7 @@ from lslam.registration.preprocessing.up import AXIS, find_up
 HALF_FIELD = np.deg2rad(15.0)
 
 
-def drive(rpy_deg: tuple[float, float, float], count: int = KEYFRAMES) -> KeyframeStore:
+def drive(rpy_deg: tuple[float, float, float], count: int = GROUND_KEYFRAMES) -> KeyframeStore:
     """Keyframes of a drive along a street, of a sensor mounted so, in the world of the first."""
     world, store = town(), KeyframeStore()
     mounting = se3.make(so3.from_euler_rpy(np.deg2rad(rpy_deg)), np.zeros(3))
