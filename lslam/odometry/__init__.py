@@ -25,6 +25,10 @@ METHODS = {
     "vgicp": ("lslam.odometry.icp", "likewise, distribution to distribution over the voxels around (Koide 2021)"),
     "ndt": ("lslam.odometry.icp", "likewise, normal distributions transform: a score over the voxels (Magnusson 2009)"),
     "icp-svd": ("lslam.odometry.icp_svd", "the classic: point to point, scan to scan, closed form by SVD (Besl 1992)"),
+    "fast-lio": (
+        "lslam.odometry.fast_lio",
+        "tightly coupled with the IMU: edges, planes and prior in one iterated Kalman filter (Xu 2021); needs an IMU",
+    ),
     "fast-lio2": (
         "lslam.odometry.fast_lio2",
         "tightly coupled with the IMU: points and prior in one iterated Kalman filter (Xu 2022); needs an IMU",
@@ -62,7 +66,7 @@ METHODS = {
 
 
 # Those whose scans have features, and so a feature map to write.
-FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam", "loam-livox")
+FEATURE_METHODS = ("loam-odom", "loam", "floam", "lego-loam", "loam-livox", "fast-lio")
 # They predict by themselves whatever the IMU says, or have nothing to predict.
 LIDAR_ONLY = ("kiss-icp", "poses")
 # Of other people, to compare with.

@@ -10,6 +10,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.odometry.icp import Icp, registration_of
 from lslam.odometry.inertial.filter import FilterMotion
+from lslam.odometry.map_method import MapMethod
 
 
 def create(config: Config) -> FastLio2:
@@ -20,7 +21,15 @@ def create(config: Config) -> FastLio2:
 create_motion = FilterMotion.of
 
 
-class FastLio2(Icp):
+class Filtered(MapMethod):
+    """Registers a scan with the filter's prior as one more measurement."""
+
+    def information_of(self, prior: MotionPrior) -> Floats | None:
+        """The inverse of the filter's covariance."""
+        return None if prior.covariance is None else np.asarray(np.linalg.inv(prior.covariance))
+
+
+class FastLio2(Filtered, Icp):
     """Points and the filter's prior in one estimate, on the local map of Gaussian voxels.
 
     The filter is the motion model (`lslam.odometry.inertial.filter`), since it predicts and deskews too; where it is silent, over
@@ -28,7 +37,3 @@ class FastLio2(Icp):
     """
 
     deskew = "by back propagation of the filter"
-
-    def information_of(self, prior: MotionPrior) -> Floats | None:
-        """The inverse of the filter's covariance."""
-        return None if prior.covariance is None else np.asarray(np.linalg.inv(prior.covariance))

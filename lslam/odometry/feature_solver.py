@@ -23,7 +23,7 @@ from lslam.registration.preprocessing.features import Features
 from lslam.registration.residuals import PLANE
 from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
-from lslam.registration.solver import voxel_terms
+from lslam.registration.solver import prior_term, voxel_terms
 
 NONE: Floats = np.zeros((0, 3))
 # Scan-to-scan errors persist as velocity, without a map to correct them: the threshold of degeneracy is twice as high there.
@@ -88,8 +88,9 @@ def solve_on_map(
 def map_problem(
     target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
     scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None, inlier_ratio: float = 1.0,
+    information: Floats | None = None,
 ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
-    """The arguments of `optimise` by which `solve_on_map` aligns."""
+    """The arguments of `optimise` by which `solve_on_map` aligns; `information` (6, 6) of the prior joins the features."""
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
     lines, matches = target.edges, Correspondences(len(planes) + len(edges))
@@ -100,7 +101,8 @@ def map_problem(
     )  # fmt: skip
     on_planes = voxel_terms(PLANE, (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
-    return [on_lines, *on_planes], T_prior, annealing, limits, matches, np.inf, inlier_ratio
+    prior = [] if information is None else [prior_term(T_prior, information)]
+    return [on_lines, *on_planes, *prior], T_prior, annealing, limits, matches, np.inf, inlier_ratio
 
 
 def remap_solution(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:

@@ -107,7 +107,8 @@ class FeatureTarget(Target):
     ) -> RegistrationResult:
         """Align with the scan before and, from there, with the feature map, from `T_start` (4, 4).
 
-        About a prior that is nearly right, that stays along degenerate directions.
+        About a prior that is nearly right, that stays along degenerate directions. `information` (6, 6) of the start joins the
+        features of the map.
         """
         assert self.scan is not None
         features, noise, iterations, c = attempt.points, self.noise(attempt.history), 0, self.config
@@ -127,7 +128,7 @@ class FeatureTarget(Target):
                 points, scatter = thinned(features) if self.variant.with_less_planes else (features.planes.points, None)
                 problem = map_problem(
                     self.map, features.edges.points, points, start, annealing, noise, scatter=scatter,
-                    inlier_ratio=self.variant.inlier_ratio,
+                    inlier_ratio=self.variant.inlier_ratio, information=information,
                 )  # fmt: skip
                 result = optimise(*problem)
             result = replace(result, iterations=iterations + result.iterations)

@@ -9,7 +9,6 @@ from typing import Any
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import UsageError
-from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.odometry.elastic import SweepPoints, register_elastic
@@ -107,10 +106,6 @@ class Icp(MapMethod):
             result, points=deskew(prepared, sweep or prior), detail=(prior, elastic), sweep=sweep, map_age=self.map_age,
             stages={"register": time.perf_counter() - began},
         )  # fmt: skip
-
-    def information_of(self, prior: MotionPrior) -> Floats | None:
-        """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
-        return None
 
     def warm_up(self) -> None:
         """Register a small room twice with a throw-away copy: every kernel is compiled or loaded."""

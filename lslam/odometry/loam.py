@@ -70,7 +70,7 @@ class Loam(MapMethod):
             features = self.features_of(prepared, prior)
         if features is prepared:
             del clock.seconds["deskew"]
-        result = self.registration.locate(features, prior.pose, is_near, clock=clock)
+        result = self.registration.locate(features, prior.pose, is_near, self.information_of(prior), clock=clock)
         return replace(result, map_age=self.map_age, stages=clock.seconds)
 
     def warm_up(self) -> None:

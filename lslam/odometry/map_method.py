@@ -6,6 +6,7 @@ import time
 from dataclasses import replace
 from typing import ClassVar
 
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -45,6 +46,10 @@ class MapMethod(Traits, Stateful):
     def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
         """Enter a scan that was registered from `prior` into the map; the result says whether the sensor is at rest."""
         return self.registration.update(result)
+
+    def information_of(self, prior: MotionPrior) -> Floats | None:
+        """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
+        return None
 
     def restart(self) -> None:
         """An empty map."""

@@ -23,7 +23,7 @@ HEEDED = {
     "registration.keyframe_deg": ON_GAUSSIANS,
     "registration.inlier_distance": (*ON_GAUSSIANS, "dlo", "icp-svd"),
     "registration.inlier_ratio": (*ON_GAUSSIANS, "dlo", "icp-svd"),
-    "recovery.fallback": FEATURE_METHODS,
+    "recovery.fallback": tuple(name for name in FEATURE_METHODS if name not in TIGHTLY_COUPLED),
 }
 
 

@@ -10,7 +10,7 @@ from lslam.core.config.input import InputConfig, PreprocessConfig
 from lslam.core.config.section import Section
 
 # Methods whose estimate is of points and IMU together.
-TIGHTLY_COUPLED = ("fast-lio2", "lio-sam", "lio-mapping", "lips")
+TIGHTLY_COUPLED = ("fast-lio", "fast-lio2", "lio-sam", "lio-mapping", "lips")
 # Of these, the ones that have no states for the device, the rotation of its extrinsics and its clock.
 FIXED_DEVICE = ("lio-sam", "lio-mapping", "lips")
 
