@@ -34,16 +34,36 @@ def spread(values: Sequence[float]) -> tuple[float, float]:
     return middle, ordered[-1]
 
 
-def difficulty(printed: float | None, values: Sequence[float]) -> str:
-    """How hard ours was beside theirs, by the angular error, deg: `as hard`, `easier`, `harder`; empty where nobody knows.
+def difficulty(pairs: Sequence[tuple[float | None, Sequence[float]]]) -> str:
+    """How hard ours was beside theirs: `as hard`, `easier`, `harder` or `partly as hard`; empty where nobody knows.
 
-    >>> difficulty(2.0, [0.1, 0.2]), difficulty(2.0, [1.5]), difficulty(None, [1.0])
+    pairs : of each measure of it, the printed number and those of our runs; all must say the same
+
+    >>> difficulty([(2.0, [0.1, 0.2])]), difficulty([(2.0, [1.5]), (9.0, [8.0])]), difficulty([(None, [1.0])])
     ('easier', 'as hard', '')
+    >>> difficulty([(2.0, [1.5]), (9.0, [2.0])])
+    'partly as hard'
     """
-    if printed is None or not values:
-        return ""
-    ratio = spread(values)[0] / printed
-    return "as hard" if 1 / LIKE <= ratio <= LIKE else "easier" if ratio < 1 else "harder"
+    found = set()
+    for printed, values in pairs:
+        if printed is not None and values:
+            ratio = spread(values)[0] / printed
+            found.add("as hard" if 1 / LIKE <= ratio <= LIKE else "easier" if ratio < 1 else "harder")
+    return "partly as hard" if len(found) > 1 else "".join(found)
+
+
+def judge_time(values: Sequence[float], limit: float | None) -> Judgement:
+    """Whether each run has kept up with the recording, as each that is printed has; s per scan, and those from scan to scan.
+
+    >>> judge_time([0.1, 0.2], 0.4).verdict, judge_time([0.1, 0.5], 0.4).verdict, judge_time([0.1], None).verdict
+    ('reproduced', 'undecided', 'undecided')
+    """
+    if limit is None or not values or max(values) == np.inf:
+        return Judgement("undecided", "no time, or no limit")
+    slow = sum(value > limit for value in values)
+    said = f"{slow} of {len(values)} runs" if slow else f"none of {len(values)} runs"
+    verdict: Verdict = "undecided" if slow else "reproduced"
+    return Judgement(verdict, f"{said} took longer than the {limit:g} s from scan to scan; another machine")
 
 
 def judge_number(printed: float, values: Sequence[float], hardness: str = "") -> Judgement:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,8 @@ from lslam.evaluation.metric import (
     percent_of_length,
     two,
 )
+
+RPY = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
@@ -149,8 +152,11 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
     key, name, word = "thesis1", "thesis1", "thesis"
     columns = (
         ("thesis_rmse", _more("thesis_rmse", "m")),
+        ("max_error", _more("thesis_max", "m")),
         ("angular_rmse_deg", _more("thesis_angular", "deg")),
+        ("angular_max_deg", _more("thesis_angular_max", "deg")),
     )
+    axes = tuple(_more(f"thesis_{axis}", unit) for axes, unit in (("xyz", "m"), (RPY, "deg")) for axis in axes)
 
     def measure(self, poses: MatchedPoses, config: EvalConfig) -> AxisErrors:
         if not poses.has_rotations:
@@ -159,6 +165,13 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
                 "origin", nan, nan, nan, nan, three, three, nan, nan, none, none, none[:, 0], NO_ROTATIONS
             )
         return axis_errors(poses.estimate, poses.truth)
+
+    def compared(self, configs: Sequence[EvalConfig]) -> list[Metric]:
+        return [*super().compared(configs), *self.axes]
+
+    def values(self, document: Any) -> dict[str, float]:
+        by_axis = zip(self.axes, (*document["xyz_rmse"], *document["rpy_rmse_deg"]), strict=True)
+        return super().values(document) | {axis.key: value for axis, value in by_axis if value is not None}
 
     def summary(self, e: Evaluation) -> list[tuple[str, str]]:
         return [(self.name, f"{metres(self.of(e).thesis_rmse)} m (thesis_rmse, sqrt(sum|e|²/3N), origin alignment)")]

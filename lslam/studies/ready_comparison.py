@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -20,7 +20,8 @@ from lslam.core.printable import significant
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import RunScore, Table
 from lslam.core.untrusted import parse_toml
-from lslam.evaluation.beside import difficulty, judge_number, judge_order, spread
+from lslam.evaluation.beside import Judgement, difficulty, judge_number, judge_order, judge_time, spread
+from lslam.evaluation.thesis import RPY
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_files import write_osm
 from lslam.io.formats.trajectory_files import read_trajectory
@@ -29,15 +30,43 @@ from lslam.simulation.osm_perturb import MapFaults, draw_perturbation, perturb
 from lslam.studies.grid import Cell
 from lslam.studies.variants import Imu, Variant, find_variants
 
-Of = Literal["before", "after", "angular", "ate", "rpe"]
-# Key of a run's values, and what people read.
-QUANTITIES: dict[str, tuple[str, str]] = {
-    "before": ("odometry.thesis_rmse", "rmse before the graph, m"),
-    "after": ("thesis_rmse", "rmse after the graph, m"),
-    "angular": ("thesis_angular", "angular rmse, deg"),
-    "ate": ("planar_ate", "planar ATE, m"),
-    "rpe": ("planar_rpe", "planar RPE, m"),
+Of = Literal["before", "after", "percent", "max", "angular", "angular_max", "prior", "time", "ate", "rpe"]
+
+
+class Quantity(NamedTuple):
+    """What people read, the key of a run's values, by what it is multiplied, and the key by whose value it is divided."""
+
+    label: str
+    key: str
+    times: float = 1.0
+    per: str = ""
+
+    def of(self, values: Mapping[str, float]) -> float:
+        """The number of a run; inf where a value is unknown."""
+        value, whole = values.get(self.key, inf), values.get(self.per, inf) if self.per else 1.0
+        return self.times * value / whole if whole < inf else inf
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "before": Quantity("rmse before the graph, m", "odometry.thesis_rmse"),
+    "after": Quantity("rmse after the graph, m", "thesis_rmse"),
+    "percent": Quantity("rmse after the graph, % of length", "thesis_rmse", 100, "path"),
+    "max": Quantity("largest error, m", "thesis_max"),
+    "angular": Quantity("angular rmse, deg", "thesis_angular"),
+    "angular_max": Quantity("largest angular error, deg", "thesis_angular_max"),
+    "prior": Quantity("error of the first guess", "prior_norm"),
+    "time": Quantity("time per scan, s", "time.mean", 1e-3),
+    "ate": Quantity("planar ATE, m", "planar_ate"),
+    "rpe": Quantity("planar RPE, m", "planar_rpe"),
 }
+# Of them, what says how hard a drive was.
+HARDNESS: tuple[Of, ...] = ("angular", "angular_max")
+# Of which a thesis prints no number.
+UNPRINTED = (
+    *(Quantity(f"{axis}, m", f"thesis_{axis}") for axis in "xyz"),
+    *(Quantity(f"{axis}, deg", f"thesis_{axis}") for axis in RPY),
+    Quantity("share of inliers", "inlier_share"),
+)
 # Kept of the runs: what they wrote for people is not read here.
 _ALWAYS = ("map.write=false", "report.html=false", "keyframes.deflate=0", "eval.metrics=['thesis']")
 MAPS = "maps"
@@ -86,7 +115,8 @@ class Quick(Section):
 class ReadyComparison(Section):
     """A comparison with what a thesis prints of it.
 
-    on_map : settings of the systems that take a map, each run on all `maps`
+    systems : settings of further systems: each on all `maps`, or where there are none on drives of which a number is printed
+    unprinted : what is said below the table of UNPRINTED; without it there is none
     """
 
     summary: str
@@ -97,23 +127,24 @@ class ReadyComparison(Section):
     settings: tuple[str, ...] = ()
     quick: Quick
     maps: dict[str, MapKind] = Field(default_factory=dict)
-    on_map: dict[str, tuple[str, ...]] = Field(default_factory=dict)
+    systems: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     printed: tuple[Printed, ...]
+    unprinted: str = ""
     stated: tuple[Stated, ...] = ()
 
     def variants(self, settings: Sequence[str]) -> list[Variant]:
-        """The methods, and the systems of `on_map` on each map, `settings` over all."""
+        """The methods and the further systems, these on each map, `settings` over all."""
         common = [*_ALWAYS, *self.settings, *settings]
         variants = find_variants(self.methods, None, common, self.imu)
-        for name, own in self.on_map.items():
+        for name, own in self.systems.items():
             config = load_config(None, [*common, *own])
-            variants += [Variant(f"{name}{ON}{kind}", config, name) for kind in self.maps]
+            variants += [Variant(name + mark, config, name) for mark in [ON + kind for kind in self.maps] or [""]]
         return variants
 
     def fitted(self, variants: Sequence[Variant], cell: Cell, out: Path) -> list[Variant]:
         """The variants with the map of a simulated drive, its place and heading; drift is drawn by the drive's seed."""
         if not self.maps:
-            return list(variants)
+            return [v for v in variants if v.name not in self.systems or self._of(cell.sequence, v.name)]
         T_enu_world, origin = _world_of(cell)
         first = T_enu_world @ read_trajectory(cell.path / "truth" / "trajectory.tum").poses[0]
         start = geodesy.from_local(first[None, :3, 3], origin)[0]
@@ -151,26 +182,37 @@ class ReadyComparison(Section):
         write_osm(path, osm_from_buildings(perturb(exact, perturbation), origin, None))
         return path
 
-    def beside(self, runs: Sequence[RunScore]) -> tuple[Table, Table]:
-        """The tables of numbers and of what is stated, of the runs that there are."""
-        return self._numbers(runs), self._statements(runs)
+    def beside(self, runs: Sequence[RunScore]) -> tuple[Table, ...]:
+        """The tables of numbers, of what is stated and of what is measured only, of the runs that there are."""
+        return self._numbers(runs), self._statements(runs), self._unprinted(runs)
 
     def _numbers(self, runs: Sequence[RunScore]) -> Table:
         rows = []
         for sequence, method in dict.fromkeys((run.sequence, run.method) for run in runs):
-            for of, printed, source in self._of(sequence, method):
-                values, angular = (list(_values(runs, sequence, method, each).values()) for each in (of, "angular"))
-                hardness = difficulty(self._printed(sequence, method, "angular"), angular)
-                judgement = judge_number(printed, values, hardness)
-                ours = " / ".join(map(_text, spread(values)))
-                theirs = (sequence, method, QUANTITIES[of][1], f"{printed:g}")
-                rows.append((*theirs, ours, hardness, judgement.verdict, judgement.why, source))
+            printed = {of: value for of, value, _ in self._of(sequence, method)}
+            ours = {of: list(_values(runs, sequence, method, QUANTITIES[of]).values()) for of in (*printed, *HARDNESS)}
+            hardness = difficulty([(printed.get(of), ours[of]) for of in HARDNESS])
+            limit = next((run.limit for run in runs if (run.sequence, run.method) == (sequence, method)), None)
+            for of, number, source in self._of(sequence, method):
+                judged = judge_time(ours[of], limit) if of == "time" else judge_number(number, ours[of], hardness)
+                theirs = (sequence, method, QUANTITIES[of].label, f"{number:g}")
+                rows.append((*theirs, _spread(ours[of]), hardness, judged.verdict, judged.why, source))
         header = ("sequence", "method", "quantity", "thesis", "ours", "ours was", "verdict", "why", "source")
         recipe = (
             "ours: median / worst over seeds; reproduced: within a factor of two of a run; refuted: all runs are off to one side "
-            "and ours was as hard by the angular error; undecided otherwise"
+            "and ours was as hard by rms and maximum of the angular error; undecided otherwise; times are of another machine: "
+            "they are judged by the limit alone"
         )
         return Table("beside the thesis, number by number", header, tuple(rows), recipe)
+
+    def _unprinted(self, runs: Sequence[RunScore]) -> Table:
+        rows = [
+            (sequence, method, *(_spread(list(_values(runs, sequence, method, each).values())) for each in UNPRINTED))
+            for sequence, method in dict.fromkeys((run.sequence, run.method) for run in runs)
+            if self.unprinted
+        ]
+        header = ("sequence", "method", *(each.label for each in UNPRINTED))
+        return Table("of which the thesis prints no number", header, tuple(rows), self.unprinted)
 
     def _of(self, sequence: str, method: str) -> list[tuple[Of, float, str]]:
         """What is printed of a method on a drive, or on the clean twin of a hard one: quantity, number, source."""
@@ -190,11 +232,13 @@ class ReadyComparison(Section):
                 kind = method.removeprefix(stated.left)
                 right = stated.right + kind if (sequence, stated.right + kind) in scores else stated.right
                 a, b = (self._printed(sequence, name, stated.of) for name in (method, right))
-                if a is None or b is None:
+                if a is None or b is None or (sequence, right) not in scores:
                     continue
-                ours, theirs = (_values(runs, sequence, name, stated.of) for name in (method, right))
+                ours, theirs = (_values(runs, sequence, name, QUANTITIES[stated.of]) for name in (method, right))
                 pairs = [(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
                 judgement = judge_order(a < b, pairs)
+                if stated.of == "time" and any(run.jobs > 1 for run in runs if run.sequence == sequence):
+                    judgement = Judgement("undecided", f"{judgement.why}; runs shared the machine (--jobs)")
                 rows.append(
                     (stated.text, sequence + kind, f"{a / b:.2f}", judgement.verdict, judgement.why, stated.source)
                 )
@@ -209,18 +253,17 @@ def _world_of(cell: Cell) -> tuple[Floats, Floats]:
     return np.array(world["T_enu_world"]), np.array(world["origin_lat_lon_alt"])
 
 
-def _values(runs: Sequence[RunScore], sequence: str, method: str, of: str) -> dict[int, float]:
+def _values(runs: Sequence[RunScore], sequence: str, method: str, of: Quantity) -> dict[int, float]:
     """A quantity by seed; inf of a run that failed."""
-    key = QUANTITIES[of][0]
     return {
-        run.seed: run.values.get(key, inf) if run.is_usable else inf
+        run.seed: of.of(run.values) if run.is_usable else inf
         for run in runs
         if (run.sequence, run.method) == (sequence, method)
     }
 
 
-def _text(value: float) -> str:
-    return "failed" if value == inf else significant(value)
+def _spread(values: Sequence[float]) -> str:
+    return " / ".join("failed" if value == inf else significant(value) for value in spread(values))
 
 
 def comparison_names() -> tuple[str, ...]:

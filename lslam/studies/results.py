@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import logging
 import os
 import time
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core.config.outputs import EvalConfig
-from lslam.core.errors import InputError
+from lslam.core.errors import InputError, input_errors
 from lslam.core.extras import install_command
 from lslam.core.types.comparison import Group, Metric, RunScore
 from lslam.core.types.study import StudyRow
@@ -68,6 +69,7 @@ def _with_values(score: RunScore, state: State) -> RunScore:
     manifest = _read_json(score.folder / "manifest.json")
     timing = read_timing(score.folder / "timing.csv")
     values = {key: float(n) for key, n in manifest["counts"].items()} | _times(timing)
+    values |= _means_of_scans(score.folder / "scans.csv")
     if "resumed_after_scans" not in manifest:  # otherwise they are of the last attempt only
         values["run_s"] = state.seconds
     if manifest["peak_memory_mb"] is not None:
@@ -102,6 +104,17 @@ def _times(timing: Timing) -> dict[str, float]:
         values["factor"] = timing.period / timing.total.mean
         values["over_limit"] = float(timing.over_limit)
     return values
+
+
+def _means_of_scans(path: Path) -> dict[str, float]:
+    """Mean share of inliers, and mean error of the motion prior, of the scans that were registered."""
+    with input_errors(f"scans {path}", csv.Error, ValueError), path.open(newline="", encoding="utf-8") as stream:
+        registered = [row for row in csv.DictReader(stream) if row["status"] == "ok" and int(row["source_points"])]
+        means = {
+            "inlier_share": [int(row["inliers"]) / int(row["source_points"]) for row in registered],
+            "prior_norm": [float(row["prior_norm"]) for row in registered],
+        }
+    return {key: sum(each) / len(each) for key, each in means.items() if each}
 
 
 def _add_errors(path: Path, manifest: dict[str, Any], values: dict[str, float]) -> str:
@@ -145,6 +158,8 @@ def metrics_of(configs: Sequence[EvalConfig], runs: Sequence[RunScore]) -> list[
         *(_more(key, unit, "health") for key, unit in (("scans", "scans"), ("ok", "scans"), ("over_limit", "scans"))),
         _more("memory", "MB", "health"),
         _more(IMU, "0 or 1", "health"),
+        _more("inlier_share", "0 to 1", "health"),
+        _more("prior_norm", "", "health"),
     ]
 
 

@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from lslam.evaluation.beside import difficulty, judge_number, judge_order, spread
+from lslam.evaluation.beside import difficulty, judge_number, judge_order, judge_time, spread
 
 
 @pytest.mark.parametrize(
@@ -18,6 +18,7 @@ from lslam.evaluation.beside import difficulty, judge_number, judge_order, sprea
         ([2.1, 9.0], "as hard", "refuted"),
         ([0.1, 0.49], "easier", "undecided"),
         ([0.1, 0.49], "", "undecided"),
+        ([0.1, 0.49], "partly as hard", "undecided"),
         ([0.9, inf], "as hard", "undecided"),
         ([inf, inf], "as hard", "undecided"),
         ([], "as hard", "undecided"),
@@ -51,8 +52,26 @@ def test_an_order_is_decided_where_all_seeds_say_the_same_and_chance_does_not(
 
 
 def test_hardness_and_the_worst() -> None:
-    assert [difficulty(1.0, [value]) for value in (0.4, 0.6, 1.9, 2.1, inf)] == [
+    assert [difficulty([(1.0, [value])]) for value in (0.4, 0.6, 1.9, 2.1, inf)] == [
         "easier", "as hard", "as hard", "harder", "harder",
     ]  # fmt: skip
+    assert difficulty([(1.0, [1.0]), (8.0, [9.0])]) == "as hard"
+    assert difficulty([(1.0, [1.0]), (8.0, [2.0])]) == "partly as hard"
+    assert difficulty([(None, [1.0]), (8.0, [2.0])]) == "easier"
+    assert difficulty([(1.0, []), (None, [2.0])]) == ""
     assert spread([0.3, 0.1, 0.2, 0.4]) == (0.25, 0.4)
     assert spread([0.3, inf]) == (inf, inf)
+
+
+@pytest.mark.parametrize(
+    ("times", "limit", "verdict"),
+    [
+        ([0.1, 0.4], 0.4, "reproduced"),
+        ([0.1, 0.41], 0.4, "undecided"),
+        ([0.1, inf], 0.4, "undecided"),
+        ([], 0.4, "undecided"),
+        ([0.1], None, "undecided"),
+    ],
+)
+def test_time_is_judged_by_the_limit_and_never_refuted(times: list[float], limit: float | None, verdict: str) -> None:
+    assert judge_time(times, limit).verdict == verdict
