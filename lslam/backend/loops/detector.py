@@ -93,16 +93,18 @@ class Detector:
         count = len(self.keyframes)
         if any(len(self._gated(b)) for b in range(count)):
             self._level_world()
+            if self.config.memory == "bounded" and self.config.rehearsal is not None:
+                places = self._rehearse(1.0 - self.config.rehearsal, should_stop)
+                self.memory = WorkingMemory(
+                    places, self.uncertainty.distances, self.config.memory_places, self.config.min_travel
+                )
         # Of thousands of keyframes, each has thousands: those of the next few are held.
         gated = SharedResults(self._gated, HELD)
         ahead: dict[int, tuple[Longs, Future[list[LoopCandidate]]]] = {}
         with ThreadPoolExecutor(threads, "lslam-loops") as pool:
             try:
                 for b, keyframe in enumerate(self.keyframes):
-                    if should_stop():
-                        raise InterruptedRunError(
-                            f"interrupted during loop closure detection, at keyframe {b} of {count}"
-                        )
+                    _stop_if(should_stop(), b, count)
                     if self.memory.reach(b):
                         gated = SharedResults(self._gated, HELD)
                     older = gated.get(b)
@@ -179,6 +181,16 @@ class Detector:
         up = find_up(maps, self._mounted)
         self.keyframes = levelled(self.keyframes, up)
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
+
+    def _rehearse(self, limit: float, should_stop: Callable[[], bool]) -> Longs:
+        """(K,) place of each keyframe: that of the one before, if its first is near and their descriptors within `limit`."""
+        place_of, first = np.zeros(len(self.keyframes), np.int64), 0
+        for k in range(1, len(self.keyframes)):
+            _stop_if(should_stop(), k, len(self.keyframes))
+            is_alike = self._away(first, k) <= NEAR_M and self._matches(k, np.array([first]))[0].distance <= limit
+            first = first if is_alike else k
+            place_of[k] = place_of[k - 1] + (first == k)
+        return place_of
 
     def _gated(self, b: int) -> Longs:
         """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
@@ -329,3 +341,8 @@ class Detector:
         points = self._clouds.get(number)
         with self._index_lock:
             self.index.add(number, points)
+
+
+def _stop_if(is_asked: bool, b: int, count: int) -> None:
+    if is_asked:
+        raise InterruptedRunError(f"interrupted during loop closure detection, at keyframe {b} of {count}")

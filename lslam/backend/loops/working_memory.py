@@ -18,9 +18,9 @@ LOOP_PLACES = 10
 class WorkingMemory:
     """Places are keyframes in a row that look alike; so many of them are compared, the others lie in long-term memory.
 
-    A place enters when the run reaches it. Beyond the bound the place of least weight, of these the oldest, is transferred
-    to long-term memory. Weight is how many keyframes a place stands for (rehearsal); a verified loop gives the weight of the
-    older place to the newer one. It also retrieves the neighbours of the older place, the nearest first.
+    A place enters when the run reaches it. Beyond the bound the place of least weight, of these the one that entered first, is
+    transferred to long-term memory. Weight is how many keyframes a place stands for (rehearsal); a verified loop gives the
+    weight of the older place to the newer one. It also retrieves the neighbours of the older place, the nearest first.
 
     place_of : (K,) place of each keyframe, from 0 in steps of 0 or 1
     distances : (K,) m travelled at each keyframe; bound : places compared at most; None: all
@@ -35,8 +35,9 @@ class WorkingMemory:
         self._begins = np.searchsorted(place_of, np.arange(count + 1))
         self._weights = np.diff(self._begins).tolist()
         self._members: list[int] = []
-        # Transfer order of the members: weight, then age.
-        self._order: list[tuple[int, int]] = []
+        # Transfer order of the members: weight, which place was the newest when they entered, number.
+        self._order: list[tuple[int, int, int]] = []
+        self._entered = [0] * count
         self._newest = -1
         self._loop: int | None = None
 
@@ -83,16 +84,20 @@ class WorkingMemory:
         at = bisect_left(self._members, place)
         if at == len(self._members) or self._members[at] != place:
             self._members.insert(at, place)
-            insort(self._order, (self._weights[place], place))
+            self._entered[place] = self._newest
+            insort(self._order, self._key(place))
+
+    def _key(self, place: int) -> tuple[int, int, int]:
+        return self._weights[place], self._entered[place], place
 
     def _weigh(self, place: int, weight: int) -> None:
-        at = bisect_left(self._order, (self._weights[place], place))
-        is_member = at < len(self._order) and self._order[at] == (self._weights[place], place)
+        at = bisect_left(self._order, self._key(place))
+        is_member = at < len(self._order) and self._order[at] == self._key(place)
         if is_member:
             del self._order[at]
         self._weights[place] = weight
         if is_member:
-            insort(self._order, (weight, place))
+            insort(self._order, self._key(place))
 
     def _retrieve(self, loop: int) -> None:
         """Enter a few neighbours of the loop's older place, the nearest along the way first."""
@@ -110,7 +115,7 @@ class WorkingMemory:
         about = (math.inf, -math.inf) if self._loop is None else (self._loop - LOOP_PLACES, self._loop + LOOP_PLACES)
         at = 0
         while len(self._members) > bound and at < len(self._order):
-            _, place = self._order[at]
+            place = self._order[at][-1]
             if about[0] <= place <= about[1] or self._distances[self._begins[place]] > recent:
                 at += 1
                 continue

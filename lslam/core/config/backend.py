@@ -67,6 +67,13 @@ class LoopsConfig(Section):
     memory_places: int = Field(
         500, ge=20, description="places, 4 m of way each, in the working memory of `loops.memory = bounded`"
     )
+    rehearsal: float | None = Field(
+        None,
+        gt=0,
+        lt=1,
+        description="there, keyframes in a row within 8 m are one place where 1 minus the distance of their descriptors is so "
+        "much; absent: 4 m of way are one",
+    )
     rings: int = Field(20, ge=4, le=400, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
     sectors: int = Field(60, ge=8, le=360, description="Scan Context: sectors of the polar image")
     reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")

@@ -8,7 +8,7 @@ from known_town import Points, keyframes_of, round_the_square, seen, town
 from numpy.typing import NDArray
 
 from lslam.backend.loops.descriptor import PlaceMatch
-from lslam.backend.loops.detector import Detector
+from lslam.backend.loops.detector import NEAR_M, Detector
 from lslam.backend.loops.working_memory import LOOP_PLACES, RETRIEVED, WorkingMemory
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
@@ -66,6 +66,23 @@ def test_a_loop_retrieves_the_neighbours_of_its_older_place_nearest_first() -> N
     np.testing.assert_array_equal(retrieved, np.setdiff1d(np.arange(50 - LOOP_PLACES, 51 + LOOP_PLACES), [50]))
 
 
+def test_a_retrieved_place_is_as_young_as_those_that_entered_with_it() -> None:
+    memory = memory_of(np.arange(300), 60)
+    for k in range(200):
+        memory.reach(k)
+    memory.close(50, 199)
+    for k in range(200, 216):
+        memory.reach(k)
+    # Another loop, elsewhere, so that nothing protects the first. All weigh as much.
+    memory.close(205, 215)
+    for k in range(216, 235):
+        memory.reach(k)
+        assert len(memory) <= 60
+    kept = set(memory.before(235).tolist())
+    assert {48, 49, 51, 52} < kept
+    assert 190 not in kept
+
+
 def test_the_weight_of_a_place_moves_to_the_one_that_sees_it_again() -> None:
     memory = memory_of(np.arange(200), 40)
     for k in range(20):
@@ -117,6 +134,27 @@ def test_laps_are_closed_with_places_in_memory_and_threads_change_nothing(monkey
     assert {c.a // 72 for c in closures if c.b > 216} & {1, 2}
     assert len(detector.memory) <= 80 + 2 * LOOP_PLACES + RETRIEVED
     assert sum(c.is_accepted for c in detect(monkeypatch, "all", 80, 4.2)[0]) <= 1.2 * len(closures)
+
+
+def test_neighbours_that_look_alike_are_rehearsed_as_one_place() -> None:
+    true = np.array([round_the_square(d) for d in np.arange(0, LAP, 1.5)])
+    world = town()[::40]
+    clouds = [seen(world, pose, np.random.default_rng(k)) for k, pose in enumerate(true)]
+
+    def places(rehearsal: float) -> NDArray[np.int64]:
+        config = LoopsConfig.model_validate({"memory": "bounded", "rehearsal": rehearsal})
+        detector = Detector(keyframes_of(true), clouds.__getitem__, config, RegistrationConfig())
+        place_of = detector._rehearse(1 - rehearsal, lambda: False)
+        assert set(np.diff(place_of)) <= {0, 1}
+        begins = np.flatnonzero(np.diff(place_of, prepend=-1))
+        for k in range(len(true)):
+            first = int(begins[place_of[k]])
+            assert np.linalg.norm(true[k, :3, 3] - true[first, :3, 3]) <= NEAR_M
+            assert k == first or 1 - detector._matches(k, np.array([first]))[0].distance >= rehearsal
+        return place_of
+
+    few, some, all_apart = (places(rehearsal) for rehearsal in (0.5, 0.8, 0.999))
+    assert few[-1] < some[-1] < all_apart[-1] == len(true) - 1
 
 
 def test_an_unbounded_memory_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
