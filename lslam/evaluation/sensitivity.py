@@ -31,6 +31,7 @@ from lslam.evaluation.curves import (
     optimum,
     over_seeds,
 )
+from lslam.evaluation.trends import OF_IMU, judge_imu, judge_trend
 from lslam.evaluation.verdicts import (
     judge_acts_only_on,
     judge_best_between,
@@ -59,6 +60,8 @@ _JUDGES: dict[str, Callable[[ExpectedFinding, CurveResult], Judged]] = {
     "linear": judge_law,
     "inverse": judge_law,
     "acts_only_on": judge_acts_only_on,
+    "rises": judge_trend,
+    "falls": judge_trend,
 }
 SKIP = "input.skip_frames"
 EFFICIENCIES = ("efficiency", "total_efficiency")
@@ -66,7 +69,10 @@ EFFICIENCIES = ("efficiency", "total_efficiency")
 
 def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Mapping[str, Law]) -> FindingVerdict:
     """Verdict over all curves that the finding applies to; undecided if they disagree."""
-    mine = [result for result in results if _speaks_of(finding, result)]
+    is_of_imu = finding.kind in OF_IMU
+    mine = [
+        result for result in results if _speaks_of(finding, result) and not (is_of_imu and not result.curve.uses_imu)
+    ]
     if not mine:
         return FindingVerdict(finding.text, "undecided", "no run of that kind was made", finding.source)
     if not any(result.curve.ran.any() for result in mine):
@@ -76,7 +82,7 @@ def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Ma
             result.curve.series: judge_product(finding, products.get(result.curve.series), result) for result in mine
         }
     else:
-        judged = {result.curve.label: _judge_one(finding, result) for result in mine}
+        judged = {result.curve.label: _judge_one(finding, result, results) for result in mine}
     outcomes = {outcome for outcome, _ in judged.values()}
     outcome: Outcome = outcomes.pop() if len(outcomes) == 1 else "undecided"
     told = [f"{name}: {said}" if len(judged) > 1 else said for name, (_, said) in judged.items()]
@@ -86,7 +92,7 @@ def judge(finding: ExpectedFinding, results: Sequence[CurveResult], products: Ma
     return FindingVerdict(finding.text, outcome, "; ".join(told), finding.source)
 
 
-def _judge_one(finding: ExpectedFinding, result: CurveResult) -> Judged:
+def _judge_one(finding: ExpectedFinding, result: CurveResult, results: Sequence[CurveResult]) -> Judged:
     curve = result.curve
     if curve.words and finding.kind not in _OF_WORDS:
         return "undecided", f"{curve.parameter} is not a number"
@@ -94,6 +100,8 @@ def _judge_one(finding: ExpectedFinding, result: CurveResult) -> Judged:
         return "undecided", "no run came to an end"
     if not _is_of_time(finding) and not _has_errors(curve):
         return "undecided", "no run has an error: there is no ground truth, or they are too short"
+    if finding.kind in OF_IMU:
+        return judge_imu(finding, result, results)
     outcome, said = _JUDGES[finding.kind](finding, result)
     # The values of a law are many, and their scatter about it shows with one seed too.
     if outcome == "confirmed" and finding.kind not in _LAWS and curve.ran.any(0).sum() < 2:

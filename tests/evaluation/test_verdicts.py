@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from study_rows import by_seed, outcome, rows_of, verdict
+from study_rows import Formula, by_seed, outcome, rows_of, verdict
 
 from lslam.core.config.study import Kind
 from lslam.core.types.study import FindingVerdict, StudyRow
@@ -79,7 +79,24 @@ def scattered(v: float, seed: int) -> float:
     return float(np.exp(np.random.default_rng([seed, round(10 * v)]).standard_normal()))
 
 
+def both(with_imu: Formula, without: Formula) -> list[StudyRow]:
+    """Errors with the IMU and without."""
+    return rows_of(SKIPS, error=without, noise=0.02) + rows_of(SKIPS, error=with_imu, noise=0.02, uses_imu=True)
+
+
+def of_seeds(change: Callable[[float, int], float]) -> list[StudyRow]:
+    """Errors of 0.3 + 0.05 v without the IMU, and with it a change of each seed's own."""
+    with_imu = by_seed(rows_of(SKIPS, uses_imu=True), lambda v, s: {"thesis_rmse": 0.3 + 0.05 * v + change(v, s - 1)})
+    return rows_of(SKIPS, error=lambda v: 0.3 + 0.05 * v) + with_imu
+
+
 BELOW = {0: 0.9, 1: 0.95, 2: 1.0}
+OF_ERROR = {"of": "translation"}
+RISING = rows_of(SKIPS, error=lambda v: 0.1 + 0.05 * v, noise=0.02)
+FALLING = rows_of(SKIPS, error=lambda v: 0.1 + 1 / v, noise=0.02)
+# One seed falls, one stays, one rises.
+PARTED = by_seed(rows_of(SKIPS), lambda v, s: {"thesis_rmse": 0.5 * (1 + 0.1 * v) ** (s - 1)})
+GENTLE, STEEP = (lambda v: 0.3 + 0.02 * v), (lambda v: 0.3 + 0.05 * v)
 ONE_BELOW = {0: 2.5, 1: 0.5, 2: 0.3}
 CASES = {
     "diverges_beyond": Case(
@@ -128,6 +145,13 @@ CASES = {
         stages({0: 50.0, 1: 3.0}, {0: 0.0, 1: 6.0}),
         {"stages": ["scan"]},
     ),
+    "rises": Case((), RISING, FALLING, PARTED, OF_ERROR),
+    "falls": Case((), FALLING, RISING, PARTED, OF_ERROR),
+    "imu_lowers": Case(
+        (), both(lambda v: 0.3, lambda v: 0.5), both(lambda v: 0.5, lambda v: 0.3), of_seeds(lambda v, s: 0.1 * s), OF_ERROR
+    ),
+    "imu_flattens": Case((), both(GENTLE, STEEP), both(STEEP, GENTLE), of_seeds(lambda v, s: 0.02 * v * s), OF_ERROR),
+    "imu_steepens": Case((), both(STEEP, GENTLE), both(GENTLE, STEEP), of_seeds(lambda v, s: 0.02 * v * s), OF_ERROR),
 }  # fmt: skip
 
 
@@ -228,3 +252,20 @@ def test_finding_at_a_value_of_the_other_parameter() -> None:
 def test_study_without_a_usable_run_decides_nothing(kind: str) -> None:
     rows = [replace(row, status="failed", reason="no data", stages_ms={}) for row in rows_of(SKIPS)]
     assert outcome(rows, kind, 5) == "undecided"
+
+
+def test_what_the_imu_does_asks_for_the_same_runs_without_it() -> None:
+    rows = both(lambda v: 0.3, lambda v: 0.5)
+    for other in (rows[:30] + rows[60:], [replace(row, seed=row.seed + row.uses_imu) for row in rows], rows[60:]):
+        found = verdict(other, "imu_lowers", of="translation")
+        assert (found.outcome, found.measured) == ("undecided", "the same was not run without the IMU")
+    shared = [replace(row, is_timing_comparable=False) for row in rows]
+    assert "shared the machine" in verdict(shared, "imu_lowers", of="time_per_scan").measured
+
+
+def test_a_trend_says_by_how_much() -> None:
+    assert verdict(RISING, "rises", of="translation").measured.startswith("translation of the upper half")
+    few = [row for row in RISING if row.parameters["input.skip_frames"] in (1, 20)]
+    assert verdict(few, "rises", of="translation").outcome == "undecided"
+    lost = by_seed(FALLING, lambda v, s: {"status": "diverged"} if v > 10 else {})
+    assert verdict(lost, "rises", of="translation").outcome == "undecided"

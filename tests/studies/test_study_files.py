@@ -35,7 +35,7 @@ def test_each_study_has_its_runs_on_the_open_flight_and_the_defaults_beside(name
     assert len({job.digest for job in found.jobs}) == len(found.jobs)
     for job in found.jobs:
         assert job.scene is not None
-        assert (job.scene.scenario, job.scene.columns, job.config.map.write) == ("open", 512, False)
+        assert (job.scene.scenario, job.scene.columns, job.config.map.write) == ("open", None, False)
         assert bool(job.config.odometry.preset) is not found.variants[job.method].is_beside
 
 

@@ -17,7 +17,7 @@ from lslam.core.errors import ConfigError, nearest
 
 Kind = Literal[
     "diverges_beyond", "holds_up_to", "best_between", "largest_between", "elbow_at", "good_from", "matters_little",
-    "linear", "inverse", "product", "acts_only_on",
+    "linear", "inverse", "product", "acts_only_on", "rises", "falls", "imu_lowers", "imu_flattens", "imu_steepens",
 ]  # fmt: skip
 Quantity = Literal["translation", "angular", "time_per_scan", "total_time", "efficiency", "total_efficiency"]
 
@@ -26,6 +26,7 @@ _COUNTS: dict[str, tuple[int, int]] = {
     "diverges_beyond": (1, 1), "holds_up_to": (1, 1), "best_between": (2, 2), "largest_between": (2, 2),
     "elbow_at": (1, 1), "good_from": (1, 1), "matters_little": (1, 1),
     "linear": (0, 1), "inverse": (0, 1), "product": (0, 1), "acts_only_on": (0, 0),
+    "rises": (0, 0), "falls": (0, 0), "imu_lowers": (0, 0), "imu_flattens": (0, 0), "imu_steepens": (0, 0),
 }  # fmt: skip
 _LAWS = ("linear", "inverse", "product")
 
@@ -42,6 +43,9 @@ class ExpectedFinding(Section):
     linear, inverse, product [r2] : total time is a x + b, a / x, a y / x with at least this R2 (0.95), and no other of them
         fits as well
     acts_only_on : of all stages of registration the parameter changes the time of `stages` only
+    rises, falls : `of` is larger, or smaller, over the upper half of the values than over the lower half
+    imu_lowers, imu_flattens, imu_steepens : with the IMU `of` is smaller than without, or its slope over the values is smaller,
+        or larger
 
     What differs by less than the seeds scatter is undecided.
     """
