@@ -84,7 +84,9 @@ def judge_number(printed: float, values: Sequence[float], hardness: str = "") ->
     text = f"all {len(values)} runs are {side} by more than {LIKE:g} times"
     if hardness == "as hard":
         return Judgement("refuted", f"{text}, of what was as hard")
-    return Judgement("undecided", f"{text}, of what was {hardness or 'nobody knows how hard'}")
+    return Judgement(
+        "undecided", f"{text}, of what was {hardness}" if hardness else f"{text}; how hard it was nobody knows"
+    )
 
 
 def judge_order(is_smaller: bool, pairs: Sequence[tuple[float, float]]) -> Judgement:

@@ -54,7 +54,7 @@ def collect_run(job: Job, is_reused: bool = False) -> RunScore:
         return RunScore(job.sequence, job.method, job.seed, job.folder, "crashed", "the process left no state behind")
     score = RunScore(
         job.sequence, job.method, job.seed, job.folder, state.status, state.reason, jobs=state.jobs, load=state.load,
-        is_reused=is_reused,
+        is_reused=is_reused, is_timed_alone=state.jobs == 1 and is_comparable(state),
     )  # fmt: skip
     if state.status not in FINAL:
         return score  # what lies in the folder may be an earlier run's

@@ -51,6 +51,7 @@ class RunScore:
     stages : mean seconds per scan of each stage, in order
     limit : seconds one scan may take, or None; note : why there are no errors, for example `no ground truth`
     jobs : runs of the study that shared the machine, 1 when it ran alone; load : of the machine before the study
+    is_timed_alone : had the machine to itself, so that its times can be compared
     machine : versions of Python and libraries
     """
 
@@ -66,6 +67,7 @@ class RunScore:
     note: str = ""
     jobs: int = 1
     load: float = 0.0
+    is_timed_alone: bool = True
     is_reused: bool = False
     machine: dict[str, Any] = field(default_factory=dict)
 
