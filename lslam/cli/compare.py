@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lslam.studies.subjects import Subject
 
 # Options that a comparison that ships with lslam does not have.
-_FIXED = ("preset", "config_file", "gt", "crop", "imu", "data_root")
+_FIXED = ("preset", "config_file", "gt", "crop", "imu")
 
 
 @click.command(
@@ -79,7 +79,8 @@ def command(sequences: tuple[str, ...], **given: Any) -> None:
     """Run methods on the same sequences and write one table and one page about all of them.
 
     SEQUENCE is what `lslam run` takes, or a scenario of `lslam simulate --list`, which is simulated once per seed. NAME is one of
-    --list: what a thesis compared, beside what it prints, with a verdict; the same command again goes on.
+    --list: what a thesis compared, beside what it prints, with a verdict; the same command again goes on. With --data-root
+    del-tufo runs on the thesis' own recording.
     """
     if given["show_list"]:
         _print_list(given["as_json"])
@@ -179,14 +180,20 @@ def _ready_plan(name: str, given: dict[str, Any]) -> Plan:
     from lslam.studies.subjects import find_subjects
 
     ready, is_quick = find_comparison(name), given["quick"]
+    source = click.get_current_context().get_parameter_source("data_root")
+    data_root = given["data_root"] if source is ParameterSource.COMMANDLINE else None
+    if data_root is not None:
+        ready = ready.on_recording(data_root)
     seeds = options.seeds_of(given["seeds"]) if given["seeds"] else ready.quick.seeds if is_quick else ready.seeds
     check_numbers(seeds, given["jobs"], None)
-    out = given["out"] or Path("runs") / (f"{name}-quick" if is_quick else name)
+    marks = [name, *(["recorded"] if data_root else []), *(["quick"] if is_quick else [])]
+    out = given["out"] or Path("runs") / "-".join(marks)
     require_free(out, COMPARISON, "comparison", given["overwrite"], not given["overwrite"])
     common, ranges = options.ranges_of(given, ())
     words = ready.quick.sequences if is_quick else ready.sequences
     return Plan(
-        subjects=tuple(find_subjects(words, None, ranges)),
+        subjects=tuple(find_subjects(words, data_root, ranges)),
+        data_root=data_root,
         variants=tuple(ready.variants([*given["settings"], *common])),
         seeds=seeds,
         out=out,

@@ -14,9 +14,9 @@ from pydantic import Field, ValidationError
 from lslam.core.config import load_config
 from lslam.core.config.config import explain, shipped
 from lslam.core.config.section import Section
-from lslam.core.errors import ConfigError, UsageError, nearest
+from lslam.core.errors import ConfigError, InputError, UsageError, nearest
 from lslam.core.geometry import geodesy, se2
-from lslam.core.printable import significant
+from lslam.core.printable import file_safe, significant
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import RunScore, Table
 from lslam.core.untrusted import parse_toml
@@ -25,6 +25,9 @@ from lslam.evaluation.thesis import RPY
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_files import write_osm
 from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.io.readers import open_sequence
+from lslam.io.readers.kitti_raw import start_on_earth
+from lslam.io.readers.lookup import find_folder
 from lslam.simulation.osm_extract import EXACT, PERTURBED, osm_from_buildings
 from lslam.simulation.osm_perturb import MapFaults, draw_perturbation, perturb
 from lslam.studies.grid import Cell
@@ -78,12 +81,13 @@ START_HEADING_DEG = 5.0
 
 
 class MapKind(Section):
-    """How wrong a map is: m of the whole, m and deg of each house, at most; or as `lslam simulate` perturbs it."""
+    """How wrong a map is: m of the whole, m and deg of each house, at most; or as `lslam simulate` perturbs it; or a file."""
 
     offset_m: float = Field(0.0, ge=0)
     house_m: float = Field(0.0, ge=0)
     house_deg: float = Field(0.0, ge=0)
     perturbed: bool = False
+    file: str = ""
 
 
 class Printed(Section):
@@ -112,6 +116,13 @@ class Quick(Section):
     seeds: tuple[int, ...]
 
 
+class OwnRecording(Section):
+    """The recording of the thesis, below a folder of the user; `settings` are those of the comparison there."""
+
+    sequence: str
+    settings: tuple[str, ...]
+
+
 class ReadyComparison(Section):
     """A comparison with what a thesis prints of it.
 
@@ -126,6 +137,7 @@ class ReadyComparison(Section):
     seeds: tuple[int, ...]
     settings: tuple[str, ...] = ()
     quick: Quick
+    recorded: OwnRecording | None = None
     maps: dict[str, MapKind] = Field(default_factory=dict)
     systems: dict[str, tuple[str, ...]] = Field(default_factory=dict)
     printed: tuple[Printed, ...]
@@ -141,17 +153,44 @@ class ReadyComparison(Section):
             variants += [Variant(name + mark, config, name) for mark in [ON + kind for kind in self.maps] or [""]]
         return variants
 
+    def on_recording(self, data_root: Path) -> ReadyComparison:
+        """The comparison on the thesis' own recording, on the one OSM file in `data_root`.
+
+        Raises UsageError where there is none of this comparison; InputError with a sentence for each thing that is missing.
+        """
+        if self.recorded is None:
+            raise UsageError("--data-root: what this comparison compares is not public; it simulates its drives")
+        word, missing, maps = self.recorded.sequence, [], sorted(data_root.expanduser().glob("*.osm"))
+        folder = data_root / "sequences" / word
+        try:
+            folder = find_folder(word, data_root)
+            word = file_safe(open_sequence(folder).name)
+        except InputError as error:
+            missing.append(f"no scans: {error}.")
+        try:
+            start_on_earth(folder, data_root)
+        except InputError as error:
+            missing.append(f"no place and heading at the start: {error}.")
+        if len(maps) != 1:
+            fetch = f"lslam osm fetch --along {self.recorded.sequence} --data-root {data_root} --out {data_root / 'town.osm'}"
+            missing.append(f"no map: one *.osm is wanted in {data_root}, not {len(maps)}; `{fetch}` makes it.")
+        if missing:
+            raise InputError("\n".join(missing))
+        of_recording = {
+            "sequences": (self.recorded.sequence,),
+            "settings": self.recorded.settings,
+            "maps": {"osm": MapKind(file=str(maps[0].absolute()))},
+            "quick": self.quick.model_copy(update={"sequences": (self.recorded.sequence,)}),
+            "printed": tuple(p.model_copy(update={"sequence": word}) for p in self.printed),
+        }
+        return self.model_copy(update=of_recording)
+
     def fitted(self, variants: Sequence[Variant], cell: Cell, out: Path) -> list[Variant]:
         """The variants with the map of a simulated drive, its place and heading; drift is drawn by the drive's seed."""
         if not self.maps:
             return [v for v in variants if v.name not in self.systems or self._of(cell.sequence, v.name)]
-        T_enu_world, origin = _world_of(cell)
-        first = T_enu_world @ read_trajectory(cell.path / "truth" / "trajectory.tum").poses[0]
-        start = geodesy.from_local(first[None, :3, 3], origin)[0]
-        place = {
-            "origin": tuple(start.tolist()),
-            "heading_deg": 90.0 - float(np.degrees(se2.of_se3(first[None])[0, 2])),
-        }
+        start, heading_deg = start_on_earth(cell.path, cell.data_root) if cell.seed is None else _start_of(cell)
+        place = {"origin": tuple(start.tolist()), "heading_deg": heading_deg}
         on_map = []
         for variant in variants:
             config = variant.config
@@ -169,6 +208,8 @@ class ReadyComparison(Section):
         errors = self.maps[kind]
         if errors == MapKind():
             return cell.path / EXACT
+        if errors.file:
+            return Path(errors.file)
         if errors.perturbed:
             return cell.path / PERTURBED
         path = out / MAPS / f"{cell.sequence}-{cell.seed}-{kind}.osm"
@@ -237,8 +278,8 @@ class ReadyComparison(Section):
                 ours, theirs = (_values(runs, sequence, name, QUANTITIES[stated.of]) for name in (method, right))
                 pairs = [(ours[seed], theirs[seed]) for seed in ours if seed in theirs]
                 judgement = judge_order(a < b, pairs)
-                if stated.of == "time" and any(run.jobs > 1 for run in runs if run.sequence == sequence):
-                    judgement = Judgement("undecided", f"{judgement.why}; runs shared the machine (--jobs)")
+                if stated.of == "time" and any(not r.is_timed_alone for r in runs if r.sequence == sequence):
+                    judgement = Judgement("undecided", f"{judgement.why}; runs shared the machine")
                 rows.append(
                     (stated.text, sequence + kind, f"{a / b:.2f}", judgement.verdict, judgement.why, stated.source)
                 )
@@ -251,6 +292,13 @@ def _world_of(cell: Cell) -> tuple[Floats, Floats]:
     """T_enu_world (4, 4) of a simulated drive, and latitude, longitude (deg) and height (m) of its origin."""
     world = parse_toml((cell.path / "truth" / "world.toml").read_text(encoding="utf-8"))
     return np.array(world["T_enu_world"]), np.array(world["origin_lat_lon_alt"])
+
+
+def _start_of(cell: Cell) -> tuple[Floats, float]:
+    """Latitude, longitude (deg), height (m) and heading (deg clockwise from north) of a simulated drive's first pose."""
+    T_enu_world, origin = _world_of(cell)
+    first = T_enu_world @ read_trajectory(cell.path / "truth" / "trajectory.tum").poses[0]
+    return geodesy.from_local(first[None, :3, 3], origin)[0], 90.0 - float(np.degrees(se2.of_se3(first[None])[0, 2]))
 
 
 def _values(runs: Sequence[RunScore], sequence: str, method: str, of: Quantity) -> dict[int, float]:

@@ -145,7 +145,11 @@ def test_one_failed_run_is_exit_code_0_and_4_with_strict(torn: Path, tmp_path: P
             UsageError,
             "block-0 has 95 scans: start = 95 goes",
         ),
-        (["del-tufo", "--data-root", "kitti"], click.UsageError, "--data-root is not of del-tufo"),
+        (
+            ["girolimetto", "--data-root", "kitti"],
+            UsageError,
+            "--data-root: what this comparison compares is not public",
+        ),
         (["girolimetto", "--preset", "hdl"], click.UsageError, "--preset is not of girolimetto"),
     ],
 )

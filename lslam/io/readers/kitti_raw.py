@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from lslam.core.errors import InputError, input_errors
-from lslam.core.geometry import se3
+from lslam.core.geometry import geodesy, se3, so3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.sequence import Calibration, Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.calibration_files import read_raw_cam0_lidar, read_rigid
-from lslam.io.formats.kitti_layout import ACCEL, GYRO, POS_ACC, Oxts, read_oxts
+from lslam.io.formats.kitti_layout import ACCEL, GYRO, POS_ACC, ROLL, YAW, Oxts, read_oxts
 from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.formats.time_columns import read_stamps
@@ -282,32 +282,12 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
     """Sequence with a stream of its raw drive. Raises InputError naming `what` is missing, and the `file` that holds it."""
     if not isinstance(sequence, FolderSequence):
         raise why_none(sequence.bag, kind)  # type: ignore[attr-defined]
-    date, number, first = DRIVES[sequence_number(sequence.path.name)]
-    roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
-    places = dict.fromkeys([*roots, sequence.path, *list(sequence.path.parents)[: 1 + _UPWARDS], Path.cwd()])
-    folders = [
-        place / above / day / f"{date}_drive_{number:04d}_{kind}"
-        for kind in ("extract", "sync")
-        for above, day in (("raw", date), ("", date), ("raw", ""), ("", ""), ("kitti_raw", date))
-        for place in places
-    ]
-    drive = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
-    if drive is None:
-        named = ", ".join(map(str, dict.fromkeys([*roots, Path.cwd()])))
-        raise InputError(
-            f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and for the raw drive "
-            f"raw/{date}/{date}_drive_{number:04d}_sync or _extract, with or without raw/ and {date}/, in {named}, that folder "
-            f"and the {_UPWARDS} above it; fetch the drive, or run without {kind.wish}"
-        )
-    beside = [folder / CALIBRATION for folder in (drive.parent, drive, drive.parent / date, drive.parent.parent)]
-    calibration = next((path for path in beside if path.is_file()), None)
-    if calibration is None:
-        raise InputError(f"{beside[0]} is missing: it says how the IMU sits, fetch the calibration of that day")
-    oxts = read_oxts(drive / "oxts")
-    if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns):
-        raise InputError(f"{drive / 'oxts'} holds no samples with stamps (data/*.txt and timestamps.txt)")
+    first = DRIVES[sequence_number(sequence.path.name)][2]
+    missing = f"{sequence.path} has no {what}, as in KITTI odometry: looked for {sequence.path / file} and"
+    drive, calibration = _drive_of(sequence.path, data_root, missing, kind.wish)
+    oxts, oxts_ns = _samples(drive)
     begin_ns, clock = _begin(drive, first)
-    stamps_ns = oxts.stamps_ns - begin_ns + int(sequence.stamps_ns[0])
+    stamps_ns = oxts_ns - begin_ns + int(sequence.stamps_ns[0])
     rate_hz = 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
     source = f"{drive} at {rate_hz:.0f} Hz, its frame {first} by {clock} taken as the first scan"
     imu, gnss = oxts_streams(oxts, stamps_ns)
@@ -320,6 +300,55 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
     )  # fmt: skip
     problems = list(dict.fromkeys([*sequence.problems, *oxts.problems]))
     return replace(sequence, notes=[*sequence.notes, f"{kind.name} of {source}"], problems=problems, **parts)
+
+
+def start_on_earth(folder: Path, data_root: Path | None = None) -> tuple[Floats, float]:
+    """Where the LiDAR of a KITTI odometry sequence is at its first scan, by OXTS of the raw drive, which `with_imu` finds.
+
+    (3,) latitude, longitude (deg) and height (m), and its heading, deg clockwise from north. `folder` may not exist.
+    Raises InputError naming the paths looked at.
+    """
+    drive, calibration = _drive_of(folder, data_root, "no OXTS: looked", "it")
+    first = DRIVES[sequence_number(folder.name)][2]
+    oxts, oxts_ns = _samples(drive)
+    sample = oxts.values[np.abs(oxts_ns - _begin(drive, first)[0]).argmin()]
+    T_enu_imu = se3.make(so3.from_euler_rpy(sample[None, ROLL : YAW + 1])[0], np.zeros(3))
+    T_enu_lidar = T_enu_imu @ se3.inverse(read_rigid(calibration))
+    place = geodesy.from_local(T_enu_lidar[None, :3, 3], sample[:3])[0]
+    return place, 90.0 - float(np.degrees(np.arctan2(T_enu_lidar[1, 0], T_enu_lidar[0, 0])))
+
+
+def _drive_of(folder: Path, data_root: Path | None, missing: str, wish: str) -> tuple[Path, Path]:
+    """Raw drive of the sequence in `folder` and its calibration; raises InputError that begins with what is `missing`."""
+    date, number, _ = DRIVES[sequence_number(folder.name)]
+    roots = [Path(root).expanduser() for root in (data_root, os.environ.get("LSLAM_DATA")) if root]
+    places = dict.fromkeys([*roots, folder, *list(folder.parents)[: 1 + _UPWARDS], Path.cwd()])
+    folders = [
+        place / above / day / f"{date}_drive_{number:04d}_{kind}"
+        for kind in ("extract", "sync")
+        for above, day in (("raw", date), ("", date), ("raw", ""), ("", ""), ("kitti_raw", date))
+        for place in places
+    ]
+    drive = next((f for f in folders if (f / "oxts" / "data").is_dir()), None)
+    if drive is None:
+        named = ", ".join(map(str, dict.fromkeys([*roots, Path.cwd()])))
+        raise InputError(
+            f"{missing} for the raw drive "
+            f"raw/{date}/{date}_drive_{number:04d}_sync or _extract, with or without raw/ and {date}/, in {named}, that folder "
+            f"and the {_UPWARDS} above it; fetch the drive, or run without {wish}"
+        )
+    beside = [folder / CALIBRATION for folder in (drive.parent, drive, drive.parent / date, drive.parent.parent)]
+    calibration = next((path for path in beside if path.is_file()), None)
+    if calibration is None:
+        raise InputError(f"{beside[0]} is missing: it says how the IMU sits, fetch the calibration of that day")
+    return drive, calibration
+
+
+def _samples(drive: Path) -> tuple[Oxts, Longs]:
+    oxts = read_oxts(drive / "oxts")
+    if oxts is None or oxts.stamps_ns is None or not len(oxts.stamps_ns):
+        raise InputError(f"{drive / 'oxts'} holds no samples with stamps (data/*.txt and timestamps.txt)")
+    return oxts, oxts.stamps_ns
 
 
 def _begin(drive: Path, first: int) -> tuple[int, str]:
