@@ -37,7 +37,7 @@ STARTED_S = time.time()
 REGION = re.compile(r"(<!-- table (.+?) -->\n```bash\n(.*?)\n```\n\n)(.*?)(\n\n\|.*?<!-- end -->)", re.DOTALL)
 MARK = re.compile(r"\nMeasured before the changes since (\w{8})\.$")
 # Options whose folder a benchmark fills; other folders hold recordings.
-SCRATCH = ("--runs", "--folder", "--work")
+SCRATCH = ("--runs", "--folder", "--work", "--keep")
 SHOWN = 6
 
 
