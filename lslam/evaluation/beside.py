@@ -13,6 +13,8 @@ Verdict = Literal["reproduced", "refuted", "undecided"]
 LIKE = 2.0
 # As seldom chance alone may put every seed on one side.
 CHANCE = 0.05
+# Share by which two numbers differ at least, or they are alike: 1 mm of 9 cm in each seed is no gain.
+ALIKE = 0.05
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ def judge_number(printed: float, values: Sequence[float], hardness: str = "") ->
 def judge_order(is_smaller: bool, pairs: Sequence[tuple[float, float]]) -> Judgement:
     """Whether the first of each pair, of one seed, is smaller (or larger) than the second, as it is stated.
 
-    Decided where every seed says the same and so many of them do not by chance.
+    Decided where every seed says the same, so many of them do not by chance, and by more than ALIKE.
 
     >>> judge_order(True, [(1, 2)] * 5).verdict, judge_order(False, [(1, 2)] * 5).verdict, judge_order(True, [(1, 2)] * 4).verdict
     ('reproduced', 'refuted', 'undecided')
@@ -107,4 +109,6 @@ def judge_order(is_smaller: bool, pairs: Sequence[tuple[float, float]]) -> Judge
     is_certain = agree in (0, len(pairs)) and len(unequal) == len(pairs) and 0.5 ** len(pairs) < CHANCE
     if not is_certain:
         return Judgement("undecided", text)
+    if finite and abs(np.median(finite) - 1) < ALIKE:
+        return Judgement("undecided", f"{text}, which is alike")
     return Judgement("reproduced" if agree else "refuted", text)

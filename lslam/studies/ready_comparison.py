@@ -284,7 +284,9 @@ class ReadyComparison(Section):
                     (stated.text, sequence + kind, f"{a / b:.2f}", judgement.verdict, judgement.why, stated.source)
                 )
         header = ("the thesis", "drive", "its ratio", "verdict", "here", "source")
-        recipe = "stated: decided where all seeds say the same, five or more of them"
+        recipe = (
+            "stated: decided where all seeds say the same, five or more of them, by a twentieth or more in the median"
+        )
         return Table("beside the thesis, system against system", header, tuple(rows), recipe)
 
 

@@ -1,105 +1,81 @@
-"""Girolimetto's presets, without and with the IMU, on its flights, clean and hard, before and after the pose graph.
+"""The comparisons with both theses that ship with lslam, as tables of the documents.
 
-    python tests/benchmarks/theses.py [--flights closed,open,open-hard] [--seeds 100-104] [--write docs/theses.md]
+    python tests/benchmarks/theses.py girolimetto|del-tufo [--quick] [--seeds 100-104] [--jobs 2] [--runs FOLDER] [--write FILE]
 
-`thesis_rmse` of the odometry and of what the graph made of it, m: root mean square over all 3 N coordinates, first pose on
-the first true pose; below them the angular error of the odometry, deg, equation 2.15: how hard a flight is. `failed` is a run
-that said `diverged`. The climb is flown a second time with returns of 70 m: hardly a beam ends within the 50 m of the presets.
+Runs `lslam compare NAME`; runs in FOLDER are kept and gone on with. Three tables are made of what it says: numbers of each
+drive and system beside the thesis', what is stated of one system against another, and what no number is printed of.
+Runs are made by other processes, whose code `ages.py` does not see: `ages.py --made TABLE` then.
 """
 
 from __future__ import annotations
 
 import argparse
-import logging
-from itertools import product
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
 
 import tables
-from traced import Traced, run_on, traced
 
-from lslam.core.errors import LslamError
-from lslam.evaluation.associate import associate
-from lslam.evaluation.thesis import axis_errors
+from lslam.cli.compare import command
+from lslam.studies.output import COMPARISON
+from lslam.studies.ready_comparison import comparison_names
 
-# Name, scenario, and keys beside the preset's: for the climb the thesis widened its range, by how much it does not say.
-FLIGHTS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "open": ("open", ()),
-    "open-hard": ("open-hard", ()),
-    "small-eight": ("small-eight", ()),
-    "closed": ("closed", ()),
-    "large-eight": ("large-eight", ()),
-    "climbing": ("climbing", ()),
-    "climbing-70m": ("climbing", ("preprocess.range_max=70",)),
-}
-PRESETS = ("thesis-icp", "thesis-loam", "thesis-loam-map")
-QUANTITIES = ("before the graph, m", "after it, m", "angular, deg")
-NONE = ("",) * 6
-# What the thesis prints of each quantity (tables 4.3 to 4.16, 5.2 to 5.4), without and with the IMU.
-PRINTED: dict[str, tuple[tuple[str, ...], ...]] = {
-    "closed": (
-        ("2.05", "0.43", "1.57", "", "0.86", "0.65"),
-        ("1.17", "0.41", "1.00", "", "0.86", "0.65"),
-        ("1.31", "0.83", "1.28", "", "1.37", "0.96"),
-    ),
-    "open": (("0.84", "0.42", "0.84", "", "0.58", "0.51"), NONE, ("2.12", "1.55", "1.67", "", "1.61", "1.57")),
-    "climbing": (("0.35", "", "1.95", "", "1.04", ""), NONE, ("1.56", "", "3.32", "", "2.19", "")),
-    "small-eight": (
-        ("0.68", "0.34", "0.70", "", "0.41", "0.38"),
-        ("0.45", "0.33", "0.63", "", "0.40", "0.36"),
-        ("1.93", "1.70", "2.81", "", "1.85", "1.96"),
-    ),
-    "large-eight": (
-        ("0.72", "", "2.16", "", "0.64", ""),
-        ("0.53", "", "1.07", "", "0.61", ""),
-        ("1.29", "", "3.43", "", "1.84", ""),
-    ),
-}
+MARKS = {"reproduced": " +", "refuted": " -", "undecided": ""}
 
 
-def judged(drive: Traced, preset: str, uses_imu: bool, more: tuple[str, ...]) -> tuple[float, float, float]:
-    """Each of QUANTITIES; inf where the run failed."""
-    settings = [f"odometry.preset={preset}", f"imu.use={str(uses_imu).lower()}", "map.write=false", *more]
-    try:
-        outcome = run_on(drive, *settings)
-    except LslamError:
-        return (float("inf"),) * 3
-    poses = (outcome.record.odometry or outcome.trajectory, outcome.trajectory)
-    matches = [associate(trajectory, drive.ground_truth, 0.01, 0) for trajectory in poses]
-    before, after = (axis_errors(m.estimate, m.truth) for m in matches)
-    return before.thesis_rmse, after.thesis_rmse, before.angular_rmse_deg
+def compared(name: str, folder: Path, options: list[str]) -> dict[str, Any]:
+    """The document of the comparison."""
+    command.main([name, "--out", str(folder), "--table", "csv", "-q", *options], standalone_mode=False)
+    document: dict[str, Any] = json.loads((folder / COMPARISON).read_text(encoding="utf-8"))
+    return document
+
+
+def numbers(table: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """A row per drive and system, a column per quantity."""
+    rows = [dict(zip(table["header"], row, strict=True)) for row in table["rows"]]
+    quantities = list(dict.fromkeys(row["quantity"] for row in rows))
+    cells: dict[tuple[str, str, str], dict[str, str]] = {}
+    for row in rows:
+        own = cells.setdefault((row["sequence"], row["method"], row["ours was"]), {})
+        own[row["quantity"]] = f"{row['ours']} ({row['thesis']}){MARKS[row['verdict']]}"
+    header = ["drive", "system", "ours was", *quantities]
+    return header, [[*key, *(own.get(each, "") for each in quantities)] for key, own in cells.items()]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--flights", default=",".join(FLIGHTS))
-    tables.offer(parser)
+    parser.add_argument("name", choices=comparison_names())
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--seeds")
+    parser.add_argument("--jobs", default="1")
+    parser.add_argument("--runs", type=Path, metavar="FOLDER")
+    tables.offer(parser, seeds=None)
     args = parser.parse_args()
-    logging.getLogger("lslam").setLevel(logging.CRITICAL)
-    flights, seeds = args.flights.split(","), tables.numbers(args.seeds)
-    systems = list(product(PRESETS, (False, True)))
-    found: dict[str, list[list[tuple[float, float, float]]]] = {}
-    for flight, seed in product(flights, seeds):
-        scenario, more = FLIGHTS[flight]
-        drive = traced(scenario, seed, imu="icm20948")
-        for system in systems:
-            errors = judged(drive, *system, more)
-            said = " ".join(f"{error:9.3f}" for error in errors)
-            print(f"{flight:12} {seed:4d} {system[0]:16} {'imu' if system[1] else '-':4} {said}", flush=True)
-            found.setdefault(flight, [[] for _ in systems])[systems.index(system)].append(errors)
-    caption = (
-        f"`thesis_rmse`, first pose on the first true pose, and the angular error of the odometry, whole flights, median / "
-        f"worst of {tables.seeds_named(seeds)}; in brackets what the thesis prints."
+    options = [
+        "--jobs",
+        args.jobs,
+        *(["--quick"] if args.quick else []),
+        *(["--seeds", args.seeds] if args.seeds else []),
+    ]
+    with tempfile.TemporaryDirectory() as scratch:
+        document = compared(args.name, args.runs or Path(scratch) / args.name, options)
+    beside, stated, unprinted = document["beside"]
+    seeds = tables.seeds_named(sorted({run["seed"] for run in document["runs"]}))
+    recipe = (
+        "ours, median / worst, and in brackets what the thesis prints; + reproduced, - refuted, else undecided; `ours was`: how "
+        "hard, by the angular error"
     )
-    header = ["flight", "", *(name + (" --imu" if uses_imu else "") for name, uses_imu in systems)]
-    rows = []
-    for flight, columns in found.items():
-        printed = PRINTED.get(flight.removesuffix("-hard").removesuffix("-70m"), (NONE,) * 3)
-        for k, quantity in enumerate(QUANTITIES):
-            cells = [
-                tables.spread([errors[k] for errors in runs]) + (f" ({told})" if told else "")
-                for runs, told in zip(columns, printed[k], strict=True)
-            ]
-            rows.append([flight, quantity, *cells])
-    tables.table("theses", caption, header, rows, args.write)
+    made = (
+        ("", recipe, *numbers(beside)),
+        *(
+            (f"-{mark}", of["recipe"], of["header"], of["rows"])
+            for mark, of in (("stated", stated), ("unprinted", unprinted))
+        ),
+    )
+    for mark, said, header, rows in made:
+        if rows:
+            tables.table(f"{args.name}{mark}", f"On {seeds}: {said}.", header, rows, args.write)
 
 
 if __name__ == "__main__":

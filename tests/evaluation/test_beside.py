@@ -40,6 +40,8 @@ def test_a_number_of_one_is_judged_by_all_runs_and_refuted_at_equal_hardness_onl
         ([(1.0, inf)] * 5, "reproduced"),
         ([(1.0, 2.0)] * 5 + [(1.0, 1.0)], "undecided"),
         ([(inf, inf)] * 5, "undecided"),
+        ([(1.0, 1.02)] * 9, "undecided"),
+        ([(1.0, 1.1)] * 5, "reproduced"),
         ([], "undecided"),
     ],
 )
