@@ -1,4 +1,4 @@
-"""Second pass over the raw scans: the merged map and the feature map, from the final poses."""
+"""Second pass over the raw scans: the merged map, from the final poses."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lslam.core.config import Config
 from lslam.core.config.outputs import MapConfig
-from lslam.core.errors import InputError, InterruptedRunError, LslamError
-from lslam.core.geometry import se3
+from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory, thinned
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.core.types.run_record import FeatureView
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
@@ -32,23 +29,17 @@ from lslam.maps.floor_plan import TopView, top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
-from lslam.odometry.base import FeatureSource
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import Loaded
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
-from lslam.registration.preprocessing.features import Features
 from lslam.registration.preprocessing.ground import Z, world_up_of
 
 log = logging.getLogger("lslam")
 
 SAMPLE = 150_000  # points that a page shows in 3D: 12 bytes each in it
 INTERRUPTED = "interrupted while the map was built: nothing of it is written"
-EDGE, PLANE = 1, 0
-FEATURES_INTERRUPTED = "interrupted while the feature map was built: nothing of it is written"
-# Scans looked at, evenly spaced over the run: enough for a course in time, a second of work.
-MOST_SCANS = 30
 
 
 @dataclass(frozen=True)
@@ -288,108 +279,3 @@ def map_checkpoints(folder: RunFolder, config: Config, what: str = "map") -> Map
     if every_s == 0:
         return None
     return MapCheckpoints(Checkpoints(folder.path / CHECKPOINT, what.replace(" ", "-"), every_s), what)
-
-
-@dataclass(frozen=True)
-class FeatureCloud:
-    """One averaged point per voxel and kind, world frame.
-
-    points : (M, 3) float64, m; kinds : (M,) uint8, EDGE 1 or PLANE 0
-    """
-
-    points: Floats
-    kinds: NDArray[np.uint8]
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
-class FeatureMaker:
-    """Averages less sharp edges and less planar points in voxels; keep : folder for a map that can be resumed."""
-
-    def __init__(self, voxel: float, reach: float, keep: Path | None = None) -> None:
-        self._parts = {
-            name: MapMerger(voxel, 0.0, reach, keep=None if keep is None else keep / name)
-            for name in ("edges", "planes")
-        }
-
-    def add(self, features: Features, T_world_lidar: Floats) -> None:
-        """Add the features of a scan at its pose (4, 4)."""
-        self._parts["edges"].add(features.less_edges.points, T_world_lidar)
-        self._parts["planes"].add(features.less_planes.points, T_world_lidar)
-
-    def finish(self) -> FeatureCloud:
-        """Map of all added features."""
-        both = [part.result().points for part in self._parts.values()]
-        kinds = np.repeat(np.array([EDGE, PLANE], np.uint8), [len(points) for points in both])
-        return FeatureCloud(np.concatenate(both), kinds)
-
-    def state(self) -> State:
-        """State for `restore`; the voxels are written to `keep`."""
-        return {name: part.state() for name, part in self._parts.items()}
-
-    def restore(self, state: State) -> None:
-        """Restore `state` in an empty maker of the same kind. Raises InputError when voxels are missing."""
-        for name, part in self._parts.items():
-            part.restore(state[name])
-
-
-def build_feature_map(
-    sequence: Sequence, odometry: FeatureSource, results: list[ScanResult], config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool], checkpoints: MapCheckpoints | None = None,
-) -> FeatureCloud:  # fmt: skip
-    """Map of the less sharp edges and less planar points of all registered scans, in voxels of `loam.feature_map_voxel`.
-
-    Raises InterruptedRunError when `should_stop` says so; `checkpoints` then allow to continue.
-    """
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
-    poses = np.stack([r.T_world_lidar for r in results])
-
-    def make() -> FeatureMaker:
-        keep = None if checkpoints is None else checkpoints.folder
-        return FeatureMaker(config.loam.feature_map_voxel, config.preprocess.range_max, keep)
-
-    maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
-    numbers, offer = range(done, len(results)), None if checkpoints is None else partial(checkpoints.offer, maker)
-    for k, loaded in scans_again(
-        sequence, odometry.prepare, numbers, config, on_step, should_stop, FEATURES_INTERRUPTED, done, offer
-    ):
-        if loaded.scan is not None and results[k].status == "ok":
-            motion = motion_within(loaded.scan, stamps, poses)
-            maker.add(odometry.features_of(loaded.prepared, motion), results[k].T_world_lidar)
-    with asking(should_stop, FEATURES_INTERRUPTED):
-        return maker.finish()
-
-
-def view_features(sequence: Sequence, odometry: FeatureSource, results: list[ScanResult]) -> FeatureView | None:
-    """Features of some of the registered scans, at their final poses; None without any.
-
-    A scan that can no longer be read, or has no features, is left out.
-    """
-    registered = [k for k, result in enumerate(results) if result.status == "ok"]
-    chosen = [registered[i] for i in np.linspace(0, len(registered) - 1, min(MOST_SCANS, len(registered))).astype(int)]
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
-    poses = np.stack([r.T_world_lidar for r in results]) if results else np.zeros((0, 4, 4))
-    seen = []
-    for k in chosen:
-        try:
-            scan = sequence.scan(k)
-            found = odometry.features_of(odometry.prepare(scan), motion_within(scan, stamps, poses))
-        except LslamError:
-            continue
-        seen.append((k, found))
-    if not seen:
-        return None
-    middle, shown = seen[len(seen) // 2]
-    others = (shown.less_edges, shown.less_planes, shown.neither)
-    return FeatureView(
-        scan=results[middle].index,
-        edges=shown.edges.points[:, :2],
-        planes=shown.planes.points[:, :2],
-        around=np.concatenate([part.points for part in others]),
-        map_edges=np.concatenate([se3.apply(poses[k], f.less_edges.points) for k, f in seen]),
-        map_planes=np.concatenate([se3.apply(poses[k], f.less_planes.points) for k, f in seen]),
-        scans=np.array([results[k].index for k, _ in seen], np.int64),
-        edge_counts=np.array([len(f.edges) for _, f in seen], np.int64),
-        plane_counts=np.array([len(f.planes) for _, f in seen], np.int64),
-    )

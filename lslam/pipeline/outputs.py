@@ -30,8 +30,9 @@ from lslam.io.formats.atomic import write_text
 from lslam.io.formats.ply_files import write_ply
 from lslam.io.formats.trajectory_files import write_kitti, write_tum
 from lslam.pipeline import map_files
+from lslam.pipeline.feature_map_pass import FeatureCloud
 from lslam.pipeline.map_files import LOCAL
-from lslam.pipeline.map_pass import BuiltMap, FeatureCloud
+from lslam.pipeline.map_pass import BuiltMap
 from lslam.pipeline.run_folder import RunFolder
 from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix

@@ -15,8 +15,8 @@ from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
 from lslam.osm.buildings_geojson import read_corrected
+from lslam.pipeline.feature_map_pass import view_features
 from lslam.pipeline.job import choose_scans
-from lslam.pipeline.map_pass import view_features
 from lslam.pipeline.rebuild import is_gone, read_run, results_of, viewed_run
 from lslam.pipeline.resume import open_again
 from lslam.reports.figures import ON_THE_MAP, WIDTHS, PlottedRun, draw_figure, require_figure

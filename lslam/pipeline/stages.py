@@ -32,10 +32,11 @@ from lslam.odometry.base import FeatureSource
 from lslam.osm.corrections import write_buildings
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import describe, level_world, optimise_poses, write_back_end
+from lslam.pipeline.feature_map_pass import build_feature_map, view_features
 from lslam.pipeline.job import PreparedRun, fit_to_scene, stoppable
 from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.map_pass import build_feature_map, build_map, map_checkpoints, view_features
+from lslam.pipeline.map_pass import build_map, map_checkpoints
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder, check_place, spool_of, upload
