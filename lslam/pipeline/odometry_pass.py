@@ -46,6 +46,7 @@ from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.precompile import helped, load_kernels
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.pipeline.segments import checks_within, join_segments
+from lslam.registration.local_map import surroundings_m
 
 log = logging.getLogger("lslam")
 
@@ -89,6 +90,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
             initial_scans=config.registration.start_scans, stationary=stationary, motion=motion,
             should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing, checkpoints=checkpoints, monitor=monitor,
             noise_m=config.registration.sigma,
+            beyond_m=surroundings_m(config.registration),
         )  # fmt: skip
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:

@@ -27,6 +27,11 @@ LEAST_BREADTH = SIGNIFICANT_SIGMAS**2
 WIDE_FACTORS = (2, 4)
 
 
+def surroundings_m(config: RegistrationConfig) -> float:
+    """How far from a spot scans share no voxel with it but the widest: their rings hit other ground."""
+    return config.voxel_size * config.coarse_factor * WIDE_FACTORS[0]
+
+
 class LocalMap(Stateful):
     """Gaussian voxels of four sizes around the sensor.
 

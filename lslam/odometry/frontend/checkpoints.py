@@ -21,6 +21,8 @@ from lslam.core.types.imu import (
     MotionState,
     PreintegratedStep,
 )
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import MotionCheck, ScanEquations, ScanResult
 from lslam.core.types.state import State
 from lslam.core.types.warned import warnings_so_far
@@ -28,6 +30,8 @@ from lslam.io.formats.state_files import Records, read_state, write_state
 from lslam.odometry.base import Resumable
 from lslam.odometry.feature_map import FeatureScan
 from lslam.odometry.frontend.keyframing import Keyframing
+from lslam.odometry.frontend.segments import Tracked
+from lslam.odometry.frontend.tracker import Loaded
 from lslam.odometry.frontend.windows import WindowTracker
 from lslam.odometry.icp_svd import Partners
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
@@ -43,9 +47,9 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 
 STATE_CLASSES = (
     Constraint, FeaturePoints, Features, FeatureScan, GravityDirection, Gyroscope, ImuEstimate, ImuDiagnostics, ImuNoise,
-    ImuState, ImuStream, InertialState, InertialStep, Landmarks, LoopCandidate, MapFix, Moment, MotionCheck, MotionState,
-    NavigationState, Partners, Past, PlaneWindow, PreintegratedStep, PreparedPoints, ScanEquations, ScanResult, Seen, Sightings,
-    InertialStart, Window, WindowPrior, WindowValues,
+    ImuState, ImuStream, InertialState, InertialStep, Landmarks, Loaded, LoopCandidate, MapFix, Moment, MotionCheck, MotionPrior,
+    MotionState, NavigationState, Partners, Past, PlaneWindow, PreintegratedStep, PreparedPoints, Scan, ScanEquations, ScanResult,
+    Seen, Sightings, InertialStart, Tracked, Window, WindowPrior, WindowValues,
 )  # fmt: skip
 
 

@@ -33,6 +33,7 @@ from lslam.odometry.integrity.monitor import IntegrityMonitor
 from lslam.odometry.scan_outcome import measurable
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.acceptance import PRIOR_COVARIANCE
+from lslam.registration.local_map import surroundings_m
 
 # Of a pose in a frame of which nobody knows where it lies, m2 and rad2.
 UNBOUNDED = np.diag(np.full(6, np.inf))
@@ -55,6 +56,7 @@ def estimate(
     checkpoints: OdometryCheckpoints | None = None,
     monitor: IntegrityMonitor | None = None,
     noise_m: float = RegistrationConfig().sigma,
+    beyond_m: float = surroundings_m(RegistrationConfig()),
 ) -> list[ScanResult]:
     """Register every scan of the sequence; stops early on `should_stop` only.
 
@@ -63,10 +65,11 @@ def estimate(
     `motion` predicts the scans, constant velocity when None.
     `keyframing` sees every scan and how the sensor moved within it. `checkpoints`, which need keyframing, say where an
     earlier run left off and keep what this one does. `monitor` checks the pose of every scan. `noise_m` is that of a point, below
-    which a bend within sweeps is none, as in `WindowTracker`.
+    which a bend within sweeps is none, and scans beyond `beyond_m` see the surroundings of the first from elsewhere, as in
+    `WindowTracker`.
     """
     tracker = SegmentTracker(Tracker(odometry, stationary, motion), begin, initial_scans)
-    windows = WindowTracker(tracker, monitor, noise_m)
+    windows = WindowTracker(tracker, monitor, noise_m, beyond_m)
     results: list[ScanResult] = []
     if checkpoints is not None and keyframing is not None:
         results = checkpoints.begin(windows, keyframing)

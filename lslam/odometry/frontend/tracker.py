@@ -233,8 +233,8 @@ class Tracker(Stateful):
         fused = self._checked(odometry, scan.stamp_ns, near, expected, None, clock)
         if fused.is_accepted:
             return _both(located, fused)
-        apart, off = (_apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
-        source = located if near.ok and apart < SAME_MINIMUM_RATIO * off else rejected
+        away, off = (apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
+        source = located if near.ok and away < SAME_MINIMUM_RATIO * off else rejected
         # Where nothing is found near by, the first registration enters with the points as they are seen from there.
         base = near
         if not near.ok:
@@ -292,10 +292,10 @@ def _matrix_norm(prior: Floats, pose: Floats) -> float:
 
 def _distance(before: MotionPrior, after: MotionPrior) -> float:
     """How far the motion from a sweep's start to its end differs, m, at a lever arm of `LEVER_M`."""
-    return _apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
+    return apart(*(se3.relative(prior.poses[0], prior.poses[-1]) for prior in (before, after)))
 
 
-def _apart(a: Floats, b: Floats) -> float:
+def apart(a: Floats, b: Floats) -> float:
     """How far two poses (4, 4) are apart, m, at a lever arm of `LEVER_M`."""
     change = se3.relative(a, b)
     return float(np.linalg.norm(change[:3, 3]) + LEVER_M * so3.angle(change[:3, :3]))

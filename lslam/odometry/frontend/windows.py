@@ -1,6 +1,7 @@
 """Windows of scans, tracked again along the course that they tell where constant velocity displaces their points.
 
-The first scan of a run is registered again, on a map of those that follow.
+The first scan of a run is registered again, on a map of those that follow; of a run that begins at rest, once they see its
+surroundings from elsewhere.
 """
 
 from __future__ import annotations
@@ -12,35 +13,41 @@ from dataclasses import replace
 
 import numpy as np
 
-from lslam.core.geometry import se3
+from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Resumable
 from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import Loaded, Tracker, apart
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import NEIGHBOUR_SWEEPS, Course
 from lslam.odometry.integrity.monitor import IntegrityMonitor
+from lslam.registration.rest import INLIER_CHI2
 from lslam.registration.robust import is_more
 
 
-def first_pose(decided: list[Tracked], initial_scans: int, create: Callable[[], Deskewing]) -> Floats:
-    """(4, 4) pose of the first scan on the map of the later ones, the initial ones left out.
+def first_pose(
+    decided: list[Tracked], initial_scans: int, create: Callable[[], Deskewing]
+) -> tuple[Floats, Floats | None]:
+    """(4, 4) pose of the first scan on the map of the later ones, the initial ones left out, and its covariance (6, 6) there.
 
     The second scan is registered on a map of the first alone. One scan shows surfaces along its rings only: their tilt is known
     badly, and its error stays between the first pose and all others. A map of many scans has none of it.
 
     create : makes the method with an empty map
-    The pose stays where fewer than `initial_scans` later ones make a map, that does not hold the first in all directions, or an
-    initial one was not registered, or taken at rest: their poses are one. So it does where a smoother links each scan to the one
-    before.
+    The pose stays, and there is no covariance, where fewer than `initial_scans` later ones make a map, that does not hold the
+    first in all directions, or an initial one was not registered, or taken at rest. So it is where a smoother links each scan
+    to the one before.
     """
-    first, later = decided[0], [k for k in range(initial_scans, len(decided)) if _is_placed(decided[k])]
+    stays, later = (
+        decided[0].result.T_world_lidar,
+        [k for k in range(initial_scans, len(decided)) if _is_placed(decided[k])],
+    )
     is_linked = any(tracked.sweep.link is not None for tracked in decided)
     if is_linked or len(later) < initial_scans or not all(_is_placed(tracked) for tracked in decided[:initial_scans]):
-        return first.result.T_world_lidar
+        return stays, None
     priors, empty, target = _priors(decided), create(), create()
     # Backwards, so that a map of the last scans alone has the nearest ones.
     for k in reversed(later):
@@ -48,9 +55,11 @@ def first_pose(decided: list[Tracked], initial_scans: int, create: Callable[[], 
         scan, prepared = decided[k].loaded.scan, decided[k].loaded.prepared
         assert scan is not None
         target.update(scan, priors[k], empty.register(scan, prepared, priors[k]))
-    assert first.loaded.scan is not None
-    result = target.register(first.loaded.scan, first.loaded.prepared, priors[0], is_near=True)
-    return result.T_world_lidar if result.is_accepted and len(result.degenerate) == 0 else first.result.T_world_lidar
+    first = decided[0].loaded
+    assert first.scan is not None
+    result = target.register(first.scan, first.prepared, priors[0], is_near=True)
+    is_better = result.is_accepted and len(result.degenerate) == 0
+    return (result.T_world_lidar, result.covariance) if is_better else (stays, None)
 
 
 def _priors(decided: list[Tracked]) -> list[MotionPrior]:
@@ -68,16 +77,29 @@ def _priors(decided: list[Tracked]) -> list[MotionPrior]:
     return out
 
 
+def _tied(tracked: Tracked, position: Floats, covariance: Floats) -> Tracked:
+    """With the covariance (6, 6) of the pose at `position` (3,), m, to which its own is relative."""
+    result = tracked.result
+    spread = noise.transported(covariance, result.T_world_lidar[:3, 3] - position)
+    own, by_points = (None if C is None else C + spread for C in (result.covariance, result.points_covariance))
+    return replace(tracked, result=replace(result, covariance=own, points_covariance=by_points))
+
+
 def _is_placed(tracked: Tracked) -> bool:
     """Whether a scan was registered, of a sensor that moved, on the first map of the run."""
+    return _is_registered(tracked) and not tracked.result.is_stationary
+
+
+def _is_registered(tracked: Tracked) -> bool:
+    """Whether a scan was registered on the first map of the run."""
     result = tracked.result
-    return (
-        tracked.loaded.scan is not None and result.status == "ok" and result.segment == 0 and not result.is_stationary
-    )
+    return tracked.loaded.scan is not None and result.status == "ok" and result.segment == 0
 
 
 # Scans: two seconds, which are held in memory.
 WINDOW_SCANS = 20
+# Of a run that began at rest, the first scan and the pose (4, 4) of its spot.
+Rest = tuple[Tracked, Floats]
 
 
 class WindowTracker(Stateful):
@@ -88,14 +110,19 @@ class WindowTracker(Stateful):
     from where a window began.
 
     The first scans of a run are a window whatever the method: with it the pose of the first is known, as in `first_pose`.
+    Scans from one spot hit the same places, so that a map of them, however many, knows surfaces as one scan does, and draws
+    those from near by. Where a run begins at rest they are decided as they come, and a window begins as the sensor leaves. Once
+    enough of it lies beyond `beyond_m` the first scan is registered on a map of that. The scans at rest move with it as one.
 
-    monitor : sees the scans that are decided; noise_m : of a point
+    monitor : sees the scans that are decided; noise_m : of a point; beyond_m : how far scans from elsewhere are
     """
 
-    STATE = ("_tracker", "_before", "_world", "_monitor")
+    STATE = ("_tracker", "_before", "_world", "_monitor", "_rest", "_start")
 
-    def __init__(self, tracker: SegmentTracker, monitor: IntegrityMonitor | None, noise_m: float) -> None:
-        self._tracker, self._monitor, self._noise_m = tracker, monitor, noise_m
+    def __init__(
+        self, tracker: SegmentTracker, monitor: IntegrityMonitor | None, noise_m: float, beyond_m: float
+    ) -> None:
+        self._tracker, self._monitor, self._noise_m, self._beyond_m = tracker, monitor, noise_m, beyond_m
         self.is_windowed = (
             tracker.odometry.follows_course
             and isinstance(tracker.odometry, Resumable)
@@ -104,11 +131,15 @@ class WindowTracker(Stateful):
         # Of the open window, None: the end of the recording.
         self._scans: list[Loaded | None] = []
         self._decided: list[Tracked] = []
-        self._start: State = {}
+        self._begin: State = {}
         # Instants, ns, and poses of the last middles before the window.
         self._before: list[tuple[int, Floats]] = []
         # The tracker's world in that of the first pose as later scans tell it; None until they do.
         self._world: Floats | None = None if self._can_look_back else np.eye(4)
+        # Of a run that began at rest, until then.
+        self._rest: Rest | None = None
+        # From then on, of such a run: the first position (3,), and the covariance (6, 6) of its registration, in that world.
+        self._start: tuple[Floats, Floats] | None = None
 
     @property
     def middle(self) -> tuple[int, Floats]:
@@ -137,7 +168,7 @@ class WindowTracker(Stateful):
         if not self._scans:
             if not self._is_begin(loaded):
                 return
-            self._start = deepcopy(self._tracker.state())
+            self._begin = deepcopy(self._tracker.state())
         self._scans.append(loaded)
 
     def decide(self, loaded: Loaded | None, result: ScanResult | None) -> list[Tracked]:
@@ -149,29 +180,67 @@ class WindowTracker(Stateful):
         if not self._scans:
             return self._moved(decided)
         self._decided += decided
-        is_full = len(self._scans) >= WINDOW_SCANS and self._tracker.is_settled
-        return self._close() if is_full or loaded is None else []
+        return self._close() if loaded is None or (self._tracker.is_settled and self._is_full()) else []
 
     def state(self) -> State:
         """What `restore` needs to go on from where the open window begins."""
-        return {**super().state(), **({"_tracker": self._start} if self._scans else {})}
+        return {**super().state(), **({"_tracker": self._begin} if self._scans else {})}
 
     def _is_begin(self, loaded: Loaded | None) -> bool:
         """Whether a window begins with the scan."""
         scan = None if loaded is None else loaded.scan
         if scan is None or not self._tracker.is_settled:
             return False
-        return self._world is None or (self.is_windowed and scan.span.seconds > 0)
+        is_looking_back = self._world is None and (
+            self._rest is None or self._has_left(self._tracker.middle[1], self._rest)
+        )
+        return is_looking_back or (self.is_windowed and scan.span.seconds > 0)
+
+    def _is_full(self) -> bool:
+        """Whether the window ends with its newest scan: where it has all of its scans, or the sensor leaves its first spot."""
+        count, rest = len(self._scans), self._resting()
+        if rest is None:
+            return count >= WINDOW_SCANS
+        begin, end = (self._has_left(self._decided[k].result.T_world_lidar, rest) for k in (0, -1))
+        if begin:
+            return count >= 2 * WINDOW_SCANS or len(self._elsewhere(self._decided, rest)) >= WINDOW_SCANS
+        return end or count >= WINDOW_SCANS
+
+    def _resting(self) -> Rest | None:
+        """The first scan of a run that began at rest and was not registered again yet, and its spot; None of other runs.
+
+        The scans after it tell the spot: it alone is known badly.
+        """
+        if self._world is not None or self._rest is not None:
+            return self._rest
+        initial = self._decided[: self._tracker.initial_scans]
+        if len(initial) < self._tracker.initial_scans or not all(_is_registered(tracked) for tracked in initial):
+            return None
+        rest = initial[0], initial[-1].result.T_world_lidar
+        if any(self._has_left(tracked.result.T_world_lidar, rest) for tracked in initial[1:]):
+            return None
+        return replace(initial[0], sweep=_priors(initial)[0]), rest[1]
+
+    def _has_left(self, pose: Floats, rest: Rest) -> bool:
+        """Whether a pose (4, 4) is so far from the first spot that a single point would tell, at three sigma."""
+        return apart(rest[1], pose) ** 2 > INLIER_CHI2 * self._noise_m**2
+
+    def _elsewhere(self, decided: list[Tracked], rest: Rest) -> list[Tracked]:
+        """The registered scans that lie beyond the surroundings of the first spot."""
+        start = rest[1][:3, 3]
+        far = [np.linalg.norm(t.result.T_world_lidar[:3, 3] - start) > self._beyond_m for t in decided]
+        return [t for t, is_far in zip(decided, far, strict=True) if is_far and _is_placed(t)]
 
     def _close(self) -> list[Tracked]:
         """The scans of the window, the first of a run where the later ones put it."""
         is_bent = self.is_windowed and self._follow_course()
         out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
         self._before = self._middles()[-NEIGHBOUR_SWEEPS:]
+        here: list[Tracked] = []
         if self._world is None:
-            out[0] = self._look_back(out)
+            here, out = self._look_back(out)
         self._scans, self._decided = [], []
-        return self._moved(out)
+        return [*here, *self._moved(out)]
 
     def _follow_course(self) -> bool:
         """Track the window along its course where it bends and more points agree along it in most scans; whether it does."""
@@ -188,9 +257,12 @@ class WindowTracker(Stateful):
         self._set_course(None)
         return is_bent
 
-    def _look_back(self, decided: list[Tracked]) -> Tracked:
-        """The first scan on the map of the later ones, in the tracker's world, which turns with its pose."""
-        begin, first, began = self._tracker.begin, decided[0], time.perf_counter()
+    def _look_back(self, decided: list[Tracked]) -> tuple[list[Tracked], list[Tracked]]:
+        """The window's scans at the spot of a start at rest, and all others, in the tracker's world.
+
+        That turns with the first scan, which is put on the map of later ones.
+        """
+        begin, began = self._tracker.begin, time.perf_counter()
         assert begin is not None
 
         def create() -> Deskewing:
@@ -198,15 +270,31 @@ class WindowTracker(Stateful):
             assert isinstance(odometry, Deskewing)
             return odometry
 
-        pose = first_pose(decided, self._tracker.initial_scans, create)
-        self._world = se3.normalise(first.result.T_world_lidar @ se3.inverse(pose))
-        stages = _sum(first.result.stages, {"register": time.perf_counter() - began})
-        return replace(first, result=replace(first.result, stages=stages)).at(pose)
+        self._rest = self._resting()
+        used, initial_scans, here = decided, self._tracker.initial_scans, 0
+        if self._rest is not None:
+            later = self._elsewhere(decided, self._rest)
+            if len(later) < initial_scans and decided[-1].result.segment == 0:
+                return [], decided
+            left = [k for k, t in enumerate(decided) if self._has_left(t.result.T_world_lidar, self._rest)]
+            used, initial_scans, here = [self._rest[0], *later], 1, min(left, default=len(decided))
+        pose, covariance = first_pose(used, initial_scans, create)
+        before = used[0].result.T_world_lidar
+        self._world = se3.normalise(before @ se3.inverse(pose))
+        stages = _sum(decided[0].result.stages, {"register": time.perf_counter() - began})
+        out = [replace(decided[0], result=replace(decided[0].result, stages=stages)), *decided[1:]]
+        if self._rest is None:
+            return [], [out[0].at(pose), *out[1:]]
+        if covariance is not None:
+            self._start = before[:3, 3], noise.rotated(covariance, self._world[:3, :3])
+        self._rest = None
+        return out[:here], out[here:]
 
     def _moved(self, decided: list[Tracked]) -> list[Tracked]:
         """In the world of the first pose."""
-        world = self._world
-        return decided if world is None else [tracked.moved(world) for tracked in decided]
+        world, start = self._world, self._start
+        moved = decided if world is None else [tracked.moved(world) for tracked in decided]
+        return moved if start is None else [_tied(tracked, *start) for tracked in moved]
 
     def _inliers(self) -> list[int]:
         return [tracked.result.inliers for tracked in self._decided]
@@ -222,7 +310,7 @@ class WindowTracker(Stateful):
 
     def _track_again(self, course: Course | None) -> None:
         earlier = [tracked.result for tracked in self._decided]
-        self._tracker.restore(deepcopy(self._start))
+        self._tracker.restore(deepcopy(self._begin))
         self._set_course(course)
         self._decided = []
         for loaded in self._scans:

@@ -25,6 +25,7 @@ from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.frontend.windows import WINDOW_SCANS, WindowTracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.course import Course
+from lslam.registration.local_map import surroundings_m
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 
@@ -56,7 +57,7 @@ def windows_of(config: Config, *, is_windowed: bool = True) -> WindowTracker:
 
     # One scan that initialises a map: none is registered again on a map of later ones.
     tracker = SegmentTracker(Tracker(create_odometry(config)), begin, initial_scans=1)
-    windows = WindowTracker(tracker, None, config.registration.sigma)
+    windows = WindowTracker(tracker, None, config.registration.sigma, surroundings_m(config.registration))
     windows.is_windowed = windows.is_windowed and is_windowed
     return windows
 
