@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import astuple, fields, is_dataclass, replace
+from dataclasses import astuple, dataclass, fields, is_dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -156,9 +156,16 @@ def test_results_come_back_to_the_last_bit(tmp_path: Path) -> None:
                 assert type(getattr(one, field.name)) is type(getattr(other, field.name)), field.name
 
 
+@dataclass
+class Foreign:
+    """A record of another program."""
+
+    count: int
+
+
 def test_only_known_records_are_made_of_a_file(tmp_path: Path) -> None:
-    write_state(tmp_path / "a.npz", {"scan": Scan(np.zeros((1, 3), np.float32), 0, 0)})
-    with pytest.raises(InputError, match=r"a\.npz is damaged: KeyError 'Scan'"):
+    write_state(tmp_path / "a.npz", {"record": Foreign(1)})
+    with pytest.raises(InputError, match=r"a\.npz is damaged: KeyError 'Foreign'"):
         read_state(tmp_path / "a.npz", STATE_CLASSES)
     with pytest.raises(TypeError, match="object"):
         write_state(tmp_path / "b.npz", object())
