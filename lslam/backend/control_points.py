@@ -37,9 +37,13 @@ MOST_SAID = 6
 
 
 def with_control(
-    placement: Placement, points: Many[ControlPoint], results: Many[ScanResult], keyframes: Many[Keyframe],
-    up: Floats | None, config: Config,
-) -> Placement:  # fmt: skip
+    placement: Placement,
+    points: Many[ControlPoint],
+    results: Many[ScanResult],
+    keyframes: Many[Keyframe],
+    up: Floats | None,
+    config: Config,
+) -> Placement:
     """The placement with the control points as held fixes; where there is none, they give it.
 
     results : at the poses of odometry; up : (3,) up in their world as an IMU has it, None for how the sensor is mounted
@@ -211,9 +215,12 @@ def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Conf
 
 
 def where_held(
-    keyframes: list[Keyframe], known: list[LoopCandidate], points: Many[ControlPoint], results: list[ScanResult],
+    keyframes: list[Keyframe],
+    known: list[LoopCandidate],
+    points: Many[ControlPoint],
+    results: list[ScanResult],
     config: Config,
-) -> list[Keyframe]:  # fmt: skip
+) -> list[Keyframe]:
     """The keyframes where odometry, known pairs and control points put them: further loop closures are searched from there."""
     loops = [c.constraint for c in known if c.is_accepted and c.constraint is not None]
     if len(keyframes) < 2 or not (loops or points):
@@ -235,9 +242,12 @@ def where_held(
 
 
 def doubts(
-    keyframes: list[Keyframe], known: list[LoopCandidate], pairs: Many[KnownPair], results: list[ScanResult],
+    keyframes: list[Keyframe],
+    known: list[LoopCandidate],
+    pairs: Many[KnownPair],
+    results: list[ScanResult],
     config: Config,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """A sentence for each known pair that does not register, and for each that odometry contradicts, which holds all the same."""
     texts = [
         f"{pair.said}: the scans of the known pair do not close a loop: {candidate.reason}"

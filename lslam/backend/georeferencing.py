@@ -97,9 +97,13 @@ def require_crs(origin: Floats, config: GnssConfig) -> None:
 
 
 def place(
-    sequence: Sequence, results: Many[ScanResult], keyframes: Many[Keyframe], up: Floats | None, graph: PoseGraph,
+    sequence: Sequence,
+    results: Many[ScanResult],
+    keyframes: Many[Keyframe],
+    up: Floats | None,
+    graph: PoseGraph,
     config: Config,
-) -> Placement:  # fmt: skip
+) -> Placement:
     """Fit the run's trajectory to its fixes.
 
     up : (3,) up in the world of the trajectory as an IMU has it, or None; graph : of the keyframes, without the fixes
@@ -125,8 +129,11 @@ def place(
     georeference, shift = _at_first(alignment, fixes, config.gnss)
     log.info(
         "GNSS: %d of %d fixes are inliers, %.2f m rms from the antenna horizontally, %.2f m vertically",
-        georeference.used, georeference.fixes, georeference.rmse_horizontal, georeference.rmse_vertical,
-    )  # fmt: skip
+        georeference.used,
+        georeference.fixes,
+        georeference.rmse_horizontal,
+        georeference.rmse_vertical,
+    )
     fix_noise, walk = None, 0.0
     if config.gnss.mode == "graph":
         fix_noise, walk = _fix_noise(fixes, alignment, keyframes, graph, config)
@@ -142,9 +149,16 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     spread = None if graph.spread is None else noise.rotated(graph.spread, T[:3, :3])
     up = np.array([0.0, 0.0, 1.0])
     return replace(
-        graph, poses=T @ graph.poses, fixes=placement.fixes, world_up=up, is_anchored=False, spread=spread,
-        fix_noise=placement.fix_noise, walk=max(graph.walk, placement.walk), tilt_sigma=placement.tilt_sigma,
-    )  # fmt: skip
+        graph,
+        poses=T @ graph.poses,
+        fixes=placement.fixes,
+        world_up=up,
+        is_anchored=False,
+        spread=spread,
+        fix_noise=placement.fix_noise,
+        walk=max(graph.walk, placement.walk),
+        tilt_sigma=placement.tilt_sigma,
+    )
 
 
 def final_fixes(sequence: Sequence, results: Many[ScanResult], config: Config) -> Fixes | None:
@@ -285,20 +299,25 @@ def _fix_noise(
     places = se3.apply(alignment.T_enu_world, graph.poses[:, :3, 3])
     drift = DriftOfFixes(constant + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])
     fix_noise, walk = fit_gauss_markov(
-        1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]), alignment.residuals[good], fixes.sigmas[good],
-        (fixes.positions - alignment.residuals)[good], config.graph.probability, drift,
+        1e-9 * (fixes.stamps_ns[good] - fixes.stamps_ns[0]),
+        alignment.residuals[good],
+        fixes.sigmas[good],
+        (fixes.positions - alignment.residuals)[good],
+        config.graph.probability,
+        drift,
         config.gnss.max_sigma if fixes.is_refuted else None,
-    )  # fmt: skip
+    )
     if fix_noise is not None:
         log.info(
             "GNSS: errors of fixes are correlated: noise of %.2f m over %.0f s is estimated",
-            fix_noise.sigma[0], fix_noise.memory,
-        )  # fmt: skip
+            fix_noise.sigma[0],
+            fix_noise.memory,
+        )
     if walk > 0:
         log.info(
             "GNSS: odometry drifts by more than its covariances, by about %.2f m after 100 m",
             np.sqrt(walk * drift_covariance(100.0, config.graph)[0, 0]),
-        )  # fmt: skip
+        )
     return fix_noise, walk
 
 
@@ -309,9 +328,13 @@ def _owners(fixes: Fixes, keyframes: Many[Keyframe]) -> NDArray[np.intp]:
 
 
 def _as_factors(
-    fixes: Fixes, alignment: GnssAlignment, shift: Floats, results: Many[ScanResult], keyframes: Many[Keyframe],
+    fixes: Fixes,
+    alignment: GnssAlignment,
+    shift: Floats,
+    results: Many[ScanResult],
+    keyframes: Many[Keyframe],
     fix_noise: GaussMarkovNoise | None,
-) -> tuple[PositionFix, ...]:  # fmt: skip
+) -> tuple[PositionFix, ...]:
     """Position factors, each from the keyframe before the fix; gross outliers are left out."""
     near = np.linalg.norm(alignment.residuals / np.hypot(fixes.sigmas, fixes.slack[:, None]), axis=1) < ABSURD
     owners = _owners(fixes, keyframes)

@@ -56,10 +56,17 @@ Hold = Callable[[PoseGraph, Placement, Given], BackEnd | None]
 
 
 def run_back_end(
-    sequence: Sequence, results: list[ScanResult], store: KeyframeStore, config: Config,
-    candidates: list[LoopCandidate], turns: Many[Turn] = (), hold: Hold | None = None,
-    clocks: KeyframeClocks | None = None, inertial: InertialChain | None = None, points: Many[ControlPoint] = (),
-) -> BackEnd:  # fmt: skip
+    sequence: Sequence,
+    results: list[ScanResult],
+    store: KeyframeStore,
+    config: Config,
+    candidates: list[LoopCandidate],
+    turns: Many[Turn] = (),
+    hold: Hold | None = None,
+    clocks: KeyframeClocks | None = None,
+    inertial: InertialChain | None = None,
+    points: Many[ControlPoint] = (),
+) -> BackEnd:
     """Optimise the pose graph with loop closures, fixes and map priors, and correct all scans; odometry's poses on failure.
 
     points : control points, which hold
@@ -183,9 +190,7 @@ def _said(placement: Placement, given: Given) -> Placement:
     return placement
 
 
-def _by_fixes(
-    sequence: Sequence, graph: PoseGraph, given: Given, results: list[ScanResult] | None = None
-) -> Placement:  # fmt: skip
+def _by_fixes(sequence: Sequence, graph: PoseGraph, given: Given, results: list[ScanResult] | None = None) -> Placement:
     """Placement of the graph's poses by the fixes of a run.
 
     results : all scans at those poses; None for odometry's scans moved with the keyframes

@@ -31,9 +31,7 @@ log = logging.getLogger("lslam")
 
 # Names of the rates of an estimated drift, from walls and from loop closures.
 _OF_WALLS = ("east_percent", "north_percent", "left_deg_per_100m")
-_OF_LOOPS = (
-    "x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m"
-)  # fmt: skip
+_OF_LOOPS = ("x_percent", "y_percent", "z_percent", "about_x_deg_per_100m", "about_y_deg_per_100m", "left_deg_per_100m")
 # Keyframes before and after each end of the loop whose clouds are shown.
 CLOUD_KEYFRAMES = 10
 
@@ -115,8 +113,12 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     judged, accepted = judged_by(given.candidates, graph, solution)
     log.info(
         "pose graph: %d keyframes, %d of %d loop closures accepted, drift factor %.3g, %d rounds",
-        len(graph), len(accepted), len(graph.loops), solution.drift, solution.rounds,
-    )  # fmt: skip
+        len(graph),
+        len(accepted),
+        len(graph.loops),
+        solution.drift,
+        solution.rounds,
+    )
     T = np.eye(4) if georeference is None else georeference.T_enu_world
     facts = _facts(solution, graph, T @ _odometry(given), given.candidates, accepted)
     tilts = not accepted and tilt_factor(graph, config.graph) > 0
@@ -147,8 +149,9 @@ def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
         shift, turn = (float(np.linalg.norm(part)) for part in np.split(graph.estimated_drift.rates, 2))
         log.info(
             "loop closures: steady drift of odometry, %.1f %% and %.1f deg/100 m, is corrected",
-            100 * shift, 100 * np.degrees(turn),
-        )  # fmt: skip
+            100 * shift,
+            100 * np.degrees(turn),
+        )
     return graph
 
 

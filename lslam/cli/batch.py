@@ -120,11 +120,15 @@ def _print_plan(expanded: ExpandedStudy, as_json: bool) -> None:
     if as_json:
         runs = [
             {
-                "sequence": job.sequence, "method": job.method, "seed": job.seed, "path": str(job.path),
-                "folder": str(job.folder), "refusal": job.refusal or None,
+                "sequence": job.sequence,
+                "method": job.method,
+                "seed": job.seed,
+                "path": str(job.path),
+                "folder": str(job.folder),
+                "refusal": job.refusal or None,
             }
             for job in expanded.jobs
-        ]  # fmt: skip
+        ]
         show(json.dumps({"runs": runs}) + "\n")
         return
     lines = [f"{job.name}  {job.folder}{f'  ({job.refusal})' if job.refusal else ''}\n" for job in expanded.jobs]

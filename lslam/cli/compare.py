@@ -37,9 +37,10 @@ _FIXED = ("preset", "config_file", "gt", "crop", "imu")
 @click.option("--list", "show_list", is_flag=True, help="List the comparisons that ship with lslam.")
 @click.option("--quick", is_flag=True, help="Of a comparison of --list: few drives and seeds, in minutes.")
 @click.option(
-    "--methods", metavar="A,B,...",
+    "--methods",
+    metavar="A,B,...",
     help="Names of `lslam methods`, presets or configuration files; the first is the reference.",
-)  # fmt: skip
+)
 @options.preset
 @click.option(
     "--seeds",

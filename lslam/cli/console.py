@@ -201,9 +201,12 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[A
 
     whole = Column(no_wrap=True)
     columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(table_column=whole),
-        TimeRemainingColumn(table_column=whole) if left is None else LeftColumn(table_column=whole), PaceColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(table_column=whole),
+        TimeRemainingColumn(table_column=whole) if left is None else LeftColumn(table_column=whole),
+        PaceColumn(),
+    )
     with Progress(*columns, console=terminal(), transient=True) as bar:
         task = bar.add_task(title, total=total, rate="")
         began = time.monotonic()

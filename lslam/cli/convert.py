@@ -37,14 +37,18 @@ Examples:
 @click.command(epilog=EPILOG)
 @click.argument("source")
 @click.option(
-    "--to", "kind", type=click.Choice(list(dict.fromkeys((*SEQUENCES, *WRITTEN, *EARTH, "gpkg")))),
+    "--to",
+    "kind",
+    type=click.Choice(list(dict.fromkeys((*SEQUENCES, *WRITTEN, *EARTH, "gpkg")))),
     help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both; kml, gpx and gpkg for "
     "georeferenced runs  [--out's suffix].",
-)  # fmt: skip
+)
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="PATH",
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="PATH",
     help="File or folder to write  [RUN/run.mcap and so on, of a run to a bag].",
-)  # fmt: skip
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing PATH.")
 @click.option("--zstd", "is_zstd", is_flag=True, help="Compress (mcap, sqlite).")
 @click.option(
@@ -59,9 +63,10 @@ Examples:
     "--sequence", type=click.Path(path_type=Path), metavar="PATH", help="RUN to a bag: the raw scans, when they moved."
 )
 @click.option(
-    "--lidars", type=click.Choice(["merged", "topics", "frames"]),
+    "--lidars",
+    type=click.Choice(["merged", "topics", "frames"]),
     help="Several LiDARs to a bag: each on a topic of its own, or all on one  [merged into one].",
-)  # fmt: skip
+)
 @options.scan_range
 @click.option(
     "--frame", metavar="BODY", help="Trajectory: lidar, cam0 or imu [default: what the format usually holds]."
@@ -153,10 +158,15 @@ def _convert_sequence(source: str, kind: str, out: Path, given: dict[str, Any]) 
         raise click.UsageError(f"--deskewed {given['deskewed']}: positions without rotations deskew no scan")
     with progress("convert", len(sequence)) as advance:
         done = convert_sequence(
-            sequence, kind, out,
-            is_zstd=given["is_zstd"], overwrite=given["overwrite"], trajectory=trajectory, lidars=given["lidars"] or "merged",
+            sequence,
+            kind,
+            out,
+            is_zstd=given["is_zstd"],
+            overwrite=given["overwrite"],
+            trajectory=trajectory,
+            lidars=given["lidars"] or "merged",
             on_scan=advance,
-        )  # fmt: skip
+        )
     left = f", {done.skipped} that could not be read left out" if done.skipped else ""
     values = {"scans": done.scans, "skipped": done.skipped}
     _print(f"{done.path}: {done.scans} scans{left}", done.path, kind, values, given)
@@ -182,9 +192,15 @@ def _convert_run(folder: Path, kind: str, out: Path | None, given: dict[str, Any
         scans = open_scans(run, given["sequence"], flag=flag, **options.reading_of(given))
     with progress("convert", len(run.trajectory)) as advance:
         done = convert_run(
-            run, scans, kind, out,
-            voxel=given["voxel"] or 0.0, is_zstd=given["is_zstd"], overwrite=given["overwrite"], on_scan=advance,
-        )  # fmt: skip
+            run,
+            scans,
+            kind,
+            out,
+            voxel=given["voxel"] or 0.0,
+            is_zstd=given["is_zstd"],
+            overwrite=given["overwrite"],
+            on_scan=advance,
+        )
     text = f"{done.path}: {done.poses} poses, {done.clouds} clouds, a map of {done.map_points} points"
     values = {"poses": done.poses, "clouds": done.clouds, "map_points": done.map_points}
     _print(text, done.path, kind, values, given)

@@ -19,15 +19,20 @@ from lslam.core.errors import UsageError
 )
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
 @click.option(
-    "--loops", "loops_file", type=click.Path(path_type=Path), metavar="FILE",
+    "--loops",
+    "loops_file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
     help="CSV of pairs of scans that are loops, or must not be: scan_a,scan_b,verdict (known, forbidden); loops.csv of the "
     "run with these words in it will do.",
-)  # fmt: skip
+)
 @click.option("--only-known", is_flag=True, help="Close the known pairs alone, search no others.")
 @click.option(
-    "--control", type=click.Path(path_type=Path), metavar="FILE",
+    "--control",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
     help="CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs.",
-)  # fmt: skip
+)
 @options.fixes_as_factors
 @options.fixes_at_the_end
 @options.coordinates
@@ -39,9 +44,12 @@ from lslam.core.errors import UsageError
 @options.replaced
 @options.reading
 @click.option(
-    "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE",
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="SECTION.KEY=VALUE",
     help="Set one configuration key of what follows odometry; repeatable.",
-)  # fmt: skip
+)
 @options.as_json
 @options.verbosity
 def command(run: Path, **given: Any) -> None:

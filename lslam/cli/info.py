@@ -58,8 +58,14 @@ def _size(count: int) -> str:
 @click.command(epilog="Example: lslam info sample_data")
 @click.argument("sequence")
 @options.data_root
-@click.option("--scans", type=click.IntRange(min=1), default=50, show_default=True, metavar="N",
-              help="Number of scans whose points are examined, spread evenly.")  # fmt: skip
+@click.option(
+    "--scans",
+    type=click.IntRange(min=1),
+    default=50,
+    show_default=True,
+    metavar="N",
+    help="Number of scans whose points are examined, spread evenly.",
+)
 @click.option("--all", "all_scans", is_flag=True, help="Examine the points of every scan.")
 @click.option("--rows", type=int, metavar="N", help="Organised clouds: rows (rings).")
 @click.option("--cols", type=int, metavar="N", help="Organised clouds: columns.")
@@ -68,8 +74,12 @@ def _size(count: int) -> str:
     is_flag=True,
     help="Register no scans: the IMU's clock and axes, and the order of the points, are not checked.",
 )
-@click.option("--imu-toml", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-              help="Write the IMU's noise as a configuration for --config.")  # fmt: skip
+@click.option(
+    "--imu-toml",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write the IMU's noise as a configuration for --config.",
+)
 @options.reading
 @options.as_json
 def command(
@@ -199,8 +209,11 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _looked_at(points: dict[str, Any]) -> str:
     """Number of scans read, with those unreadable or empty."""
-    extra = [f"{points[key]} {word}" for key, word in (("scans_unreadable", "unreadable"), ("scans_empty", "empty"))
-             if points[key]]  # fmt: skip
+    extra = [
+        f"{points[key]} {word}"
+        for key, word in (("scans_unreadable", "unreadable"), ("scans_empty", "empty"))
+        if points[key]
+    ]
     return f"{points['scans_read'] + points['scans_unreadable']}" + (f" ({', '.join(extra)})" if extra else "")
 
 

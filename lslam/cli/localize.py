@@ -19,13 +19,18 @@ from lslam.cli import run as main_job
 )
 @click.argument("sequence")
 @click.option(
-    "--map", "map_path", type=click.Path(path_type=Path), metavar="MAP", required=True,
+    "--map",
+    "map_path",
+    type=click.Path(path_type=Path),
+    metavar="MAP",
+    required=True,
     help="Run folder, folder of tiles, or a cloud: PLY, PCD, LAS or LAZ.",
-)  # fmt: skip
+)
 @click.option(
-    "--start", metavar="X,Y,HEADING",
+    "--start",
+    metavar="X,Y,HEADING",
     help="Place of the first scan in the map, m, and heading, deg counter-clockwise from its x axis [default: searched].",
-)  # fmt: skip
+)
 @click.option("--gnss", is_flag=True, help="Search the start about the first satellite fix, in a georeferenced map.")
 @options.method
 @options.preset

@@ -115,9 +115,13 @@ def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None
     epilog="Example: lslam run sample_data --out runs/first",
 )
 @click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_print_version,
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
     help="Show the versions of lslam and its libraries.",
-)  # fmt: skip
+)
 def cli() -> None:
     """Batch LiDAR SLAM: a recorded sequence goes in; a trajectory, a map and an honest report come out."""
 

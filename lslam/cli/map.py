@@ -24,8 +24,19 @@ if TYPE_CHECKING:
 
 # What a map is made with, and how clouds are scored: no part of a comparison of drives.
 _OTHERS = (
-    "file_format", "crop", "clean", "occupancy", "denoise", "mesh", "crs", "geoid", "out", "is_scored", "threshold", "radius",
-)  # fmt: skip
+    "file_format",
+    "crop",
+    "clean",
+    "occupancy",
+    "denoise",
+    "mesh",
+    "crs",
+    "geoid",
+    "out",
+    "is_scored",
+    "threshold",
+    "radius",
+)
 _FLAGS = {"file_format": "format", "is_scored": "score"}
 # Rows of the table, at most; the files have all.
 _MOST = 20
@@ -71,14 +82,22 @@ def _print_changes(folder: Path, found: ChangedCells, as_json: bool) -> None:
 
     things = [properties(number, change) for number, change in enumerate(found.changes, 1)]
     cells = {
-        "same": len(found.same), "occupied_new": found.occupied_new, "occupied_old": found.occupied_old,
-        "unseen_new": found.unseen_new, "unseen_old": found.unseen_old,
-    }  # fmt: skip
+        "same": len(found.same),
+        "occupied_new": found.occupied_new,
+        "occupied_old": found.occupied_old,
+        "unseen_new": found.unseen_new,
+        "unseen_old": found.unseen_old,
+    }
     if as_json:
         document = {
-            "cloud": str(folder / CLOUD), "areas": str(folder / AREAS), "voxel_m": found.voxel, "cells": cells,
-            "appeared": len(found.of("appeared")), "vanished": len(found.of("vanished")), "things": things,
-        }  # fmt: skip
+            "cloud": str(folder / CLOUD),
+            "areas": str(folder / AREAS),
+            "voxel_m": found.voxel,
+            "cells": cells,
+            "appeared": len(found.of("appeared")),
+            "vanished": len(found.of("vanished")),
+            "things": things,
+        }
         show(json.dumps(document, allow_nan=False) + "\n")
         return
     rows = [
@@ -147,9 +166,11 @@ Examples:
     help="--against RUN: write there what appeared and vanished.",
 )
 @click.option(
-    "--against-sequence", type=click.Path(path_type=Path), metavar="PATH",
+    "--against-sequence",
+    type=click.Path(path_type=Path),
+    metavar="PATH",
     help="--changes: sequence of the other run's raw scans, when it has moved.",
-)  # fmt: skip
+)
 @click.option("--threshold", type=float, metavar="M", help="--against: largest distance of matching points  [0.2].")
 @click.option("--radius", type=float, metavar="M", help="--score: radius of neighbourhoods  [0.5].")
 @options.reading
@@ -197,9 +218,12 @@ def _measure(target: Path, given: dict[str, Any]) -> None:
         rows += [
             ("against", str(given["against"])),
             ("F1", f"{found.f1:.4f} (precision {found.precision:.4f}, recall {found.recall:.4f})"),
-            ("Chamfer", f"{found.chamfer:.4f} m (to it {found.mean_to_reference:.4f}, from it {found.mean_from_reference:.4f})"),
+            (
+                "Chamfer",
+                f"{found.chamfer:.4f} m (to it {found.mean_to_reference:.4f}, from it {found.mean_from_reference:.4f})",
+            ),
             ("", found.recipe),
-        ]  # fmt: skip
+        ]
     _print(rows, document, given["as_json"])
 
 

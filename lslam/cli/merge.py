@@ -56,9 +56,11 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
     if not given["resume"]:
         check_target(out, given["overwrite"])
     flags = {
-        "map.voxel": given["voxel"], "map.format": given["file_format"], "input.threads": given["threads"],
+        "map.voxel": given["voxel"],
+        "map.format": given["file_format"],
+        "input.threads": given["threads"],
         "map.write": "false" if given["no_map"] else None,
-    }  # fmt: skip
+    }
     settings = [*given["settings"], *(f"{key}={value}" for key, value in flags.items() if value is not None)]
     config = load_config(given["config_file"], settings)
     from lslam.cli.run import watch_of
@@ -67,9 +69,14 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
         watch = watch_of(stack, stop, lambda outcome: None)
         stop.is_gentle = True
         manifest = merge_into(
-            runs, out, config, watch, overwrite=given["overwrite"], resume=given["resume"],
+            runs,
+            out,
+            config,
+            watch,
+            overwrite=given["overwrite"],
+            resume=given["resume"],
             command=shlex.join(["lslam", *sys.argv[1:]]),
-        )  # fmt: skip
+        )
     show(json.dumps({"folder": str(out), "manifest": manifest}) + "\n" if given["as_json"] else _summary(out, manifest))
 
 

@@ -160,9 +160,12 @@ def reading(function: F) -> F:
     for name, text in (("gnss", "satellite fixes"), ("imu", "the IMU")):
         function = click.option(f"--{name}-topic", metavar="TOPIC", help=f"Of a bag: the topic of {text}.")(function)
     return click.option(
-        "--lidar-topic", multiple=True, metavar="TOPIC", callback=lambda context, option, topics: ",".join(topics) or None,
+        "--lidar-topic",
+        multiple=True,
+        metavar="TOPIC",
+        callback=lambda context, option, topics: ",".join(topics) or None,
         help="Of a bag: the topic of the scans; several LiDARs are merged into the sweeps of the first.",
-    )(function)  # fmt: skip
+    )(function)
 
 
 def reading_of(given: dict[str, Any]) -> dict[str, Any]:

@@ -44,9 +44,13 @@ Examples:
     "--origin", metavar="LAT,LON[,H]", help="With --along TRAJECTORY in metres: where x = y = 0 is, x east, y north."
 )
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("map.osm"), show_default=True, metavar="FILE",
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("map.osm"),
+    show_default=True,
+    metavar="FILE",
     help="OSM XML (.osm), or the server's own reply (.json).",
-)  # fmt: skip
+)
 @click.option("--overwrite", is_flag=True, help="Replace FILE.")
 @click.option("--server", metavar="URL", help="Another Overpass server  [osm.server].")
 @click.option("--refresh", is_flag=True, help="Ask the server also for areas that are in the cache.")

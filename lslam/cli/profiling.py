@@ -95,17 +95,25 @@ class StackProfile:
         length = self._ended - self._began
         profiles = [
             {
-                "type": "sampled", "name": self._names.get(ident, str(ident)), "unit": "seconds",
-                "startValue": 0, "endValue": round(length, 6), **self._samples(seen, stacks),
+                "type": "sampled",
+                "name": self._names.get(ident, str(ident)),
+                "unit": "seconds",
+                "startValue": 0,
+                "endValue": round(length, 6),
+                **self._samples(seen, stacks),
             }
-            for ident, seen in sorted(self._seen.items(), key=lambda item: -sum(end - begin for _, begin, end in item[1]))
-        ]  # fmt: skip
+            for ident, seen in sorted(
+                self._seen.items(), key=lambda item: -sum(end - begin for _, begin, end in item[1])
+            )
+        ]
         return {
             "$schema": "https://www.speedscope.app/file-format-schema.json",
-            "exporter": f"lslam {__version__}", "name": name, "activeProfileIndex": 0,
+            "exporter": f"lslam {__version__}",
+            "name": name,
+            "activeProfileIndex": 0,
             "shared": {"frames": [{"name": n, "file": file, "line": line} for n, file, line in frames]},
             "profiles": profiles,
-        }  # fmt: skip
+        }
 
     def _samples(self, seen: list[list[Any]], stacks: list[list[int]]) -> dict[str, Any]:
         """Stacks and weights of a thread; an empty stack while it did not exist."""

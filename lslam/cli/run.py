@@ -115,8 +115,12 @@ def arguments_of(out: Path, given: dict[str, Any]) -> Iterator[dict[str, Any]]:
             watch = watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"]))
             command = shlex.join(["lslam", *sys.argv[1:]])
             yield {
-                "out": out, "overwrite": given["overwrite"], "resume": given["resume"], "command": command, "watch": watch
-            }  # fmt: skip
+                "out": out,
+                "overwrite": given["overwrite"],
+                "resume": given["resume"],
+                "command": command,
+                "watch": watch,
+            }
     except RunFinishedError as finished:
         log.info("%s", finished)
         _print_finished(out, given["as_json"])
@@ -137,10 +141,13 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
     from lslam.io.readers import open_sequence
 
     opened = open_sequence(
-        given["sequence"], data_root=given["data_root"],
+        given["sequence"],
+        data_root=given["data_root"],
         vertical_correction_deg=config.input.vertical_correction_deg,
-        imu=config.imu.use, gnss=config.gnss.mode != "off", **options.reading_of(given),
-    )  # fmt: skip
+        imu=config.imu.use,
+        gnss=config.gnss.mode != "off",
+        **options.reading_of(given),
+    )
     return opened, config
 
 

@@ -59,9 +59,12 @@ if TYPE_CHECKING:
     help="Where x = y = 0 of the city lies [default: the extract's middle, or a GeoJSON path's first point].",
 )
 @click.option(
-    "--set", "settings", multiple=True, metavar="KEY=VALUE",
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="KEY=VALUE",
     help="Set one key of the scenario, for example world.relief=1; repeatable.",
-)  # fmt: skip
+)
 @click.option(
     "--plan",
     type=click.Path(path_type=Path),
@@ -253,10 +256,13 @@ def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool, is_
         f"{done.sequence}: {len(drive)} scans, {length:.1f} m, {done.points / len(drive):.0f} points per scan, "
         f"{done.size / 1e6:.1f} MB",
         {
-            "sequence": str(done.sequence), "scans": len(drive), "path_length_m": length,
-            "points_per_scan": done.points / len(drive), "bytes": done.size,
+            "sequence": str(done.sequence),
+            "scans": len(drive),
+            "path_length_m": length,
+            "points_per_scan": done.points / len(drive),
+            "bytes": done.size,
         },
-    )  # fmt: skip
+    )
 
 
 def _print_scenario(name: str, settings: tuple[str, ...], as_json: bool) -> None:

@@ -34,9 +34,11 @@ if TYPE_CHECKING:
 @click.option("--pilot", is_flag=True, help="With --dry-run: estimate the time by a few short runs.")
 @options.studied
 @click.option(
-    "--report", type=click.Path(path_type=Path), metavar="DIR",
+    "--report",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
     help="Write the report of the study in DIR anew from its results.csv, run nothing.",
-)  # fmt: skip
+)
 @options.engine
 @click.option("--seeds", metavar="N,N,...", help="Seeds instead of the study's.")
 @options.data_root

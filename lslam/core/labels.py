@@ -10,13 +10,41 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CLASSES = {
-    "unlabeled": 0, "outlier": 1, "car": 10, "bicycle": 11, "bus": 13, "motorcycle": 15, "on-rails": 16, "truck": 18,
-    "other-vehicle": 20, "person": 30, "bicyclist": 31, "motorcyclist": 32, "road": 40, "parking": 44, "sidewalk": 48,
-    "other-ground": 49, "building": 50, "fence": 51, "other-structure": 52, "lane-marking": 60, "vegetation": 70, "trunk": 71,
-    "terrain": 72, "pole": 80, "traffic-sign": 81, "other-object": 99, "moving-car": 252, "moving-bicyclist": 253,
-    "moving-person": 254, "moving-motorcyclist": 255, "moving-on-rails": 256, "moving-bus": 257, "moving-truck": 258,
+    "unlabeled": 0,
+    "outlier": 1,
+    "car": 10,
+    "bicycle": 11,
+    "bus": 13,
+    "motorcycle": 15,
+    "on-rails": 16,
+    "truck": 18,
+    "other-vehicle": 20,
+    "person": 30,
+    "bicyclist": 31,
+    "motorcyclist": 32,
+    "road": 40,
+    "parking": 44,
+    "sidewalk": 48,
+    "other-ground": 49,
+    "building": 50,
+    "fence": 51,
+    "other-structure": 52,
+    "lane-marking": 60,
+    "vegetation": 70,
+    "trunk": 71,
+    "terrain": 72,
+    "pole": 80,
+    "traffic-sign": 81,
+    "other-object": 99,
+    "moving-car": 252,
+    "moving-bicyclist": 253,
+    "moving-person": 254,
+    "moving-motorcyclist": 255,
+    "moving-on-rails": 256,
+    "moving-bus": 257,
+    "moving-truck": 258,
     "moving-other-vehicle": 259,
-}  # fmt: skip
+}
 MOVING = "moving"  # every class whose name begins so
 _VALUES = 1 << 16
 

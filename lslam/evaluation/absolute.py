@@ -133,9 +133,17 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
                 )
             )
         header = (
-            "alignment", "rmse, m", "mean, m", "median, m", "std, m", "max, m", "horizontal rmse, m", "vertical rmse, m",
-            "rotation rmse, deg", "rmse, % of length",
-        )  # fmt: skip
+            "alignment",
+            "rmse, m",
+            "mean, m",
+            "median, m",
+            "std, m",
+            "max, m",
+            "horizontal rmse, m",
+            "vertical rmse, m",
+            "rotation rmse, deg",
+            "rmse, % of length",
+        )
         alignments = "; ".join(f"{name}: {ALIGNMENTS.get(name, name)}" for name in self.of(e))
         recipe = f"{e.matched} of {e.possible} poses matched, path {e.path_length:.1f} m. {alignments}."
         return [Table("Absolute trajectory error (ATE)", header, tuple(rows), recipe)]

@@ -230,8 +230,11 @@ class TrajectoryMetric(ABC, Generic[Score]):
         rows = []
         for k, metric in enumerate(metric for _, metric in self.columns):
             cells = [self._texts(e)[k][1] for e in es]
-            rows.append(MetricRow(metric.label, metric.unit, cells, self.name) if k else
-                        MetricRow(self.name, metric.unit, cells))  # fmt: skip
+            rows.append(
+                MetricRow(metric.label, metric.unit, cells, self.name)
+                if k
+                else MetricRow(self.name, metric.unit, cells)
+            )
         return rows
 
     def recipes(self, e: Evaluation) -> list[str]:

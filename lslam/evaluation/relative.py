@@ -110,9 +110,18 @@ def relative_error(estimate: Floats, truth: Floats, seconds: Floats | None, reci
     translation = np.linalg.norm(E[:, :3, 3], axis=1)
     angle = np.rad2deg(so3.angle(so3.normalise(E[:, :3, :3])))
     return RelativeError(
-        delta, unit, rule, len(pairs), describe(translation), describe(angle), "", sentence,
-        pair_ends=pairs[:, 1], translation_errors=translation, rotation_errors_deg=angle,
-    )  # fmt: skip
+        delta,
+        unit,
+        rule,
+        len(pairs),
+        describe(translation),
+        describe(angle),
+        "",
+        sentence,
+        pair_ends=pairs[:, 1],
+        translation_errors=translation,
+        rotation_errors_deg=angle,
+    )
 
 
 def _without_rotations(recipe: str) -> RelativeError:
@@ -169,8 +178,15 @@ class RelativePoseError(TrajectoryMetric[list[RelativeError]]):
             values = (metres(t.rmse), metres(t.mean), metres(t.max), f"{r.rmse:.4f}", f"{r.mean:.4f}", f"{r.max:.4f}")
             rows.append((error.name, str(error.n_pairs), *values))
         header = (
-            "pair rule", "pairs", "translation rmse, m", "mean, m", "max, m", "rotation rmse, deg", "mean, deg", "max, deg",
-        )  # fmt: skip
+            "pair rule",
+            "pairs",
+            "translation rmse, m",
+            "mean, m",
+            "max, m",
+            "rotation rmse, deg",
+            "mean, deg",
+            "max, deg",
+        )
         recipe = (
             "E = inv(inv(Q_i) Q_j) (inv(P_i) P_j) over the pairs of the rule; P estimate, Q ground truth; no alignment."
         )

@@ -190,8 +190,16 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
     def tables(self, e: Evaluation) -> list[Table]:
         s = self.of(e)
         header = (
-            "", "thesis_rmse, m", "x, m", "y, m", "z, m", "roll, deg", "pitch, deg", "yaw, deg", "angular, deg",
-        )  # fmt: skip
+            "",
+            "thesis_rmse, m",
+            "x, m",
+            "y, m",
+            "z, m",
+            "roll, deg",
+            "pitch, deg",
+            "yaw, deg",
+            "angular, deg",
+        )
         angles = (fixed(v, 3) for v in (*s.rpy_rmse_deg, s.angular_rmse_deg))
         row = ("rmse", metres(s.thesis_rmse), *(metres(v) for v in s.xyz_rmse), *angles)
         return [Table("Girolimetto (thesis1): errors per axis", header, (row,), f"{s.recipe}.")]

@@ -115,9 +115,7 @@ def _rms(values: Floats) -> float:
 
 
 def judge_acts_only_on(finding: ExpectedFinding, result: CurveResult) -> Judged:
-    """Verdict on stages: confirmed if the named ones make up at least 80 % of the change of registration time, else refuted;
-    most seeds by themselves must agree.
-    """
+    """Verdict on stages: confirmed if the named ones make up 80 % of the change of registration time, for most seeds too."""
     curve = result.curve
     change, level = _changes(curve)
     if not any(name in curve.stages for name in finding.stages):
@@ -171,9 +169,10 @@ def _value_list(curve: Curve, which: Bools) -> str:
 
 
 BELOW: dict[Rise, str] = {
-    "worse": "it is worse by more than the seeds scatter", "as good": "it is as good",
+    "worse": "it is worse by more than the seeds scatter",
+    "as good": "it is as good",
     "unknown": "too few runs, or too scattered ones, say whether it rises",
-}  # fmt: skip
+}
 Ranking = Literal["worse", "as good", "better", "unknown"]
 
 

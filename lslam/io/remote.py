@@ -133,9 +133,13 @@ class RemotePath(PosixPath):
             return str(stream.read())
 
     def open(
-        self, mode: str = "r", buffering: int = -1, encoding: str | None = None, errors: str | None = None,
+        self,
+        mode: str = "r",
+        buffering: int = -1,
+        encoding: str | None = None,
+        errors: str | None = None,
         newline: str | None = None,
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         """A stream over all of the object; raises UsageError for any other mode than reading."""
         if set(mode) - set("rbt"):
             os.fspath(self)

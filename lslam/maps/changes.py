@@ -128,9 +128,14 @@ def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
     ]
     same = after.occupied[_beside(after.occupied, before.blocked)]
     return ChangedCells(
-        tuple(changes), _cells(same, new), new.voxel, len(after.occupied), len(before.occupied),
-        int((~_among(after.occupied, before.seen)).sum()), int((~_among(before.occupied, after.seen)).sum()),
-    )  # fmt: skip
+        tuple(changes),
+        _cells(same, new),
+        new.voxel,
+        len(after.occupied),
+        len(before.occupied),
+        int((~_among(after.occupied, before.seen)).sum()),
+        int((~_among(before.occupied, after.seen)).sum()),
+    )
 
 
 def _drive(found: Evidence) -> _Drive:

@@ -77,9 +77,11 @@ def floor_plan(grid: OccupancyGrid) -> FloorPlan:
     image[at[inside & occupied]] = OCCUPIED
     resolution = grid.voxel * step
     return FloorPlan(
-        np.ascontiguousarray(image.reshape(height, width)[::-1]), resolution, float(low[0] * grid.voxel),
+        np.ascontiguousarray(image.reshape(height, width)[::-1]),
+        resolution,
+        float(low[0] * grid.voxel),
         float(low[1] * grid.voxel),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

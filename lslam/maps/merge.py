@@ -111,10 +111,16 @@ class MapMerger:
     """
 
     def __init__(
-        self, voxel: float = 0.2, range_min: float = 2.0, range_max: float = 80.0, *,
-        crop: Any = None, spool: Path | None = None, keep: Path | None = None,
+        self,
+        voxel: float = 0.2,
+        range_min: float = 2.0,
+        range_max: float = 80.0,
+        *,
+        crop: Any = None,
+        spool: Path | None = None,
+        keep: Path | None = None,
         most: int = _MOST_ROWS,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if not (np.isfinite(voxel) and voxel > 0):
             raise ConfigError(f"map.voxel = {voxel}: the voxel must be a positive number of metres, for example 0.2")
         if not 0 <= range_min < range_max:
@@ -161,9 +167,18 @@ class MapMerger:
             self._spill()
         self._reserve(self._used + len(cloud))
         self._used, gated, outside = accumulate(
-            cloud, values if self._with_intensity else _NO_INTENSITY, T, self._range_min, self._range_max, self._voxel,
-            self._crop, self._origin, self._slots, self._rows, self._used,
-        )  # fmt: skip
+            cloud,
+            values if self._with_intensity else _NO_INTENSITY,
+            T,
+            self._range_min,
+            self._range_max,
+            self._voxel,
+            self._crop,
+            self._origin,
+            self._slots,
+            self._rows,
+            self._used,
+        )
         self.scans += 1
         self.gated += int(gated)
         self.outside += int(outside)

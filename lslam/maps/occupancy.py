@@ -87,9 +87,16 @@ class OccupancyMapper:
     """
 
     def __init__(
-        self, voxel: float = 0.4, range_min: float = 1.0, range_max: float = 40.0, *, spool: Path | None = None,
-        keep: Path | None = None, most: int = _MOST_ROWS, origin: Longs | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        voxel: float = 0.4,
+        range_min: float = 1.0,
+        range_max: float = 40.0,
+        *,
+        spool: Path | None = None,
+        keep: Path | None = None,
+        most: int = _MOST_ROWS,
+        origin: Longs | None = None,
+    ) -> None:
         if not (np.isfinite([voxel, range_max]).all() and voxel > 0 and 0 <= range_min < range_max):
             raise ConfigError(
                 f"map.occupancy_voxel = {voxel}, ranges {range_min} to {range_max}: a cell above 0 m, a range_max above "
@@ -159,8 +166,10 @@ class OccupancyMapper:
         if self._used:
             self._spill()
         return {
-            "origin": self._origin, "scans": self.scans, "runs": None if self._runs is None else self._runs.state(),
-        }  # fmt: skip
+            "origin": self._origin,
+            "scans": self.scans,
+            "runs": None if self._runs is None else self._runs.state(),
+        }
 
     def restore(self, state: State) -> None:
         """Restore `state` in an empty mapper of the same kind. Raises InputError when cells are missing."""

@@ -30,8 +30,12 @@ class AllPoints(Stateful):
 
     def __init__(self, config: RegistrationConfig, voxel_size: float) -> None:
         plain = {
-            "residual": None, "target": "map", "inlier_distance": None, "inlier_ratio": 1.0, "voxel_size": voxel_size,
-        }  # fmt: skip
+            "residual": None,
+            "target": "map",
+            "inlier_distance": None,
+            "inlier_ratio": 1.0,
+            "voxel_size": voxel_size,
+        }
         self._config = config.model_copy(update=plain)
         # `icp` by default settings, updated from the first poorly constrained scan on.
         self._icp = Registration(self._config)

@@ -124,9 +124,16 @@ def register_elastic(
     information = np.asarray(np.linalg.pinv(at_stamp @ covariance[:12, :12] @ at_stamp.T, hermitian=True), np.float64)
     pose = sweep.prior.pose
     result = RegistrationResult.of(
-        pose, information, facts, start.prior.pose, step=at_stamp @ d.ravel(), weak=weak, source_points=len(points.times),
-        iterations=iterations, converged=converged,
-    )  # fmt: skip
+        pose,
+        information,
+        facts,
+        start.prior.pose,
+        step=at_stamp @ d.ravel(),
+        weak=weak,
+        source_points=len(points.times),
+        iterations=iterations,
+        converged=converged,
+    )
     return ElasticResult(sweep, skew[0], covariance, result)
 
 

@@ -157,9 +157,15 @@ class LastSweep(Stateful):
         return ElasticConstraints(expected, location, velocity, since, self._skew, skewed)
 
     def follow(
-        self, stamp_ns: int, pose: Floats, sweep: MotionPrior, prior: MotionPrior, skew: Floats, covariance: Floats,
+        self,
+        stamp_ns: int,
+        pose: Floats,
+        sweep: MotionPrior,
+        prior: MotionPrior,
+        skew: Floats,
+        covariance: Floats,
         share: float,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take the `sweep` that was found for `prior`, its pose at the stamp now `pose` (4, 4).
 
         skew, covariance : as of `ElasticResult`; share : of the map that this scan is

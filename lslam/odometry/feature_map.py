@@ -22,9 +22,7 @@ from lslam.registration.local_map import LastKeyframes, LocalMap
 from lslam.registration.preprocessing.features import FeaturePoints, Features
 from lslam.registration.preprocessing.prepare import NO_TIMES
 
-Grid = tuple[
-    Floats, NDArray[np.uint16], NDArray[np.int32], Longs, NDArray[np.int32]
-]  # fmt: skip
+Grid = tuple[Floats, NDArray[np.uint16], NDArray[np.int32], Longs, NDArray[np.int32]]
 
 # m, how far a counterpart may lie: the rings of sixteen beams are that far apart on the ground at 10 m.
 MATCH_REACH_M = 2.0
@@ -77,8 +75,15 @@ def _normals(points: Floats) -> Floats:
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(
-            points, around.size, SURFACE_SIGMA_M**2, NORMAL_SIGMA_RAD**2, around.planes, around.keys, around.table, normals
-        )  # fmt: skip
+            points,
+            around.size,
+            SURFACE_SIGMA_M**2,
+            NORMAL_SIGMA_RAD**2,
+            around.planes,
+            around.keys,
+            around.table,
+            normals,
+        )
     return normals
 
 
@@ -101,13 +106,25 @@ class FeatureMap(Stateful):
     STATE = ("planes", "edges")
 
     def __init__(
-        self, size: float, *, plane_size: float | None = None, coarse_factor: int = 3, min_points: int = 6,
-        planarity: float = 0.3, count_cap: float = 200.0, reach: float = 150.0, capacity: int = 1 << 16,
-    ) -> None:  # fmt: skip
+        self,
+        size: float,
+        *,
+        plane_size: float | None = None,
+        coarse_factor: int = 3,
+        min_points: int = 6,
+        planarity: float = 0.3,
+        count_cap: float = 200.0,
+        reach: float = 150.0,
+        capacity: int = 1 << 16,
+    ) -> None:
         self.planes = LocalMap(
-            plane_size or size, coarse_factor=coarse_factor, min_points=min_points, planarity=planarity,
-            count_cap=count_cap, reach=reach,
-        )  # fmt: skip
+            plane_size or size,
+            coarse_factor=coarse_factor,
+            min_points=min_points,
+            planarity=planarity,
+            count_cap=count_cap,
+            reach=reach,
+        )
         self.edges = GaussianMap(size, count_cap=count_cap, reach=reach, capacity=capacity // 4)
         self._lines = _lines_for(self.edges)
 

@@ -47,9 +47,16 @@ class FeatureNoise:
 
 
 def solve_on_scan(
-    target: FeatureScan, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
-    one_to_many: bool = True, allowed: Floats | None = None,
-) -> RegistrationResult:  # fmt: skip
+    target: FeatureScan,
+    edges: Floats,
+    planes: Floats,
+    T_prior: Floats,
+    annealing: Annealing,
+    noise: FeatureNoise,
+    *,
+    one_to_many: bool = True,
+    allowed: Floats | None = None,
+) -> RegistrationResult:
     """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with an earlier scan, starting at `T_prior` (4, 4).
 
     `allowed` (6, 6) projects the steps; the result's degenerate directions are those that it allows.
@@ -63,16 +70,26 @@ def solve_on_scan(
         Term(linearise_planes, (planes,), (*target.planes, target.normals), settings(noise.plane)),
     ]
     limits = Limits(
-        noise.weak_share, TIMES_ON_SCAN * noise.least / noise.plane**2, by_surfaces=True,
+        noise.weak_share,
+        TIMES_ON_SCAN * noise.least / noise.plane**2,
+        by_surfaces=True,
         allowed=EVERYWHERE if allowed is None else np.ascontiguousarray(allowed),
-    )  # fmt: skip
+    )
     return optimise(terms, T_prior, annealing, limits, Correspondences(len(edges) + len(planes)))
 
 
 def solve_on_map(
-    target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
-    scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None, inlier_ratio: float = 1.0,
-) -> RegistrationResult:  # fmt: skip
+    target: FeatureMap,
+    edges: Floats,
+    planes: Floats,
+    T_prior: Floats,
+    annealing: Annealing,
+    noise: FeatureNoise,
+    *,
+    scatter: Floats | None = None,
+    levels: Sequence[GaussianMap] | None = None,
+    inlier_ratio: float = 1.0,
+) -> RegistrationResult:
     """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map, starting at `T_prior` (4, 4).
 
     scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
@@ -86,19 +103,29 @@ def solve_on_map(
 
 
 def map_problem(
-    target: FeatureMap, edges: Floats, planes: Floats, T_prior: Floats, annealing: Annealing, noise: FeatureNoise, *,
-    scatter: Floats | None = None, levels: Sequence[GaussianMap] | None = None, inlier_ratio: float = 1.0,
+    target: FeatureMap,
+    edges: Floats,
+    planes: Floats,
+    T_prior: Floats,
+    annealing: Annealing,
+    noise: FeatureNoise,
+    *,
+    scatter: Floats | None = None,
+    levels: Sequence[GaussianMap] | None = None,
+    inlier_ratio: float = 1.0,
     information: Floats | None = None,
-) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
+) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:
     """The arguments of `optimise` by which `solve_on_map` aligns; `information` (6, 6) of the prior joins the features."""
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
     lines, matches = target.edges, Correspondences(len(planes) + len(edges))
     on_lines = Term(
-        linearise_lines, (edges,), (lines.moments, lines.keys, lines.table, *target.lines),
+        linearise_lines,
+        (edges,),
+        (lines.moments, lines.keys, lines.table, *target.lines),
         (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR_M2),
         (*slots_of(len(edges)), matches.away2[len(planes) :]),
-    )  # fmt: skip
+    )
     on_planes = voxel_terms(PLANE, (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
     prior = [] if information is None else [prior_term(T_prior, information)]
@@ -121,9 +148,14 @@ ScanStep = Callable[[FeatureScan, Features, Floats, Annealing, FeatureNoise, boo
 
 
 def joint_step(
-    target: FeatureScan, features: Features, T_prior: Floats, annealing: Annealing, noise: FeatureNoise,
-    one_to_many: bool, clock: StageClock,
-) -> RegistrationResult:  # fmt: skip
+    target: FeatureScan,
+    features: Features,
+    T_prior: Floats,
+    annealing: Annealing,
+    noise: FeatureNoise,
+    one_to_many: bool,
+    clock: StageClock,
+) -> RegistrationResult:
     """Edges and planar points together, stage `scan`."""
     with clock.stage("scan"):
         return solve_on_scan(
@@ -132,9 +164,14 @@ def joint_step(
 
 
 def two_steps(
-    target: FeatureScan, features: Features, T_prior: Floats, annealing: Annealing, noise: FeatureNoise,
-    one_to_many: bool, clock: StageClock,
-) -> RegistrationResult:  # fmt: skip
+    target: FeatureScan,
+    features: Features,
+    T_prior: Floats,
+    annealing: Annealing,
+    noise: FeatureNoise,
+    one_to_many: bool,
+    clock: StageClock,
+) -> RegistrationResult:
     """z, roll and pitch from planar points, stage `ground`; then x, y and yaw from edges, stage `edges`.
 
     LeGO-LOAM (Shan and Englot 2018), section IV-D. Axes are the sensor's at the prior. The covariance joins the two:
@@ -148,9 +185,15 @@ def two_steps(
     with clock.stage("edges"):
         level = np.eye(6) - upright
         edges = solve_on_scan(
-            target, features.edges.points, NONE, ground.T_world_lidar, annealing, noise, one_to_many=one_to_many,
+            target,
+            features.edges.points,
+            NONE,
+            ground.T_world_lidar,
+            annealing,
+            noise,
+            one_to_many=one_to_many,
             allowed=level,
-        )  # fmt: skip
+        )
     if ground.covariance is None or edges.covariance is None:
         covariance = None
     else:

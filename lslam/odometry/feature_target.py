@@ -58,9 +58,16 @@ class FeatureTarget(Target):
     STATE = ("map", "scan", "all_points", "_keyframes")
 
     def __init__(
-        self, config: RegistrationConfig, loam: LoamConfig, variant: LoamVariant, reach: float = 120.0, *,
-        up: Floats = Z, with_start_search: bool = True, with_all_points: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        config: RegistrationConfig,
+        loam: LoamConfig,
+        variant: LoamVariant,
+        reach: float = 120.0,
+        *,
+        up: Floats = Z,
+        with_start_search: bool = True,
+        with_all_points: bool = False,
+    ) -> None:
         self.config, self.loam, self.variant, self._reach = config, loam, variant, reach
         self.map = self._new_map(1 << 16) if variant.with_map else None
         self.scan: FeatureScan | None = None
@@ -71,9 +78,14 @@ class FeatureTarget(Target):
     def fresh(self) -> FeatureTarget:
         """An empty one of the same settings."""
         return FeatureTarget(
-            self.config, self.loam, self.variant, self._reach, up=self._up, with_start_search=self._with_start_search,
+            self.config,
+            self.loam,
+            self.variant,
+            self._reach,
+            up=self._up,
+            with_start_search=self._with_start_search,
             with_all_points=self.all_points is not None,
-        )  # fmt: skip
+        )
 
     def __len__(self) -> int:
         return 0 if self.scan is None else len(self.scan.features.less_planes) + len(self.scan.features.less_edges)
@@ -127,9 +139,16 @@ class FeatureTarget(Target):
             with attempt.clock.stage("map"):
                 points, scatter = thinned(features) if self.variant.with_less_planes else (features.planes.points, None)
                 problem = map_problem(
-                    self.map, features.edges.points, points, start, annealing, noise, scatter=scatter,
-                    inlier_ratio=self.variant.inlier_ratio, information=information,
-                )  # fmt: skip
+                    self.map,
+                    features.edges.points,
+                    points,
+                    start,
+                    annealing,
+                    noise,
+                    scatter=scatter,
+                    inlier_ratio=self.variant.inlier_ratio,
+                    information=information,
+                )
                 result = optimise(*problem)
             result = replace(result, iterations=iterations + result.iterations)
         is_remapped = attempt.is_near and len(result.degenerate) > 0
@@ -206,9 +225,15 @@ class FeatureTarget(Target):
     def _new_map(self, capacity: int) -> FeatureMap:
         c, size = self.config, self.loam.feature_map_voxel
         return FeatureMap(
-            size, plane_size=self._plane_size(size), coarse_factor=c.coarse_factor, min_points=c.min_points,
-            planarity=c.planarity, count_cap=c.count_cap, reach=self._reach, capacity=capacity,
-        )  # fmt: skip
+            size,
+            plane_size=self._plane_size(size),
+            coarse_factor=c.coarse_factor,
+            min_points=c.min_points,
+            planarity=c.planarity,
+            count_cap=c.count_cap,
+            reach=self._reach,
+            capacity=capacity,
+        )
 
     def _plane_size(self, size: float) -> float:
         return surface_size(size, self.loam.grid_step)

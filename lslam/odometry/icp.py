@@ -103,9 +103,13 @@ class Icp(MapMethod):
         result = attempt.judge(elastic.result)
         sweep = replace(elastic.sweep.prior, change=prior.change) if result.ok else None
         return replace(
-            result, points=deskew(prepared, sweep or prior), detail=(prior, elastic), sweep=sweep, map_age=self.map_age,
+            result,
+            points=deskew(prepared, sweep or prior),
+            detail=(prior, elastic),
+            sweep=sweep,
+            map_age=self.map_age,
             stages={"register": time.perf_counter() - began},
-        )  # fmt: skip
+        )
 
     def warm_up(self) -> None:
         """Register a small room twice with a throw-away copy: every kernel is compiled or loaded."""

@@ -74,9 +74,13 @@ class IcpSvd(Traits, Stateful):
             alignment = RegistrationResult(prior.pose, source_points=len(prepared.source), inliers=len(prepared.source))
         else:
             alignment = align_closed_form(
-                prepared.source, self._last, prior.pose, inlier_ratio=c.inlier_ratio,
-                inlier_distance=c.inlier_distance, max_iterations=c.max_iterations,
-            )  # fmt: skip
+                prepared.source,
+                self._last,
+                prior.pose,
+                inlier_ratio=c.inlier_ratio,
+                inlier_distance=c.inlier_distance,
+                max_iterations=c.max_iterations,
+            )
         aligned = time.perf_counter()
         result = judge(scan, alignment, prior.pose, c, {})
         self._failed = 0 if result.status == "ok" else self._failed + 1
@@ -93,9 +97,14 @@ class IcpSvd(Traits, Stateful):
 
 
 def align_closed_form(
-    source: Floats, last: Partners, T_prior: Floats, *,
-    inlier_ratio: float = 1.0, inlier_distance: float | None = None, max_iterations: int = 50,
-) -> RegistrationResult:  # fmt: skip
+    source: Floats,
+    last: Partners,
+    T_prior: Floats,
+    *,
+    inlier_ratio: float = 1.0,
+    inlier_distance: float | None = None,
+    max_iterations: int = 50,
+) -> RegistrationResult:
     """Pose of the source points (S, 3), m, LiDAR frame, by equations 2.17 to 2.20 of Girolimetto.
 
     Each round pairs every point with its nearest in the last scan, keeps the pairs within `inlier_distance`, m (None: those
@@ -119,9 +128,13 @@ def align_closed_form(
             break
     rmse = float(np.sqrt(np.mean(distance[near] ** 2))) if len(near) else 0.0
     return RegistrationResult(
-        last.T_world_lidar @ se3.normalise(T), source_points=len(source), inliers=len(near), converged=converged,
-        iterations=rounds, rmse=rmse,
-    )  # fmt: skip
+        last.T_world_lidar @ se3.normalise(T),
+        source_points=len(source),
+        inliers=len(near),
+        converged=converged,
+        iterations=rounds,
+        rmse=rmse,
+    )
 
 
 def keep_pairs(distance: Floats, inlier_ratio: float, inlier_distance: float | None) -> Longs:

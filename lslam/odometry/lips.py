@@ -87,9 +87,16 @@ class Lips(Traits, Stateful):
             result = self._result(link, window, planes, matches)
         off = correction(prior.pose, result.T_world_lidar)
         return replace(
-            result, ok=not reason, reason=reason, converged=not reason, iterations=steps, source_points=len(points),
-            prior_error=off, stages=clock.seconds, detail=(window, predicted, result.detail),
-        )  # fmt: skip
+            result,
+            ok=not reason,
+            reason=reason,
+            converged=not reason,
+            iterations=steps,
+            source_points=len(points),
+            prior_error=off,
+            stages=clock.seconds,
+            detail=(window, predicted, result.detail),
+        )
 
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
         """The window goes on with the scan's planes, or without them where its result is rejected."""
@@ -128,10 +135,15 @@ class Lips(Traits, Stateful):
         n = planes.counts[which]
         rmse = float(np.sqrt(n @ planes.rms[which] ** 2 / max(n.sum(), 1.0)))
         return RegistrationResult(
-            pose, covariance=on_planes, inliers=round(float(n.sum())), matched=round(float(n.sum())), rmse=rmse,
-            degenerate=self._degenerate(window, matches), inertial=window.values.newest(P[:27, :27]),
+            pose,
+            covariance=on_planes,
+            inliers=round(float(n.sum())),
+            matched=round(float(n.sum())),
+            rmse=rmse,
+            degenerate=self._degenerate(window, matches),
+            inertial=window.values.newest(P[:27, :27]),
             detail=noise.transported(P[state, state], step),
-        )  # fmt: skip
+        )
 
     def _degenerate(self, window: PlaneWindow, matches: Longs) -> Floats:
         """(D, 6) twists of the LiDAR along which the known planes of the scan say next to nothing."""

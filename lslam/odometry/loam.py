@@ -42,9 +42,14 @@ class Loam(MapMethod):
         self.config, self.variant = config, variant
         c, reach = config.registration, 1.2 * config.preprocess.range_max
         target = FeatureTarget(
-            c, config.loam, variant, reach, up=up_of(config.preprocess), with_start_search=config.recovery.start_search,
+            c,
+            config.loam,
+            variant,
+            reach,
+            up=up_of(config.preprocess),
+            with_start_search=config.recovery.start_search,
             with_all_points=config.recovery.fallback == "all-points",
-        )  # fmt: skip
+        )
         # From scan to scan no spot is remembered, on which the sensor could have come to rest.
         switches = {} if variant.with_map else {"at_rest": False}
         policies = feature_policies(config.recovery.model_copy(update=switches))

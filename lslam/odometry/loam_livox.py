@@ -109,13 +109,21 @@ def joined(
     pose = se3.normalise(at(np.zeros(1))[0])
     shares = line_weights(middles[good], np.zeros(1))[0]
     located = replace(
-        parts[len(parts) // 2], T_world_lidar=pose, covariance=_combined(parts, shares), source_points=offered,
-        matched=sum(part.matched for part in parts), inliers=sum(part.inliers for part in parts),
-        iterations=sum(result.iterations for result in pieces), converged=all(part.converged for part in parts),
-        rmse=float(np.sqrt(np.mean([part.rmse**2 for part in parts]))), prior_error=correction(prior.pose, pose),
+        parts[len(parts) // 2],
+        T_world_lidar=pose,
+        covariance=_combined(parts, shares),
+        source_points=offered,
+        matched=sum(part.matched for part in parts),
+        inliers=sum(part.inliers for part in parts),
+        iterations=sum(result.iterations for result in pieces),
+        converged=all(part.converged for part in parts),
+        rmse=float(np.sqrt(np.mean([part.rmse**2 for part in parts]))),
+        prior_error=correction(prior.pose, pose),
         pose_source=next((part.pose_source for part in parts if part.pose_source), ""),
-        degenerate=min((part.degenerate for part in parts), key=len), replaced=None, detail=None,
-    )  # fmt: skip
+        degenerate=min((part.degenerate for part in parts), key=len),
+        replaced=None,
+        detail=None,
+    )
     return located, sweep
 
 

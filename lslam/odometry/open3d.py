@@ -77,9 +77,12 @@ class Open3dGicp(Traits):
             return RegistrationResult(T_prior, source_points=count, inliers=count)
         registration = self._package.pipelines.registration
         alignment = registration.registration_generalized_icp(
-            cloud, self._last.cloud, MATCH_REACH_M, se3.relative(self._last.T_world_lidar, T_prior),
+            cloud,
+            self._last.cloud,
+            MATCH_REACH_M,
+            se3.relative(self._last.T_world_lidar, T_prior),
             registration.TransformationEstimationForGeneralizedICP(),
-        )  # fmt: skip
+        )
         pose = self._last.T_world_lidar @ np.asarray(alignment.transformation, np.float64)
         inliers = len(alignment.correspondence_set)
         return RegistrationResult(pose, source_points=count, inliers=inliers, rmse=float(alignment.inlier_rmse))

@@ -39,9 +39,14 @@ class WindowValues:
     def begin(cls, state: MotionState) -> WindowValues:
         """One state and no planes."""
         return cls(
-            state.gravity, state.gyro_axes, state.T_world_imu[None], state.velocity[None], state.accel_bias[None],
-            state.gyro_bias[None], np.zeros((0, 3)),
-        )  # fmt: skip
+            state.gravity,
+            state.gyro_axes,
+            state.T_world_imu[None],
+            state.velocity[None],
+            state.accel_bias[None],
+            state.gyro_bias[None],
+            np.zeros((0, 3)),
+        )
 
     @property
     def states(self) -> int:
@@ -63,29 +68,47 @@ class WindowValues:
         x = update[SHARED : self.first_plane].reshape(-1, STATE_SIZE)
         poses = se3.normalise(se3.make(so3.exp(x[:, 3:6]) @ self.poses[:, :3, :3], self.poses[:, :3, 3] + x[:, :3]))
         return WindowValues(
-            self.gravity + update[:3], self.axes + update[3:SHARED].reshape(3, 3), poses, self.velocities + x[:, 6:9],
-            self.accel_biases + x[:, 9:12], self.gyro_biases + x[:, 12:],
+            self.gravity + update[:3],
+            self.axes + update[3:SHARED].reshape(3, 3),
+            poses,
+            self.velocities + x[:, 6:9],
+            self.accel_biases + x[:, 9:12],
+            self.gyro_biases + x[:, 12:],
             self.planes + update[self.first_plane :].reshape(-1, 3),
-        )  # fmt: skip
+        )
 
     def since(self, before: WindowValues) -> Floats:
         """(N,) the update that leads here from values `before` of as many states and planes."""
         turn = so3.log(self.poses[:, :3, :3] @ np.swapaxes(before.poses[:, :3, :3], 1, 2))
-        x = np.concatenate([
-            self.poses[:, :3, 3] - before.poses[:, :3, 3], turn, self.velocities - before.velocities,
-            self.accel_biases - before.accel_biases, self.gyro_biases - before.gyro_biases,
-        ], axis=1)  # fmt: skip
-        return np.concatenate([
-            self.gravity - before.gravity, (self.axes - before.axes).ravel(), x.ravel(),
-            (self.planes - before.planes).ravel(),
-        ])  # fmt: skip
+        x = np.concatenate(
+            [
+                self.poses[:, :3, 3] - before.poses[:, :3, 3],
+                turn,
+                self.velocities - before.velocities,
+                self.accel_biases - before.accel_biases,
+                self.gyro_biases - before.gyro_biases,
+            ],
+            axis=1,
+        )
+        return np.concatenate(
+            [
+                self.gravity - before.gravity,
+                (self.axes - before.axes).ravel(),
+                x.ravel(),
+                (self.planes - before.planes).ravel(),
+            ]
+        )
 
     def cut(self, states: slice, planes: slice | Bools = slice(None)) -> WindowValues:
         """Some of the states and planes."""
         return replace(
-            self, poses=self.poses[states], velocities=self.velocities[states], accel_biases=self.accel_biases[states],
-            gyro_biases=self.gyro_biases[states], planes=self.planes[planes],
-        )  # fmt: skip
+            self,
+            poses=self.poses[states],
+            velocities=self.velocities[states],
+            accel_biases=self.accel_biases[states],
+            gyro_biases=self.gyro_biases[states],
+            planes=self.planes[planes],
+        )
 
     def newest(self, covariance: Floats) -> MotionState:
         """The last state, with the `covariance` (27, 27) of shared part and state."""
@@ -136,10 +159,12 @@ class Sightings:
 
     def joined(self, more: Sightings) -> Sightings:
         """These and `more`."""
-        return Sightings(*(
-            np.concatenate([getattr(self, name), getattr(more, name)])
-            for name in ("states", "planes", "cp", "information")
-        ))  # fmt: skip
+        return Sightings(
+            *(
+                np.concatenate([getattr(self, name), getattr(more, name)])
+                for name in ("states", "planes", "cp", "information")
+            )
+        )
 
 
 def step_residual(values: WindowValues, k: int, step: PreintegratedStep) -> tuple[Floats, Floats]:
@@ -155,11 +180,15 @@ def step_residual(values: WindowValues, k: int, step: PreintegratedStep) -> tupl
     moved, gained = R @ (step.position - step.position_arm @ force), R @ (step.velocity - step.velocity_arm @ force)
     led = R @ step.rotation @ so3.exp(step.turn_columns @ rate)
     off, v = R_end @ led.T, values.velocities
-    r = np.concatenate([
-        values.poses[k + 1, :3, 3] - values.poses[k, :3, 3] - t * v[k] - 0.5 * t**2 * values.gravity - moved, so3.log(off),
-        v[k + 1] - v[k] - t * values.gravity - gained, values.accel_biases[k + 1] - values.accel_biases[k],
-        values.gyro_biases[k + 1] - values.gyro_biases[k],
-    ])  # fmt: skip
+    r = np.concatenate(
+        [
+            values.poses[k + 1, :3, 3] - values.poses[k, :3, 3] - t * v[k] - 0.5 * t**2 * values.gravity - moved,
+            so3.log(off),
+            v[k + 1] - v[k] - t * values.gravity - gained,
+            values.accel_biases[k + 1] - values.accel_biases[k],
+            values.gyro_biases[k + 1] - values.gyro_biases[k],
+        ]
+    )
     J, one, turn = np.zeros((15, SHARED + 2 * STATE_SIZE)), np.eye(3), -R_end @ step.turn_columns
     J[0:3, 0:3], J[6:9, 0:3] = -0.5 * t**2 * one, -t * one
     J[3:6, 3:12] = turn[:, 3:]
@@ -220,10 +249,13 @@ def normal_equations(
         far = np.sqrt(np.einsum("ki,kij,kj->k", r, sightings.information, r))
         weight = np.minimum(1.0, HUBER_SIGMAS / np.maximum(far, HUBER_SIGMAS))
         weighted = np.swapaxes(J, 1, 2) @ (weight[:, None, None] * sightings.information)
-        at = np.concatenate([
-            SHARED + STATE_SIZE * sightings.states[:, None] + np.arange(6),
-            values.first_plane + PLANE_SIZE * sightings.planes[:, None] + np.arange(PLANE_SIZE),
-        ], axis=1)  # fmt: skip
+        at = np.concatenate(
+            [
+                SHARED + STATE_SIZE * sightings.states[:, None] + np.arange(6),
+                values.first_plane + PLANE_SIZE * sightings.planes[:, None] + np.arange(PLANE_SIZE),
+            ],
+            axis=1,
+        )
         np.add.at(H, (at[:, :, None], at[:, None, :]), weighted @ J)
         np.add.at(g, at, np.einsum("kij,kj->ki", weighted, r))
     return Normal(0.5 * (H + H.T), g)

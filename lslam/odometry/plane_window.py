@@ -69,9 +69,10 @@ class Landmarks:
         """These and K new ones, with their boxes (K, 3) and a common anchor (4, 4)."""
         return Landmarks(
             np.concatenate([self.anchors, np.broadcast_to(anchor, (len(lows), 4, 4))]),
-            np.concatenate([self.lows, lows]), np.concatenate([self.highs, highs]),
+            np.concatenate([self.lows, lows]),
+            np.concatenate([self.highs, highs]),
             np.concatenate([self.unseen, np.zeros(len(lows), np.int64)]),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -105,10 +106,12 @@ class PlaneWindow:
         """With one more state, where `step` leads from the newest one."""
         v = self.values
         doubled = replace(
-            v, poses=np.concatenate([v.poses, v.poses[-1:]]), velocities=np.concatenate([v.velocities, v.velocities[-1:]]),
+            v,
+            poses=np.concatenate([v.poses, v.poses[-1:]]),
+            velocities=np.concatenate([v.velocities, v.velocities[-1:]]),
             accel_biases=np.concatenate([v.accel_biases, v.accel_biases[-1:]]),
             gyro_biases=np.concatenate([v.gyro_biases, v.gyro_biases[-1:]]),
-        )  # fmt: skip
+        )
         r, _ = step_residual(doubled, v.states - 1, step)
         update = np.zeros(doubled.size)
         update[doubled.first_plane - STATE_SIZE : doubled.first_plane] = -r
@@ -190,9 +193,12 @@ class PlaneWindow:
         rest = self.seen.only(~of_first)
         values = v.cut(slice(1, None))
         return replace(
-            self, values=values, prior=WindowPrior(left.H, left.g, values.cut(slice(1))), steps=self.steps[1:],
+            self,
+            values=values,
+            prior=WindowPrior(left.H, left.g, values.cut(slice(1))),
+            steps=self.steps[1:],
             seen=replace(rest, states=rest.states - 1),
-        )  # fmt: skip
+        )
 
     def _without_planes(self, is_old: Bools) -> PlaneWindow:
         is_old = is_old & ~np.isin(np.arange(len(is_old)), self.seen.planes)
@@ -204,9 +210,12 @@ class PlaneWindow:
         rest = Normal(self.prior.information, self.prior.gradient).without(out)
         number = np.cumsum(~is_old) - 1
         return replace(
-            self, values=self.values.cut(slice(None), ~is_old), prior=WindowPrior(rest.H, rest.g, at.cut(slice(None), ~is_old)),
-            landmarks=self.landmarks.only(~is_old), seen=replace(self.seen, planes=number[self.seen.planes]),
-        )  # fmt: skip
+            self,
+            values=self.values.cut(slice(None), ~is_old),
+            prior=WindowPrior(rest.H, rest.g, at.cut(slice(None), ~is_old)),
+            landmarks=self.landmarks.only(~is_old),
+            seen=replace(self.seen, planes=number[self.seen.planes]),
+        )
 
 
 # Cosine of 10 deg between normals, and m between planes, along the normal at what the scan saw.
@@ -230,10 +239,13 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
     sightings = Sightings(states, landmark, planes.cp[which], np.asarray(np.linalg.inv(covariances), np.float64))
     r, by_pose, by_plane = sighting_residuals(window.values, sightings, window.landmarks.anchors, window.T_imu_lidar)
     J = np.concatenate([by_pose, by_plane], axis=2)
-    at = np.concatenate([
-        np.broadcast_to(SHARED + np.arange(6), (len(which), 6)),
-        SHARED + STATE_SIZE + PLANE_SIZE * landmark[:, None] + np.arange(PLANE_SIZE),
-    ], axis=1)  # fmt: skip
+    at = np.concatenate(
+        [
+            np.broadcast_to(SHARED + np.arange(6), (len(which), 6)),
+            SHARED + STATE_SIZE + PLANE_SIZE * landmark[:, None] + np.arange(PLANE_SIZE),
+        ],
+        axis=1,
+    )
     S = J @ covariance[at[:, :, None], at[:, None, :]] @ np.swapaxes(J, 1, 2) + covariances
     squares = np.einsum("ki,ki->k", r, np.linalg.solve(S, r[:, :, None])[:, :, 0])
     # The nearest landmark of each plane: the last one written is the smallest.
@@ -255,6 +267,6 @@ def _candidates(window: PlaneWindow, planes: Planes) -> tuple[Longs, Longs]:
     lows, highs = turned(planes, T)
     is_near = (
         (lows[:, None] - BOXES_APART_M < marks.highs[None]) & (highs[:, None] + BOXES_APART_M > marks.lows[None])
-    ).all(axis=2)  # fmt: skip
+    ).all(axis=2)
     which, landmark = np.nonzero((cosine > ALIKE) & (off < CLOSE) & is_near)
     return which, landmark

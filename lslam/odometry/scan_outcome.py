@@ -26,13 +26,26 @@ def recorded(scan: Scan, result: RegistrationResult, covariance: Floats | None, 
     covariance : (6, 6) of the pose in the world; own : likewise, relative to the local map
     """
     return ScanResult(
-        index=scan.index, stamp_ns=scan.stamp_ns, T_world_lidar=result.T_world_lidar,
-        status="ok" if result.is_accepted else "bridged", reason=result.reason, covariance=covariance,
-        registration_covariance=own, map_age=result.map_age, converged=result.converged, iterations=result.iterations,
-        source_points=result.source_points, inliers=result.inliers, rmse=result.rmse, overlap=result.overlap,
-        is_stationary=result.is_stationary, posed_by=result.pose_source,
-        degenerate=result.degenerate, prior_error=result.prior_error, stages=result.stages,
-    )  # fmt: skip
+        index=scan.index,
+        stamp_ns=scan.stamp_ns,
+        T_world_lidar=result.T_world_lidar,
+        status="ok" if result.is_accepted else "bridged",
+        reason=result.reason,
+        covariance=covariance,
+        registration_covariance=own,
+        map_age=result.map_age,
+        converged=result.converged,
+        iterations=result.iterations,
+        source_points=result.source_points,
+        inliers=result.inliers,
+        rmse=result.rmse,
+        overlap=result.overlap,
+        is_stationary=result.is_stationary,
+        posed_by=result.pose_source,
+        degenerate=result.degenerate,
+        prior_error=result.prior_error,
+        stages=result.stages,
+    )
 
 
 def judge(
@@ -95,6 +108,14 @@ def plausible(result: ScanResult, T_prior: Floats, last: ScanResult | None) -> S
     if not reason:
         return result
     return replace(
-        result, T_world_lidar=T_prior.copy(), status="bridged", reason=reason, converged=False, inliers=0, rmse=0.0,
-        overlap=0.0, covariance=None, registration_covariance=None,
-    )  # fmt: skip
+        result,
+        T_world_lidar=T_prior.copy(),
+        status="bridged",
+        reason=reason,
+        converged=False,
+        inliers=0,
+        rmse=0.0,
+        overlap=0.0,
+        covariance=None,
+        registration_covariance=None,
+    )

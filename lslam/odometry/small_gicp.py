@@ -73,9 +73,12 @@ class SmallGicp(Traits):
         )
         pose = np.asarray(alignment.T_target_source, np.float64)
         return RegistrationResult(
-            pose, source_points=count, inliers=int(alignment.num_inliers), converged=bool(alignment.converged),
+            pose,
+            source_points=count,
+            inliers=int(alignment.num_inliers),
+            converged=bool(alignment.converged),
             iterations=int(alignment.iterations),
-        )  # fmt: skip
+        )
 
     def _has_moved_on(self, pose: Floats) -> bool:
         moved = se3.relative(self._T_world_keyframe, pose)

@@ -43,9 +43,12 @@ class StationaryDetector(Stateful):
         c = self._config
         # Of the reference, in voxels as coarse as those of a map's first scans: a ring is no plane.
         self._planes = GaussianMap(
-            c.voxel_size * c.coarse_factor, min_points=c.min_points, planarity=c.planarity, count_cap=c.count_cap,
+            c.voxel_size * c.coarse_factor,
+            min_points=c.min_points,
+            planarity=c.planarity,
+            count_cap=c.count_cap,
             reach=1.2 * preprocess.range_max,
-        )  # fmt: skip
+        )
         # The pose of its own points on them after one step; None: there is no reference.
         self._T_own: Floats | None = None
         self._last: ScanResult | None = None
@@ -55,11 +58,16 @@ class StationaryDetector(Stateful):
         if self._last is None or not self._is_stationary(scan):
             return None
         return ScanResult(
-            scan.index, scan.stamp_ns, self._last.T_world_lidar.copy(),
-            reason=f"standing since scan {self._last.index}", is_stationary=True, is_repeated=True,
-            covariance=self._last.covariance, registration_covariance=self._last.registration_covariance,
+            scan.index,
+            scan.stamp_ns,
+            self._last.T_world_lidar.copy(),
+            reason=f"standing since scan {self._last.index}",
+            is_stationary=True,
+            is_repeated=True,
+            covariance=self._last.covariance,
+            registration_covariance=self._last.registration_covariance,
             points_covariance=self._last.points_covariance,
-        )  # fmt: skip
+        )
 
     def observe(self, scan: Scan, result: ScanResult) -> None:
         """Take a registered scan as the reference if the sensor was slow."""

@@ -57,9 +57,13 @@ def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: Buil
 
 
 def run_baseline(
-    graph: PoseGraph, solution: Solution, extract: BuildingExtract, store: KeyframeStore, config: Config,
+    graph: PoseGraph,
+    solution: Solution,
+    extract: BuildingExtract,
+    store: KeyframeStore,
+    config: Config,
     clocks: KeyframeClocks,
-) -> tuple[JointSolution, OsmMatches, CorrectedMap]:  # fmt: skip
+) -> tuple[JointSolution, OsmMatches, CorrectedMap]:
     """For each keyframe: NDT of the scan with all buildings near, VGICP of each building, an edge to each, optimisation.
 
     graph : in the frame of the map, with the start that all modes share
@@ -83,9 +87,15 @@ def run_baseline(
     with clocks[len(store) - 1].stage("graph"):
         joint = optimise_jointly(replace(graph, poses=poses), middles, local, None, config.graph)
     matches = OsmMatches(
-        extract.origin, osm.buildings, osm.walls, osm.owners, tuple(sights), tuple(local), source=extract.source,
+        extract.origin,
+        osm.buildings,
+        osm.walls,
+        osm.owners,
+        tuple(sights),
+        tuple(local),
+        source=extract.source,
         attribution=extract.attribution,
-    )  # fmt: skip
+    )
     placed = place_buildings(matches, se2.of_se3(joint.poses), local, joint.buildings, config.osm, "baseline")
     return joint, matches, placed
 
@@ -106,9 +116,16 @@ def _match(
         whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose
     sight = KeyframeMatch(
-        number, np.zeros((0, 2, 2)), np.zeros((1, 2)), at, np.zeros(3), start, np.zeros((3, 3)),
-        kind="none" if whole is None else "edges", reason="no convergence" if whole is None else ONLY_START,
-    )  # fmt: skip
+        number,
+        np.zeros((0, 2, 2)),
+        np.zeros((1, 2)),
+        at,
+        np.zeros(3),
+        start,
+        np.zeros((3, 3)),
+        kind="none" if whole is None else "edges",
+        reason="no convergence" if whole is None else ONLY_START,
+    )
     found = []
     for building in osm.near(start[:2], config.osm.use_radius).tolist():
         middle = osm.buildings[building].middle

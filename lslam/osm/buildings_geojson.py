@@ -122,9 +122,13 @@ def _correction(feature: dict[str, Any], origin: Floats) -> BuildingCorrection:
     east, north, turn = known["displacement_east_m"], known["displacement_north_m"], np.radians(known["turn_deg"])
     displacement = np.array([east, north, turn], np.float64)
     return BuildingCorrection(
-        _undone(there, displacement), displacement, np.array(known["covariance"], np.float64).reshape(3, 3),
-        known["status"], known["matches"], known["matches_rejected"],
-    )  # fmt: skip
+        _undone(there, displacement),
+        displacement,
+        np.array(known["covariance"], np.float64).reshape(3, 3),
+        known["status"],
+        known["matches"],
+        known["matches_rejected"],
+    )
 
 
 def _undone(there: Building, displacement: Floats) -> Building:

@@ -197,9 +197,13 @@ def correct_buildings(matches: OsmMatches, poses: Floats, config: OsmConfig) -> 
 
 
 def place_buildings(
-    matches: OsmMatches, poses: Floats, local: Sequence[BuildingMatch], solution: BuildingSolution, config: OsmConfig,
+    matches: OsmMatches,
+    poses: Floats,
+    local: Sequence[BuildingMatch],
+    solution: BuildingSolution,
+    config: OsmConfig,
     mode: str,
-) -> CorrectedMap:  # fmt: skip
+) -> CorrectedMap:
     """The map after a solution of the `local` matches: without overlaps, with absent buildings and new walls.
 
     mode : of `OsmConfig.mode`, or the name of the matcher
@@ -228,8 +232,11 @@ def place_buildings(
     counts = {status: sum(c.status == status for c in found) for status in ("seen", "unseen", "absent")}
     log.info(
         "OSM: %d buildings seen, %d unseen, %d absent; %d new walls",
-        counts["seen"], counts["unseen"], counts["absent"], len(corrected.new_walls),
-    )  # fmt: skip
+        counts["seen"],
+        counts["unseen"],
+        counts["absent"],
+        len(corrected.new_walls),
+    )
     return corrected
 
 

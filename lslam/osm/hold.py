@@ -72,9 +72,14 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
         problems.append(located.problem)
         return None
     on_walls = Georeference(
-        extract.origin, located.T_enu_odometry, config.gnss.crs, "osm", used=len(located.priors),
-        height_epsg=config.gnss.height_crs, geoid=config.gnss.geoid,
-    )  # fmt: skip
+        extract.origin,
+        located.T_enu_odometry,
+        config.gnss.crs,
+        "osm",
+        used=len(located.priors),
+        height_epsg=config.gnss.height_crs,
+        geoid=config.gnss.geoid,
+    )
     georeference = known if is_on_earth else on_walls
     out = solve(held, given, georeference)
     if out is None or out.solution is None:
@@ -133,8 +138,9 @@ def find_on_map(
         log.info(
             "OSM: %s drift of odometry, %.1f %% and %.1f deg/100 m, is corrected",
             "varying" if estimated.is_varying else "steady",
-            100 * np.linalg.norm(rates[:2]), 100 * np.degrees(rates[2]),
-        )  # fmt: skip
+            100 * np.linalg.norm(rates[:2]),
+            100 * np.degrees(rates[2]),
+        )
     return located, held
 
 

@@ -70,9 +70,14 @@ class Located:
 
 
 def locate(
-    extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config, placed: Floats | None = None,
-    odometry: Floats | None = None, clocks: KeyframeClocks | None = None,
-) -> Located:  # fmt: skip
+    extract: BuildingExtract,
+    store: KeyframeStore,
+    up: Floats | None,
+    config: Config,
+    placed: Floats | None = None,
+    odometry: Floats | None = None,
+    clocks: KeyframeClocks | None = None,
+) -> Located:
     """Match all keyframes with the map.
 
     up : (3,) up in the world of odometry by an IMU; None estimates it by the ground
@@ -90,9 +95,12 @@ def locate(
     if start.problem:
         return Located(T_level, osm, problem=start.problem)
     track = OsmTrack(
-        start.pose, start.sigma, config.graph.drift_percent, np.radians(config.graph.drift_deg_per_100m) / 100,
+        start.pose,
+        start.sigma,
+        config.graph.drift_percent,
+        np.radians(config.graph.drift_deg_per_100m) / 100,
         np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)]),
-    )  # fmt: skip
+    )
     matches = _both_ways(store, poses, osm, track, config, clocks)
     accepted = [match for match in matches if match.is_accepted]
     if not accepted:
@@ -116,9 +124,13 @@ def locate(
 
 
 def finish(
-    located: Located, extract: BuildingExtract, poses: Floats, solution: Solution, config: OsmConfig,
+    located: Located,
+    extract: BuildingExtract,
+    poses: Floats,
+    solution: Solution,
+    config: OsmConfig,
     clocks: KeyframeClocks | None = None,
-) -> OsmMatches:  # fmt: skip
+) -> OsmMatches:
     """All keyframe matches with the graph's verdicts, and the building matches from the final `poses`.
 
     clocks : measure the time of each keyframe, stage `building match`
@@ -131,9 +143,17 @@ def finish(
         with clocks[match.keyframe].stage("building match"):
             local += match_buildings(match, planar[match.keyframe], solution.shift, located.osm, config)
     return OsmMatches(
-        extract.origin, located.osm.buildings, located.osm.walls, located.osm.owners, tuple(judged), tuple(local),
-        solution.shift, solution.shift_sigma, extract.source, extract.attribution,
-    )  # fmt: skip
+        extract.origin,
+        located.osm.buildings,
+        located.osm.walls,
+        located.osm.owners,
+        tuple(judged),
+        tuple(local),
+        solution.shift,
+        solution.shift_sigma,
+        extract.source,
+        extract.attribution,
+    )
 
 
 def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Floats:
@@ -170,9 +190,15 @@ def _both_ways(
 
 
 def _along(
-    numbers: Iterable[int], store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config,
-    clocks: KeyframeClocks, before: int | None = None,
-) -> list[KeyframeMatch]:  # fmt: skip
+    numbers: Iterable[int],
+    store: KeyframeStore,
+    poses: Floats,
+    osm: OsmMap,
+    track: OsmTrack,
+    config: Config,
+    clocks: KeyframeClocks,
+    before: int | None = None,
+) -> list[KeyframeMatch]:
     """Match the keyframes `numbers` in turn. The track is at keyframe `before`, or at the first of them for None."""
     planar = se2.of_se3(poses)
     matches: list[KeyframeMatch] = []

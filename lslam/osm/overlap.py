@@ -156,9 +156,13 @@ def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
 
 
 def _move(
-    ours: Floats, turned: Floats, rotation: Floats, push: Floats, contacts: tuple[tuple[int, int, int], ...],
+    ours: Floats,
+    turned: Floats,
+    rotation: Floats,
+    push: Floats,
+    contacts: tuple[tuple[int, int, int], ...],
     extra: float = 0.0,
-) -> _Move:  # fmt: skip
+) -> _Move:
     """The move that takes our corners to `turned` + `push`."""
     farthest = float(np.linalg.norm(turned + push - ours[:, 0], axis=1).max())
     return _Move(rotation, turned[0] + push - rotation @ ours[0, 0], farthest + extra, contacts)

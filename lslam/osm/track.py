@@ -75,10 +75,12 @@ class OsmTrack:
 
         Returns the rotation, rad, about the first pose, and the squared Mahalanobis distances (M,) of the matches.
         """
-        weights = np.stack([
-            self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY_M)
-            for m, way in zip(matches, ways, strict=True)
-        ])  # fmt: skip
+        weights = np.stack(
+            [
+                self._weight(m.information, self._map + self._drift * abs(way - ways[0]) * MEMORY_M)
+                for m, way in zip(matches, ways, strict=True)
+            ]
+        )
         real, pivot = np.stack([m.pose for m in matches]), np.append(poses[0, :2], 0.0)
         about, moved, squared = se2.relative(pivot, poses), np.zeros(3), np.zeros(len(poses))
         for _ in range(ROUNDS):

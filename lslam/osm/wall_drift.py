@@ -74,9 +74,15 @@ class DriftFit:
     """
 
     def __init__(
-        self, graph: PoseGraph, seen: WallSightings, effects: Floats, taken: Floats, seen_sigma: float, map_sigma: float,
+        self,
+        graph: PoseGraph,
+        seen: WallSightings,
+        effects: Floats,
+        taken: Floats,
+        seen_sigma: float,
+        map_sigma: float,
         given: Floats,
-    ) -> None:  # fmt: skip
+    ) -> None:
         about = seen.places - graph.poses[seen.keyframes, :2, 3]
         turned = seen.normals[:, 1] * about[:, 0] - seen.normals[:, 0] * about[:, 1]
         self._axes = np.column_stack([seen.normals, turned])
@@ -198,9 +204,13 @@ class WallDrift:
 
 
 def find_wall_drift(
-    graph: PoseGraph, seen: WallSightings, seen_sigma: float, map_sigma: float, config: GraphConfig,
+    graph: PoseGraph,
+    seen: WallSightings,
+    seen_sigma: float,
+    map_sigma: float,
+    config: GraphConfig,
     before: WallDrift | None = None,
-) -> WallDrift | None:  # fmt: skip
+) -> WallDrift | None:
     """The rates of drift for which the sightings of each wall agree; None without sightings.
 
     Rates at knots and errors of sightings are random, with hyperparameters that maximise the marginal likelihood (empirical
@@ -223,9 +233,13 @@ def find_wall_drift(
 
 
 def _fitted(
-    graph: PoseGraph, seen: WallSightings, sigmas: tuple[float, float], config: GraphConfig, before: WallDrift | None,
+    graph: PoseGraph,
+    seen: WallSightings,
+    sigmas: tuple[float, float],
+    config: GraphConfig,
+    before: WallDrift | None,
     is_varying: bool,
-) -> WallDrift:  # fmt: skip
+) -> WallDrift:
     """As `find_wall_drift`, for constant or for varying rates alone."""
     assert graph.start_sigma is not None
     length = float(graph.distances[-1])
@@ -254,10 +268,12 @@ def _fitted(
     spread = np.zeros((len(graph), 6, 6))
     spread[:, np.array(PLANAR)[:, None], PLANAR] = moves @ covariance @ np.swapaxes(moves, -1, -2)
     return WallDrift(
-        found.reshape(-1, 3), np.asarray(at_knots @ new.reshape(-1, 3)), spread,
+        found.reshape(-1, 3),
+        np.asarray(at_knots @ new.reshape(-1, 3)),
+        spread,
         EstimatedDrift(-(mean @ found), sigma, gain, quantile(config.probability, FITTED), rms),
         is_settled=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
-    )  # fmt: skip
+    )
 
 
 def _likeliest(fit: DriftFit, roots: Sequence[Floats]) -> Sizes:

@@ -182,9 +182,16 @@ def _beside(best: WallMatch, at: Floats, window: Floats) -> Floats:
 
 
 def _refined(
-    seen: Floats, known: Floats, pose: Floats, gates: Floats, at: Floats, trust: Floats, window: Floats,
-    config: OsmConfig, by_coverage: bool,
-) -> WallMatch | None:  # fmt: skip
+    seen: Floats,
+    known: Floats,
+    pose: Floats,
+    gates: Floats,
+    at: Floats,
+    trust: Floats,
+    window: Floats,
+    config: OsmConfig,
+    by_coverage: bool,
+) -> WallMatch | None:
     """The pose refined by lines; None when it leaves the window or no wall has a partner."""
     pose, normal, centre, rms, pair = wall_matching.refine(
         seen, known, pose, at, trust, gates, LAST_ITERATIONS, LIKENESS, SHORT, by_coverage
@@ -278,10 +285,17 @@ def matched(view: KeyframeMatch, found: WallMatch, numbers: Longs) -> KeyframeMa
     """`view` with the match `found`; numbers : (T,) of the map's walls that it was matched with."""
     pairs = np.column_stack([found.pairs[:, 0], numbers[found.pairs[:, 1]]])
     return replace(
-        view, pose=found.pose, information=found.information, rank=found.rank, kind=found.kind, fitness=found.fitness,
-        coverage=found.coverage, rms=found.rms, pairs=pairs,
+        view,
+        pose=found.pose,
+        information=found.information,
+        rank=found.rank,
+        kind=found.kind,
+        fitness=found.fitness,
+        coverage=found.coverage,
+        rms=found.rms,
+        pairs=pairs,
         reason="another place fits nearly as well" if found.is_ambiguous else "",
-    )  # fmt: skip
+    )
 
 
 def match_buildings(
@@ -309,10 +323,20 @@ def match_buildings(
         reason = "another place fits nearly as well" if one.is_ambiguous else ""
         found.append(
             BuildingMatch(
-                match.keyframe, number, one.pose, one.information, one.rank, one.kind, one.fitness, one.coverage,
-                one.rms, one.pairs, Verdict.REJECTED if reason else Verdict.ACCEPTED, reason,
+                match.keyframe,
+                number,
+                one.pose,
+                one.information,
+                one.rank,
+                one.kind,
+                one.fitness,
+                one.coverage,
+                one.rms,
+                one.pairs,
+                Verdict.REJECTED if reason else Verdict.ACCEPTED,
+                reason,
             )
-        )  # fmt: skip
+        )
     return found
 
 

@@ -85,9 +85,16 @@ def find_walls(
     )
     tries = np.random.default_rng(0).integers(0, 2**31, (MOST, TRIES))
     found = segments.find_segments(
-        flat, every, tries, config.wall_tolerance, AGREEMENT, config.wall_gap, float(config.min_cluster),
-        config.min_length, WALL_STEP_M,
-    )  # fmt: skip
+        flat,
+        every,
+        tries,
+        config.wall_tolerance,
+        AGREEMENT,
+        config.wall_gap,
+        float(config.min_cluster),
+        config.min_length,
+        WALL_STEP_M,
+    )
     seen_from = np.zeros((1, 2)) if views is None else np.asarray(views, np.float64)[:, :2]
     return Walls(_directed(found[:, :4].reshape(-1, 2, 2), seen_from), found[:, 4].astype(np.int64), found[:, 5])
 

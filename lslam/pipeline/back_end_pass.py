@@ -71,9 +71,17 @@ def optimise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
                 raise InterruptedRunError("interrupted before the pose graph")
             with asking(job.watch.should_stop, "interrupted before the pose graph was solved"):
                 done = run_back_end(
-                    job.sequence, record.results, store, config, candidates, record.turns, hold, clocks, record.inertial,
+                    job.sequence,
+                    record.results,
+                    store,
+                    config,
+                    candidates,
+                    record.turns,
+                    hold,
+                    clocks,
+                    record.inertial,
                     manual.points,
-                )  # fmt: skip
+                )
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return BackEnd(record.results)
@@ -114,9 +122,17 @@ def _loops(
     if config.loops.use:
         taken = {(c.a, c.b) for c in candidates}
         found = find_loops(
-            store, config.loops, config.registration, submap_size, clocks, should_stop, config.input.workers,
-            where_held(store.keyframes, candidates, job.manual.points, results, config), pairs.forbidden, up,
-        )  # fmt: skip
+            store,
+            config.loops,
+            config.registration,
+            submap_size,
+            clocks,
+            should_stop,
+            config.input.workers,
+            where_held(store.keyframes, candidates, job.manual.points, results, config),
+            pairs.forbidden,
+            up,
+        )
         candidates += [c for c in found if (c.a, c.b) not in taken]
     if checkpoints is not None:
         checkpoints.write(len(poses), lambda: {"poses": poses, "candidates": Records(candidates)})
@@ -157,10 +173,11 @@ def write_back_end(folder: Path, record: RunRecord, store: KeyframeStore, done: 
     if record.odometry is None:
         return
     write_tum(
-        folder / "trajectory_odometry.tum", record.odometry,
+        folder / "trajectory_odometry.tum",
+        record.odometry,
         comment=f"lslam {__version__}, {record.method}: T_world_lidar of odometry, in a world of its own\n"
         f"pose_time: {record.pose_time}",
-    )  # fmt: skip
+    )
     numbers = [record.results[k.scan].index for k in store.keyframes]
     if done.osm is not None:
         write_osm_matches(folder / "osm_matches.csv", done.osm, numbers, se2.of_se3(done.keyframes))

@@ -53,8 +53,9 @@ def frame_between(new: EarlierRun, old: EarlierRun) -> Floats:
     log.warning(
         "only their places on the Earth tie %s to %s: where these are off by more than a cell all walls seem changed; lslam "
         "localize ties drives by their scans",
-        new.folder, old.folder,
-    )  # fmt: skip
+        new.folder,
+        old.folder,
+    )
     T_old_new = frame_change(new.georeference.origin, old.georeference.origin)
     return np.asarray(se3.inverse(old.georeference.T_enu_world) @ T_old_new @ new.georeference.T_enu_world)
 
@@ -75,9 +76,14 @@ def _frame_of(run: EarlierRun) -> Path:
 
 
 def compare_runs(
-    new: tuple[EarlierRun, Sequence], old: tuple[EarlierRun, Sequence], T_old_new: Floats, *, spool: Path | None = None,
-    on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
-) -> ChangedCells:  # fmt: skip
+    new: tuple[EarlierRun, Sequence],
+    old: tuple[EarlierRun, Sequence],
+    T_old_new: Floats,
+    *,
+    spool: Path | None = None,
+    on_step: Callable[[], None] = lambda: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> ChangedCells:
     """Changes between both runs, in the world of the old one.
 
     Moving objects are removed from each drive separately. Cells and their range are those of the new run's configuration.
@@ -145,10 +151,12 @@ def write_changes(folder: Path, found: ChangedCells, new: EarlierRun, old: Earli
     thing = np.repeat(np.arange(len(kinds) + 1), [*(len(k) for k in kinds), len(found.same)])
     cells = np.concatenate([*(c.cells for c in found.changes), found.same])
     write_ply(
-        folder / CLOUD, (cells + 0.5) * found.voxel, colours=_COLOURS[change + 1],
+        folder / CLOUD,
+        (cells + 0.5) * found.voxel,
+        colours=_COLOURS[change + 1],
         scalars={"change": change, "thing": np.where(change == 0, 0, thing + 1)},
         comment=f"lslam {__version__} changes from {old.folder} to {new.folder}, cells of {found.voxel:g} m; {old.world}",
-    )  # fmt: skip
+    )
     place = old.georeference
     about = {"old": str(old.folder), "new": str(new.folder), "voxel_m": found.voxel, "lslam": __version__}
     if place is None:
@@ -170,8 +178,13 @@ def properties(number: int, change: MapChange) -> dict[str, str | int | float]:
     x, y, _ = change.centres.mean(axis=0)
     length, width = change.extent
     measures = {
-        "x_m": x, "y_m": y, "base_m": change.base, "height_m": change.height, "length_m": length, "width_m": width,
+        "x_m": x,
+        "y_m": y,
+        "base_m": change.base,
+        "height_m": change.height,
+        "length_m": length,
+        "width_m": width,
         "volume_m3": change.volume,
-    }  # fmt: skip
+    }
     rounded = {name: round(float(value), 3) for name, value in measures.items()}
     return {"thing": number, "kind": change.kind, "cells": len(change.cells), **rounded}

@@ -75,9 +75,14 @@ class FeatureMaker:
 
 
 def build_feature_map(
-    sequence: Sequence, odometry: FeatureSource, results: list[ScanResult], config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool], checkpoints: MapCheckpoints | None = None,
-) -> FeatureCloud:  # fmt: skip
+    sequence: Sequence,
+    odometry: FeatureSource,
+    results: list[ScanResult],
+    config: Config,
+    on_step: Callable[[], None],
+    should_stop: Callable[[], bool],
+    checkpoints: MapCheckpoints | None = None,
+) -> FeatureCloud:
     """Map of the less sharp edges and less planar points of all registered scans, in voxels of `loam.feature_map_voxel`.
 
     Raises InterruptedRunError when `should_stop` says so; `checkpoints` then allow to continue.

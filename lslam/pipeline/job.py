@@ -162,9 +162,12 @@ def announce(job: PreparedRun) -> None:
         log.info("%s", note)
     sweep = sweep_of(sequence)
     units = examine_units(
-        getattr(sequence, "whole", sequence), job.truth, config.imu.use, config.gnss.mode != "off",
+        getattr(sequence, "whole", sequence),
+        job.truth,
+        config.imu.use,
+        config.gnss.mode != "off",
         None if sequence.motion_compensated else sweep,
-    )  # fmt: skip
+    )
     job.manifest.problems += map(str, [*units, *examine_jumps(job.truth)])
     for problem in [*sequence.problems, *job.manifest.problems]:
         log.warning("%s", problem)

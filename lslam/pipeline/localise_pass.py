@@ -83,8 +83,12 @@ def _followed(
         start = _find_start(sequence, prior_map, search, config, watch)
         follower = MapFollower(view, *_at_first_scan(start, search.store, results, config), config, reanchor)
         fixes: list[MapFix] = []
-        about = {"votes": start.votes, "tried": start.tried, "scan": search.store.keyframes[start.vote.keyframe].scan,
-                 "support": round(start.vote.support, 3)}  # fmt: skip
+        about = {
+            "votes": start.votes,
+            "tried": start.tried,
+            "scan": search.store.keyframes[start.vote.keyframe].scan,
+            "support": round(start.vote.support, 3),
+        }
     else:
         follower = MapFollower(view, np.eye(4), np.eye(6), config, reanchor)
         follower.restore(known["follower"])
@@ -157,8 +161,10 @@ def _find_start(sequence: Sequence, prior_map: PriorMap, search: PlaceFinder, co
         )
     log.info(
         "found in the map by %d of %d keyframes tried, %.0f %% of the upright points fit",
-        start.votes, start.tried, 100 * start.vote.support,
-    )  # fmt: skip
+        start.votes,
+        start.tried,
+        100 * start.vote.support,
+    )
     return start
 
 
@@ -235,9 +241,13 @@ def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config:
     shares = [fix.inlier_share for fix in fixes if fix.is_held]
     manifest.world = record.world
     manifest.localization = {
-        "map": config.localize.map, "points": len(prior_map), "start": start, **dict(sorted(counts.items())),
-        "doubted": doubtful, "inlier_share": round(float(np.median(shares)), 4),
-    }  # fmt: skip
+        "map": config.localize.map,
+        "points": len(prior_map),
+        "start": start,
+        **dict(sorted(counts.items())),
+        "doubted": doubtful,
+        "inlier_share": round(float(np.median(shares)), 4),
+    }
     others = ", ".join(f"{counts[status]} {said}" for status, said in WORDS.items() if counts[status])
     if others:
         manifest.problems.append(

@@ -58,8 +58,11 @@ def _report_stamps(results: list[ScanResult]) -> None:
         log.warning(
             "the stamps of %d of %d scans, the first is scan %d, are wrong by up to %.0f ms: at the period of the sensor the "
             "poses follow each other steadily, by their stamps they jump; it spoils speeds, deskewing and the use of an IMU",
-            len(at), len(results), results[at[0]].index, 1e3 * off_s,
-        )  # fmt: skip
+            len(at),
+            len(results),
+            results[at[0]].index,
+            1e3 * off_s,
+        )
 
 
 def _positions(results: list[ScanResult]) -> tuple[Floats, Longs]:

@@ -123,9 +123,14 @@ class MapNote:
 
 
 def write_built(
-    path: Path, built: BuiltMap, config: MapConfig, sequence: str, trajectory: Trajectory, world: str,
+    path: Path,
+    built: BuiltMap,
+    config: MapConfig,
+    sequence: str,
+    trajectory: Trajectory,
+    world: str,
     georeference: Georeference | None,
-) -> None:  # fmt: skip
+) -> None:
     """Write the map of a run, and if configured a surface, the occupancy, and the trajectory on the Earth.
 
     Raises as `write_map`.

@@ -57,9 +57,14 @@ class BuiltMap:
 
 
 def build_map(
-    sequence: Sequence, results: list[ScanResult], config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool], spool: Path | None = None, checkpoints: MapCheckpoints | None = None,
-) -> BuiltMap:  # fmt: skip
+    sequence: Sequence,
+    results: list[ScanResult],
+    config: Config,
+    on_step: Callable[[], None],
+    should_stop: Callable[[], bool],
+    spool: Path | None = None,
+    checkpoints: MapCheckpoints | None = None,
+) -> BuiltMap:
     """Merge every registered scan.
 
     Bridged scans, and scans of another frame, are left out: their error would enter the map. A map too large for memory is
@@ -86,9 +91,16 @@ def build_map(
 
 
 def scans_again(
-    sequence: Sequence, prepare: Callable[[Scan], Any], numbers: range, config: Config, on_step: Callable[[], None],
-    should_stop: Callable[[], bool], interrupted: str, done: int = 0, offer: Callable[[int, bool], None] | None = None,
-) -> Iterator[tuple[int, Loaded]]:  # fmt: skip
+    sequence: Sequence,
+    prepare: Callable[[Scan], Any],
+    numbers: range,
+    config: Config,
+    on_step: Callable[[], None],
+    should_stop: Callable[[], bool],
+    interrupted: str,
+    done: int = 0,
+    offer: Callable[[int, bool], None] | None = None,
+) -> Iterator[tuple[int, Loaded]]:
     """Second pass over raw scans: their numbers, and the results of `prepare`, which runs ahead in a thread.
 
     interrupted : message of the InterruptedRunError that is raised when `should_stop` says so
@@ -140,16 +152,23 @@ class MapMaker:
     def __init__(self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: Floats = Z) -> None:
         self._section = section
         self._merger = MapMerger(
-            section.voxel, section.range_min, section.range_max, crop=section.crop_box, spool=spool,
+            section.voxel,
+            section.range_min,
+            section.range_max,
+            crop=section.crop_box,
+            spool=spool,
             keep=None if keep is None else keep / "map",
-        )  # fmt: skip
+        )
         self._cleaner = Cleaner(up) if section.clean else None
         self._occupancy = None
         if section.occupancy:
             self._occupancy = OccupancyMapper(
-                section.occupancy_voxel, section.range_min, section.occupancy_range, spool=spool,
+                section.occupancy_voxel,
+                section.range_min,
+                section.occupancy_range,
+                spool=spool,
                 keep=None if keep is None else keep / "occupancy",
-            )  # fmt: skip
+            )
         self._given: list[int] = []
 
     def add(self, number: int, scan: PosedScan) -> None:

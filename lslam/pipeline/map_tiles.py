@@ -37,9 +37,15 @@ BUFFERED = 1 << 22
 
 
 def rebuild_in_tiles(
-    run: EarlierRun, sequence: Sequence, folder: Path, size: float, *, crs: OutputCrs | None = None,
-    on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
-) -> dict[str, Any]:  # fmt: skip
+    run: EarlierRun,
+    sequence: Sequence,
+    folder: Path,
+    size: float,
+    *,
+    crs: OutputCrs | None = None,
+    on_step: Callable[[], None] = lambda: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> dict[str, Any]:
     """Build the map of a run again, in tiles of `size` m, in `folder`, checked by `check_tiles`. Returns the index.
 
     Raises as `rebuild` does.
@@ -75,11 +81,20 @@ def write_tiles(
         _publish(Path(stage), folder, {tile["file"] for tile in tiles})
     crs = projection.name if projection is not None and is_projected else None
     index: dict[str, Any] = {
-        "schema": SCHEMA, "kind": "tiles", "tile_m": size, "unit": "m", "points": len(cloud), "tiles": tiles,
-        "frame": note.world if projection is None or crs is None else projection.frame, "crs": crs,
+        "schema": SCHEMA,
+        "kind": "tiles",
+        "tile_m": size,
+        "unit": "m",
+        "points": len(cloud),
+        "tiles": tiles,
+        "frame": note.world if projection is None or crs is None else projection.frame,
+        "crs": crs,
         "georeference": None if georeference is None else georeference_note(georeference),
-        "voxel": note.voxel, "done": list(note.done), "sequence": note.sequence, "lslam": __version__,
-    }  # fmt: skip
+        "voxel": note.voxel,
+        "done": list(note.done),
+        "sequence": note.sequence,
+        "lslam": __version__,
+    }
     write_json(folder / INDEX, index)
     return index
 

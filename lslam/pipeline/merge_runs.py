@@ -127,9 +127,12 @@ def _with_covariances(run: EarlierRun) -> list[ScanResult]:
 
 
 def merge_runs(
-    folders: Sequence[Path], config: Config, should_stop: Stop = lambda: False,
-    on_stage: Callable[[str], None] = lambda stage: None, checkpoints: Checkpoints | None = None,
-) -> Merged:  # fmt: skip
+    folders: Sequence[Path],
+    config: Config,
+    should_stop: Stop = lambda: False,
+    on_stage: Callable[[str], None] = lambda stage: None,
+    checkpoints: Checkpoints | None = None,
+) -> Merged:
     """Connect the sessions, find loops, optimise.
 
     The first run defines the world. Raises RunFailedError when no other can be connected to it, InterruptedRunError when
@@ -207,9 +210,13 @@ def _loops(chain: Chain, config: Config, should_stop: Stop, checkpoints: Checkpo
 
 
 def _solve(
-    chain: Chain, candidates: list[LoopCandidate], config: Config, runs: dict[str, EarlierRun], left_out: list[LeftOut],
+    chain: Chain,
+    candidates: list[LoopCandidate],
+    config: Config,
+    runs: dict[str, EarlierRun],
+    left_out: list[LeftOut],
     should_stop: Stop,
-) -> Merged:  # fmt: skip
+) -> Merged:
     keyframes = chain.keyframes()
     loops = [c.constraint for c in candidates if c.is_accepted and c.constraint is not None]
     graph = PoseGraph(

@@ -58,9 +58,15 @@ class SessionRow:
 
 
 def merge_into(
-    folders: Sequence[Path], out: Path, config: Config, watch: Watch, *, overwrite: bool = False, resume: bool = False,
+    folders: Sequence[Path],
+    out: Path,
+    config: Config,
+    watch: Watch,
+    *,
+    overwrite: bool = False,
+    resume: bool = False,
     command: str = "",
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Merge runs into the folder `out`. Returns its manifest.
 
     Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`.
@@ -121,11 +127,13 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
         "sessions": [vars(row) for row in rows],
         "left_out": [vars(one) for one in merged.left_out],
         "graph": {
-            "keyframes": len(merged.chain), "loops": len(accepted), "drift_factor": round(merged.solution.drift, 4),
+            "keyframes": len(merged.chain),
+            "loops": len(accepted),
+            "drift_factor": round(merged.solution.drift, 4),
             "rounds": merged.solution.rounds,
         },
         **({} if georeference is None else {"georeference": describe(georeference)}),
-    }  # fmt: skip
+    }
 
 
 def _recording(run: EarlierRun, problems: list[str]) -> Recording | None:
@@ -152,11 +160,18 @@ def _rows(
         T = merged.solution.poses[part][0] @ se3.inverse(session.keyframes[0].T_world_lidar)
         rows.append(
             SessionRow(
-                session.name, str(run.folder.resolve()), len(session.results), len(session.keyframes), part.start,
-                0 if start is None else start.votes, 0 if start is None else start.tried, merged.between(n),
-                _ate(run.trajectory, trajectory, recording, config), se3.normalise(T).tolist(),
+                session.name,
+                str(run.folder.resolve()),
+                len(session.results),
+                len(session.keyframes),
+                part.start,
+                0 if start is None else start.votes,
+                0 if start is None else start.tried,
+                merged.between(n),
+                _ate(run.trajectory, trajectory, recording, config),
+                se3.normalise(T).tolist(),
             )
-        )  # fmt: skip
+        )
     return rows
 
 

@@ -86,12 +86,21 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
-            sequence, job.odometry, threads=config.input.workers, begin=_begin_segment(job, inertial),
-            initial_scans=config.registration.start_scans, stationary=stationary, motion=motion,
-            should_stop=watch.should_stop, on_scan=seen, keyframing=keyframing, checkpoints=checkpoints, monitor=monitor,
+            sequence,
+            job.odometry,
+            threads=config.input.workers,
+            begin=_begin_segment(job, inertial),
+            initial_scans=config.registration.start_scans,
+            stationary=stationary,
+            motion=motion,
+            should_stop=watch.should_stop,
+            on_scan=seen,
+            keyframing=keyframing,
+            checkpoints=checkpoints,
+            monitor=monitor,
             noise_m=config.registration.sigma,
             beyond_m=surroundings_m(config.registration),
-        )  # fmt: skip
+        )
         keyframing.settle()
     if checkpoints is not None and checkpoints.resumed_after:
         manifest.resumed_after = checkpoints.resumed_after
@@ -188,9 +197,11 @@ def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: I
     config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
     alike = type(job.odometry), is_over, bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
     with (
-        job.manifest.timed("compile_s"), one_at_a_time(jit.lock_file(), "compiles kernels"), helped(config) as start_helper,
+        job.manifest.timed("compile_s"),
+        one_at_a_time(jit.lock_file(), "compiles kernels"),
+        helped(config) as start_helper,
         jit.announced(log, start_helper),
-    ):  # fmt: skip
+    ):
         if alike not in _warmed:
             trackers = [one for one in (job.odometry, stationary, monitor) if one is not None]
             load_kernels(config, trackers, is_over=is_over)

@@ -38,14 +38,37 @@ from lslam.reports.evaluations import run_document
 from lslam.reports.facts import stage_matrix
 
 LOOP_COLUMNS = (
-    "keyframe_a", "keyframe_b", "scan_a", "scan_b", "distance_m", "descriptor_distance", "verdict", "stage", "rmse_m",
-    "overlap", "sigma_m", "sigma_deg", "reason",
-)  # fmt: skip
+    "keyframe_a",
+    "keyframe_b",
+    "scan_a",
+    "scan_b",
+    "distance_m",
+    "descriptor_distance",
+    "verdict",
+    "stage",
+    "rmse_m",
+    "overlap",
+    "sigma_m",
+    "sigma_deg",
+    "reason",
+)
 # x, y, yaw: of the keyframe in the map frame, or of the displacement of the building about its middle.
 MATCH_COLUMNS = (
-    "keyframe", "scan", "building", "verdict", "kind", "rank", "walls", "fitness", "coverage", "rms_m", "x_m", "y_m", "yaw_deg",
+    "keyframe",
+    "scan",
+    "building",
+    "verdict",
+    "kind",
+    "rank",
+    "walls",
+    "fitness",
+    "coverage",
+    "rms_m",
+    "x_m",
+    "y_m",
+    "yaw_deg",
     "reason",
-)  # fmt: skip
+)
 
 
 def write_loops(path: Path, candidates: Sequence[LoopCandidate], scans: Sequence[int]) -> None:
@@ -55,11 +78,21 @@ def write_loops(path: Path, candidates: Sequence[LoopCandidate], scans: Sequence
     """
     rows = [
         (
-            c.a, c.b, scans[c.a], scans[c.b], f"{c.distance:.3f}", _number(c.descriptor_distance),
-            c.verdict, c.stage, _number(c.rmse), _number(c.overlap), *map(_number, _sigmas(c)), c.reason,
+            c.a,
+            c.b,
+            scans[c.a],
+            scans[c.b],
+            f"{c.distance:.3f}",
+            _number(c.descriptor_distance),
+            c.verdict,
+            c.stage,
+            _number(c.rmse),
+            _number(c.overlap),
+            *map(_number, _sigmas(c)),
+            c.reason,
         )
         for c in candidates
-    ]  # fmt: skip
+    ]
     _write(path, LOOP_COLUMNS, rows)
 
 
@@ -94,9 +127,16 @@ def _match_row(
 ) -> tuple[Any, ...]:
     place = (pose[0], pose[1], np.degrees(pose[2])) if match.rank else (np.nan, np.nan, np.nan)
     return (
-        match.keyframe, scans[match.keyframe], building, match.verdict, match.kind, match.rank, len(match.pairs),
-        *map(_number, (match.fitness, match.coverage, match.rms, *place)), match.reason,
-    )  # fmt: skip
+        match.keyframe,
+        scans[match.keyframe],
+        building,
+        match.verdict,
+        match.kind,
+        match.rank,
+        len(match.pairs),
+        *map(_number, (match.fitness, match.coverage, match.rms, *place)),
+        match.reason,
+    )
 
 
 def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
@@ -106,9 +146,13 @@ def _write(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) ->
 
 
 def timing_text(
-    indices: list[int], stamps_ns: list[int], names: list[str], seconds: Floats,
-    back_end: Mapping[int, Mapping[str, float]] | None = None, saved: Mapping[int, float] | None = None,
-) -> str:  # fmt: skip
+    indices: list[int],
+    stamps_ns: list[int],
+    names: list[str],
+    seconds: Floats,
+    back_end: Mapping[int, Mapping[str, float]] | None = None,
+    saved: Mapping[int, float] | None = None,
+) -> str:
     """Table of times of scans by number and stamp, with seconds (N, S) of the stages `names`.
 
     back_end : seconds by row and name, of stages that do not count in the total of a scan
@@ -177,8 +221,10 @@ def write_trajectories(folder: RunFolder, record: RunRecord, calibration: Calibr
     write_kitti(folder.path / "trajectory_kitti.txt", _in_camera(trajectory, calibration))
     if trajectory.covariances is not None:
         stream = io.BytesIO()
-        registration = [np.full((6, 6), np.nan) if r.registration_covariance is None else r.registration_covariance
-                        for r in record.results]  # fmt: skip
+        registration = [
+            np.full((6, 6), np.nan) if r.registration_covariance is None else r.registration_covariance
+            for r in record.results
+        ]
         np.savez_compressed(
             stream,
             stamps_ns=trajectory.stamps_ns,
@@ -204,13 +250,27 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
     rows = [columns + ",degenerate,prior_m,prior_deg,prior_norm,steady_norm,steady_iterations,lost,segment,frame"]
     for r in record.results:
         values = (
-            r.index, r.stamp_ns, r.status, r.poser(record.method), int(r.is_stationary), int(r.converged), r.iterations,
-            r.source_points, r.inliers, f"{r.overlap:.4f}", f"{r.rmse:.5f}", len(r.degenerate), f"{r.prior_error[0]:.5f}",
-            f"{np.rad2deg(r.prior_error[1]):.5f}", f"{r.prior_norm:.5f}",
+            r.index,
+            r.stamp_ns,
+            r.status,
+            r.poser(record.method),
+            int(r.is_stationary),
+            int(r.converged),
+            r.iterations,
+            r.source_points,
+            r.inliers,
+            f"{r.overlap:.4f}",
+            f"{r.rmse:.5f}",
+            len(r.degenerate),
+            f"{r.prior_error[0]:.5f}",
+            f"{np.rad2deg(r.prior_error[1]):.5f}",
+            f"{r.prior_norm:.5f}",
             "" if r.imu.steady_norm is None else f"{r.imu.steady_norm:.5f}",
-            "" if r.imu.steady_iterations is None else r.imu.steady_iterations, int(r.is_lost), r.segment,
+            "" if r.imu.steady_iterations is None else r.imu.steady_iterations,
+            int(r.is_lost),
+            r.segment,
             r.frame,
-        )  # fmt: skip
+        )
         rows.append(",".join(str(v) for v in values))
     folder.write_text("scans.csv", "\n".join(rows) + "\n")
     if any(r.imu.state is not None for r in record.results):
@@ -231,10 +291,19 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
         )
         at = fix.T_map_lidar[:3, 3] + record.map_origin
         values = (
-            result.index, result.stamp_ns, fix.status, int(fix.is_doubted), f"{fix.overlap:.4f}", f"{fix.inlier_share:.4f}",
-            f"{fix.innovation[0]:.5f}", f"{np.rad2deg(fix.innovation[1]):.5f}", f"{sigma_m:.5f}", f"{np.rad2deg(sigma_rad):.5f}",
-            *(f"{v:.4f}" for v in at), fix.reason.replace(",", ";"),
-        )  # fmt: skip
+            result.index,
+            result.stamp_ns,
+            fix.status,
+            int(fix.is_doubted),
+            f"{fix.overlap:.4f}",
+            f"{fix.inlier_share:.4f}",
+            f"{fix.innovation[0]:.5f}",
+            f"{np.rad2deg(fix.innovation[1]):.5f}",
+            f"{sigma_m:.5f}",
+            f"{np.rad2deg(sigma_rad):.5f}",
+            *(f"{v:.4f}" for v in at),
+            fix.reason.replace(",", ";"),
+        )
         rows.append(",".join(str(v) for v in values))
     folder.write_text("localization.csv", "\n".join(rows) + "\n")
     if record.georeference is not None:
@@ -253,9 +322,11 @@ def write_feature_map(folder: RunFolder, features: FeatureCloud) -> None:
     """Write feature_map.ply, world frame of the trajectory; the scalar `class` is 1 on edges and 0 on planes."""
     folder.require_space(BYTES_PER_POINT * len(features), "the feature map")
     write_ply(
-        folder.path / "feature_map.ply", features.points, scalars={"class": features.kinds},
+        folder.path / "feature_map.ply",
+        features.points,
+        scalars={"class": features.kinds},
         comment=f"lslam feature map, class 1 = edge, 0 = plane; {LOCAL}",
-    )  # fmt: skip
+    )
 
 
 def write_evaluation(folder: RunFolder, record: RunRecord, evaluation: Evaluation | None) -> None:

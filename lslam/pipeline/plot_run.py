@@ -24,9 +24,12 @@ from lslam.reports.picture import check_plot_path, house_style, picture
 
 
 def plotted_run(
-    folder: Path, what: str, sequence: Path | None = None,
-    truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None, **reading: Any,
-) -> PlottedRun:  # fmt: skip
+    folder: Path,
+    what: str,
+    sequence: Path | None = None,
+    truth_of: Callable[[Sequence], Trajectory | None] = lambda sequence: None,
+    **reading: Any,
+) -> PlottedRun:
     """Parts of the run that the figure `what` needs.
 
     sequence : where the raw scans have moved; truth_of : gives what replaces the recording's truth, None for nothing

@@ -184,9 +184,15 @@ def _with_clock(run: EarlierRun, opened: Sequence) -> Sequence:
 
 
 def rebuild(
-    run: EarlierRun, sequence: Sequence, out: Path | None = None, *, overwrite: bool = False, crs: OutputCrs | None = None,
-    on_step: Callable[[], None] = lambda: None, should_stop: Callable[[], bool] = lambda: False,
-) -> RebuiltMap:  # fmt: skip
+    run: EarlierRun,
+    sequence: Sequence,
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    crs: OutputCrs | None = None,
+    on_step: Callable[[], None] = lambda: None,
+    should_stop: Callable[[], bool] = lambda: False,
+) -> RebuiltMap:
     """Build the map with the run's configuration and write it to `out`, by default map.<format> in the run folder.
 
     Maps of other names and formats stay. Where it is a map of the run folder, what the run says of its map is renewed: the
@@ -253,10 +259,21 @@ def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> Ru
     about = {"file": name, "points": points, "voxel": section.voxel, "done": list(built.done)}
     manifest = {**run.manifest, "map_points": points, "map": about}
     return RunRecord(
-        name="", method=run.config.odometry.method, folder=run.folder, results=[], trajectory=run.trajectory,
-        ground_truth=None, real_time_limit=0.0, manifest=manifest, map_file=name, map_image=built.view.image,
-        map_heights=built.view.heights, map_extent=built.view.extent, map_sample=built.sample, crispness=score,
-    )  # fmt: skip
+        name="",
+        method=run.config.odometry.method,
+        folder=run.folder,
+        results=[],
+        trajectory=run.trajectory,
+        ground_truth=None,
+        real_time_limit=0.0,
+        manifest=manifest,
+        map_file=name,
+        map_image=built.view.image,
+        map_heights=built.view.heights,
+        map_extent=built.view.extent,
+        map_sample=built.sample,
+        crispness=score,
+    )
 
 
 @contextmanager

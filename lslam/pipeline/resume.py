@@ -243,9 +243,12 @@ def open_again(run: EarlierRun, sequence: Path | None = None, **reading: Any) ->
     """
     config = run.config
     return open_sequence(
-        recording_of(run, sequence), vertical_correction_deg=config.input.vertical_correction_deg, imu=config.imu.use,
-        gnss=config.gnss.mode != "off", **reading_of(run, sequence, **reading),
-    )  # fmt: skip
+        recording_of(run, sequence),
+        vertical_correction_deg=config.input.vertical_correction_deg,
+        imu=config.imu.use,
+        gnss=config.gnss.mode != "off",
+        **reading_of(run, sequence, **reading),
+    )
 
 
 def reading_of(run: EarlierRun, sequence: Path | None = None, **reading: Any) -> dict[str, Any]:

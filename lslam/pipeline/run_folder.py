@@ -35,12 +35,39 @@ SPOOL = ".lslam-map-"  # what a map in the making is called, as its merger does
 # What a run that goes on needs of what the one before left.
 _NEEDED = (MANIFEST, "config.toml", LOG)
 OURS = (
-    MANIFEST, "config.toml", LOG, "trajectory.tum", "trajectory_kitti.txt", "covariances.npz", "map.ply",
-    "map.pcd", "map.las", "map.laz", "map.json", "map_mesh.ply", "feature_map.ply", "trajectory.geojson",
-    "occupancy.npz", "occupancy.ply", "floor_plan.png", "floor_plan.yaml", "evaluation.json",
-    "trajectory_odometry.tum", "loops.csv", "control.csv", "graph.g2o", "osm_matches.csv", "buildings.geojson", "buildings.osm",
-    "timing.csv", "scans.csv", "imu_states.csv", "localization.csv", "sessions.csv", "report.html",
-)  # fmt: skip
+    MANIFEST,
+    "config.toml",
+    LOG,
+    "trajectory.tum",
+    "trajectory_kitti.txt",
+    "covariances.npz",
+    "map.ply",
+    "map.pcd",
+    "map.las",
+    "map.laz",
+    "map.json",
+    "map_mesh.ply",
+    "feature_map.ply",
+    "trajectory.geojson",
+    "occupancy.npz",
+    "occupancy.ply",
+    "floor_plan.png",
+    "floor_plan.yaml",
+    "evaluation.json",
+    "trajectory_odometry.tum",
+    "loops.csv",
+    "control.csv",
+    "graph.g2o",
+    "osm_matches.csv",
+    "buildings.geojson",
+    "buildings.osm",
+    "timing.csv",
+    "scans.csv",
+    "imu_states.csv",
+    "localization.csv",
+    "sessions.csv",
+    "report.html",
+)
 UPLOADED_FROM = "spool"
 
 

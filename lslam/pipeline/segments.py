@@ -135,9 +135,12 @@ def _is_found_from_before(
     own = last.keyframes[0]
     place = before.T_town_session @ own.T_world_lidar
     back, _ = tie(
-        replace(before, store=last, keyframes=last.keyframes), [session], config, should_stop,
+        replace(before, store=last, keyframes=last.keyframes),
+        [session],
+        config,
+        should_stop,
         Vicinity(place[:3, 3], reach),
-    )  # fmt: skip
+    )
     if back is None or back.start is None or not back.start.has_majority:
         return False
     return not is_elsewhere(place, back.T_town_session @ own.T_world_lidar)

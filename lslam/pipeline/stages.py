@@ -94,9 +94,14 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
     watch.on_start("map", len(record.results))
     with manifest.timed("map_s"), stoppable(job, "interrupted while the map was written"):
         built = build_map(
-            job.sequence, record.results, config, watch.on_step, watch.should_stop, folder.path,
+            job.sequence,
+            record.results,
+            config,
+            watch.on_step,
+            watch.should_stop,
+            folder.path,
             map_checkpoints(folder, config),
-        )  # fmt: skip
+        )
         score = crispness(built.merged)
         outputs.write_map(folder, built, config.map, record)
         record.map_file, record.map_sample = f"map.{config.map.format}", built.sample
@@ -114,9 +119,14 @@ def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> 
     watch.on_start("feature map", len(record.results))
     with manifest.timed("feature_map_s"), stoppable(job, "interrupted while the feature map was written"):
         built = build_feature_map(
-            job.sequence, odometry, record.results, config, watch.on_step, watch.should_stop,
+            job.sequence,
+            odometry,
+            record.results,
+            config,
+            watch.on_step,
+            watch.should_stop,
             map_checkpoints(folder, config, "feature map"),
-        )  # fmt: skip
+        )
         outputs.write_feature_map(folder, built)
         log.info("feature map: %d points in %s", len(built), folder.path / "feature_map.ply")
 

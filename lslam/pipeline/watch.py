@@ -57,9 +57,16 @@ class RunOutcome:
     def _plotted(self, cloud: ArrayCloud | None = None) -> PlottedRun:
         record = self.record
         return PlottedRun(
-            record.name, record.trajectory, None if record.odometry is record.trajectory else record.odometry,
-            self.evaluation, cloud, record.imu, record.features, record.buildings, record.georeference,
-        )  # fmt: skip
+            record.name,
+            record.trajectory,
+            None if record.odometry is record.trajectory else record.odometry,
+            self.evaluation,
+            cloud,
+            record.imu,
+            record.features,
+            record.buildings,
+            record.georeference,
+        )
 
     def _repr_html_(self) -> str:
         """Summary and trajectory, for notebooks."""

@@ -86,9 +86,13 @@ class Acceptance:
 def failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
     """The motion prior with its covariance."""
     return RegistrationResult(
-        T_prior.copy(), ok=False, reason=reason, covariance=PRIOR_COVARIANCE.copy(), converged=False,
+        T_prior.copy(),
+        ok=False,
+        reason=reason,
+        covariance=PRIOR_COVARIANCE.copy(),
+        converged=False,
         source_points=source_points,
-    )  # fmt: skip
+    )
 
 
 def correction(T_prior: Floats, pose: Floats) -> tuple[float, float]:

@@ -29,9 +29,15 @@ class MapAlignment:
         self._matches, self._changes = Correspondences(0), 0
 
     def refine(
-        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
-        allowed: Floats = EVERYWHERE, information: Floats | None = None,
-    ) -> RegistrationResult:  # fmt: skip
+        self,
+        points: PreparedPoints,
+        start: Floats,
+        width: float,
+        steps: int,
+        coarser: Sequence[GaussianMap] = (),
+        allowed: Floats = EVERYWHERE,
+        information: Floats | None = None,
+    ) -> RegistrationResult:
         """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
 
         coarser : maps for the points that find nothing in the fine one, finest first; none: all that there are
@@ -41,9 +47,15 @@ class MapAlignment:
         return optimise(*self.problem(points, start, width, steps, coarser, allowed, information))
 
     def problem(
-        self, points: PreparedPoints, start: Floats, width: float, steps: int, coarser: Sequence[GaussianMap] = (),
-        allowed: Floats = EVERYWHERE, information: Floats | None = None,
-    ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:  # fmt: skip
+        self,
+        points: PreparedPoints,
+        start: Floats,
+        width: float,
+        steps: int,
+        coarser: Sequence[GaussianMap] = (),
+        allowed: Floats = EVERYWHERE,
+        information: Floats | None = None,
+    ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:
         """The arguments of `optimise` by which `refine` aligns."""
         c, coarser = self.config, coarser or self.map.coarser
         coarser = coarser if self.kind.is_wide else coarser[:1]

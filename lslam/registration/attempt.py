@@ -100,9 +100,13 @@ class Attempt:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
         c, history = self.config, self.history
         limits = Acceptance(
-            c.min_overlap, history.matches.least, max_jump_m=c.max_jump_m, max_jump_deg=c.max_jump_deg,
-            usual=history.agreement, source=self.target.source,
-        )  # fmt: skip
+            c.min_overlap,
+            history.matches.least,
+            max_jump_m=c.max_jump_m,
+            max_jump_deg=c.max_jump_deg,
+            usual=history.agreement,
+            source=self.target.source,
+        )
         return limits.judge(result, self.T_prior if T_prior is None else T_prior)
 
     def credit(self, result: RegistrationResult, pose_source: str) -> RegistrationResult:

@@ -26,9 +26,16 @@ class GaussianMap(Stateful):
     """
 
     def __init__(
-        self, size: float, *, min_points: int = 6, planarity: float = 0.3, count_cap: float = 200.0,
-        reach: float = 150.0, capacity: int = 1 << 16, breadth: float = 0.0,
-    ) -> None:  # fmt: skip
+        self,
+        size: float,
+        *,
+        min_points: int = 6,
+        planarity: float = 0.3,
+        count_cap: float = 200.0,
+        reach: float = 150.0,
+        capacity: int = 1 << 16,
+        breadth: float = 0.0,
+    ) -> None:
         self.size, self.min_points, self.planarity = size, min_points, planarity
         self.count_cap, self.reach = count_cap, reach
         self.breadth = breadth
@@ -54,9 +61,24 @@ class GaussianMap(Stateful):
             self._grow()
         R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
         return gaussians.insert(
-            points, R, t, self.size, self.count_cap, float(self.min_points), self.planarity, FLOOR_M2,
-            self.breadth, self.reach, self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free,
-        )  # fmt: skip
+            points,
+            R,
+            t,
+            self.size,
+            self.count_cap,
+            float(self.min_points),
+            self.planarity,
+            FLOOR_M2,
+            self.breadth,
+            self.reach,
+            self.moments,
+            self.planes,
+            self.keys,
+            self.refreshed,
+            self.table,
+            self.pool,
+            self.free,
+        )
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""
@@ -73,9 +95,15 @@ class GaussianMap(Stateful):
         if len(self._shapes) < len(self.keys):
             self._shapes = np.zeros((len(self.keys), 14))
         describe(
-            self.moments, self.planes, self.keys, self.refreshed, int(self.pool[gaussians.USED]),
-            FLOOR_M2, max(EXTENT_M2, self.size**2), self._shapes,
-        )  # fmt: skip
+            self.moments,
+            self.planes,
+            self.keys,
+            self.refreshed,
+            int(self.pool[gaussians.USED]),
+            FLOOR_M2,
+            max(EXTENT_M2, self.size**2),
+            self._shapes,
+        )
         return self._shapes
 
     def coarsen(self, factor: int) -> GaussianMap:
@@ -85,14 +113,32 @@ class GaussianMap(Stateful):
         """
         capacity = 1 << max(8, int(np.ceil(np.log2(len(self) + 1))))
         coarse = GaussianMap(
-            self.size * factor, min_points=self.min_points * factor, planarity=self.planarity, count_cap=self.count_cap,
-            reach=self.reach, capacity=capacity, breadth=self.breadth,
-        )  # fmt: skip
+            self.size * factor,
+            min_points=self.min_points * factor,
+            planarity=self.planarity,
+            count_cap=self.count_cap,
+            reach=self.reach,
+            capacity=capacity,
+            breadth=self.breadth,
+        )
         gaussians.coarsen(
-            factor, coarse.size, float(coarse.min_points), self.planarity, FLOOR_M2, self.breadth, self.moments, self.keys,
-            int(self.pool[gaussians.USED]), coarse.moments, coarse.planes, coarse.keys, coarse.refreshed,
-            coarse.table, coarse.pool, coarse.free,
-        )  # fmt: skip
+            factor,
+            coarse.size,
+            float(coarse.min_points),
+            self.planarity,
+            FLOOR_M2,
+            self.breadth,
+            self.moments,
+            self.keys,
+            int(self.pool[gaussians.USED]),
+            coarse.moments,
+            coarse.planes,
+            coarse.keys,
+            coarse.refreshed,
+            coarse.table,
+            coarse.pool,
+            coarse.free,
+        )
         return coarse
 
     def state(self) -> State:
@@ -100,10 +146,14 @@ class GaussianMap(Stateful):
         used, freed = int(self.pool[gaussians.USED]), int(self.pool[gaussians.FREED])
         return {
             "capacity": len(self.keys),
-            "moments": self.moments[:used], "planes": self.planes[:used], "keys": self.keys[:used],
-            "refreshed": self.refreshed[:used], "free": self.free[:freed], "pool": self.pool,
+            "moments": self.moments[:used],
+            "planes": self.planes[:used],
+            "keys": self.keys[:used],
+            "refreshed": self.refreshed[:used],
+            "free": self.free[:freed],
+            "pool": self.pool,
             "shapes": self._shapes[:used] if len(self._shapes) else None,
-        }  # fmt: skip
+        }
 
     def restore(self, state: State) -> None:
         """Go on with the voxels of `state`; raises InputError when they do not fit together."""

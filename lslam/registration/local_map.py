@@ -42,9 +42,16 @@ class LocalMap(Stateful):
     """
 
     def __init__(
-        self, size: float, *, coarse_factor: int, min_points: int, planarity: float, count_cap: float, reach: float,
+        self,
+        size: float,
+        *,
+        coarse_factor: int,
+        min_points: int,
+        planarity: float,
+        count_cap: float,
+        reach: float,
         breadth: float | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         breadth = LEAST_BREADTH if breadth is None else breadth
         self.levels = tuple(
             GaussianMap(

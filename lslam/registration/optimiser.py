@@ -87,9 +87,14 @@ class Limits:
 
 
 def optimise(
-    terms: Sequence[Term], T_start: Floats, annealing: Annealing, limits: Limits, matches: Correspondences,
-    inlier_distance: float = np.inf, inlier_ratio: float = 1.0,
-) -> RegistrationResult:  # fmt: skip
+    terms: Sequence[Term],
+    T_start: Floats,
+    annealing: Annealing,
+    limits: Limits,
+    matches: Correspondences,
+    inlier_distance: float = np.inf,
+    inlier_ratio: float = 1.0,
+) -> RegistrationResult:
     """Step from `T_start` (4, 4) until, at the kernel's end width, a step is below `STEP_M` and `STEP_RAD`.
 
     Every step linearises all terms anew, in their order: on several maps the finest first. Correspondences beyond
@@ -126,9 +131,16 @@ def optimise(
     if len(limits.allowed):
         weak = weak[np.linalg.norm(weak @ limits.allowed, axis=1) > 0.5]
     return RegistrationResult.of(
-        se3.make(*pose), H, facts, T_start, step=d, weak=weak, source_points=len(matches), iterations=iterations,
+        se3.make(*pose),
+        H,
+        facts,
+        T_start,
+        step=d,
+        weak=weak,
+        source_points=len(matches),
+        iterations=iterations,
         converged=converged,
-    )  # fmt: skip
+    )
 
 
 def warm_up() -> None:

@@ -45,9 +45,13 @@ class Registration(Stateful):
     STATE = ("target", "history", "rest_detector", "_last", "_index")
 
     def __init__(
-        self, config: RegistrationConfig | None = None, preprocess: PreprocessConfig | None = None,
-        recovery: RecoveryConfig | None = None, target: Target | None = None, policies: Sequence[Policy] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        config: RegistrationConfig | None = None,
+        preprocess: PreprocessConfig | None = None,
+        recovery: RecoveryConfig | None = None,
+        target: Target | None = None,
+        policies: Sequence[Policy] | None = None,
+    ) -> None:
         self.config, self.preprocess = config or RegistrationConfig(), preprocess or PreprocessConfig()
         self.target: Any = VoxelTarget(self.config, self.preprocess) if target is None else target
         self.policies = policies_of(recovery or RecoveryConfig()) if policies is None else tuple(policies)
@@ -82,9 +86,13 @@ class Registration(Stateful):
         return result
 
     def locate(
-        self, points: Any, T_prior: Floats, is_near: bool = False, information: Floats | None = None,
+        self,
+        points: Any,
+        T_prior: Floats,
+        is_near: bool = False,
+        information: Floats | None = None,
         clock: StageClock | None = None,
-    ) -> RegistrationResult:  # fmt: skip
+    ) -> RegistrationResult:
         """Register prepared points without updating the map; the result says whether it is accepted.
 
         is_near : local registration: narrow kernel, no recovery

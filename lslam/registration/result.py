@@ -65,9 +65,18 @@ class RegistrationResult:
 
     @classmethod
     def of(
-        cls, pose: Floats, H: Floats, facts: Floats, T_start: Floats, *, step: Floats, weak: Floats, source_points: int,
-        iterations: int, converged: bool,
-    ) -> RegistrationResult:  # fmt: skip
+        cls,
+        pose: Floats,
+        H: Floats,
+        facts: Floats,
+        T_start: Floats,
+        *,
+        step: Floats,
+        weak: Floats,
+        source_points: int,
+        iterations: int,
+        converged: bool,
+    ) -> RegistrationResult:
         """Where iterations from `T_start` (4, 4) ended, or the start where that is not finite.
 
         H, facts, step : (6, 6) and sums of the last linearisation, and (6,) its step; weak : (K, 6) unobserved directions
@@ -78,11 +87,19 @@ class RegistrationResult:
         lever = math.sqrt(max(f[at.LEVER] / max(f[at.INFORMATION], 1e-300), 1e-6))
         has_covariance = is_finite and int(f[at.MATCHED]) >= LEAST_MATCHED
         return cls(
-            pose if is_finite else T_start, ok=is_finite, reason="" if is_finite else "the solution is not finite",
-            covariance=_covariance(H, weak, f[at.INFORMATION], lever) if has_covariance else None, converged=converged,
-            iterations=iterations, source_points=source_points, matched=int(f[at.MATCHED]), inliers=int(f[at.INLIERS]),
-            rmse=math.sqrt(f[at.SQUARED] / max(f[at.ROBUST], 1e-12)), degenerate=weak, lever_arm=lever,
-        )  # fmt: skip
+            pose if is_finite else T_start,
+            ok=is_finite,
+            reason="" if is_finite else "the solution is not finite",
+            covariance=_covariance(H, weak, f[at.INFORMATION], lever) if has_covariance else None,
+            converged=converged,
+            iterations=iterations,
+            source_points=source_points,
+            matched=int(f[at.MATCHED]),
+            inliers=int(f[at.INLIERS]),
+            rmse=math.sqrt(f[at.SQUARED] / max(f[at.ROBUST], 1e-12)),
+            degenerate=weak,
+            lever_arm=lever,
+        )
 
     @property
     def is_accepted(self) -> bool:

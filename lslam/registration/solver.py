@@ -19,9 +19,15 @@ from lslam.registration.robust import Annealing
 
 
 def solve(
-    levels: Sequence[GaussianMap], points: PreparedPoints, T_prior: Floats, annealing: Annealing, c: RegistrationConfig, *,
-    residual: ResidualKind = PLANE, allowed: Floats = EVERYWHERE,
-) -> RegistrationResult:  # fmt: skip
+    levels: Sequence[GaussianMap],
+    points: PreparedPoints,
+    T_prior: Floats,
+    annealing: Annealing,
+    c: RegistrationConfig,
+    *,
+    residual: ResidualKind = PLANE,
+    allowed: Floats = EVERYWHERE,
+) -> RegistrationResult:
     """Align the source points with maps by annealed Gauss-Newton, starting at `T_prior` (4, 4), as `c` weighs them.
 
     Points without a plane or a blob in one of the maps, the finest first, are matched in the next. `allowed` as in `Limits`.
@@ -39,9 +45,13 @@ def prior_term(T_prior: Floats, information: Floats) -> Term:
 
 
 def voxel_terms(
-    kind: ResidualKind, points: tuple[Any, ...], levels: Sequence[GaussianMap], matches: Correspondences, sigma: float,
+    kind: ResidualKind,
+    points: tuple[Any, ...],
+    levels: Sequence[GaussianMap],
+    matches: Correspondences,
+    sigma: float,
     blob_weight: float,
-) -> list[Term]:  # fmt: skip
+) -> list[Term]:
     """The residual of the points on each of the maps, the finest first, which share their matches.
 
     points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
@@ -51,13 +61,21 @@ def voxel_terms(
     last, linearise, usual = len(levels) - 1, kind.linearise, levels[:2][-1].size
     return [
         Term(
-            linearise, points, kind.voxels(level),
-            (level.size, float(sigma) ** 2, part_of_usual(level.size, usual), float(blob_weight) if k < 2 else 0.0, kind.along,
-             0 < k == last),
+            linearise,
+            points,
+            kind.voxels(level),
+            (
+                level.size,
+                float(sigma) ** 2,
+                part_of_usual(level.size, usual),
+                float(blob_weight) if k < 2 else 0.0,
+                kind.along,
+                0 < k == last,
+            ),
             matches.search(level),
         )
         for k, level in enumerate(levels)
-    ]  # fmt: skip
+    ]
 
 
 def part_of_usual(size: float, usual: float) -> float:

@@ -30,9 +30,7 @@ def source_covariance(
     return (_of_neighbours if neighbourhood == "knn" else _of_voxels)(source, map_points, thin)
 
 
-def _of_neighbours(
-    source: Floats, map_points: NDArray[np.float32], thin: float
-) -> Floats:  # fmt: skip
+def _of_neighbours(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
     """As generalized ICP has it: the normal of the nearest points, whether these are of several rings or of one."""
     from scipy.spatial import cKDTree
 
@@ -44,9 +42,7 @@ def _of_neighbours(
     return np.ascontiguousarray(discs[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
 
 
-def _of_voxels(
-    source: Floats, map_points: NDArray[np.float32], thin: float
-) -> Floats:  # fmt: skip
+def _of_voxels(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
     """The normal is that of the scan's own points in the cell around. A ring by itself has none: a disc across it would be
     a guess that holds the sensor to where the ring was. Such points get no normal but their noise, `thin` in all
     directions, and the map's normal alone decides.

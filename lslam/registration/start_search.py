@@ -184,9 +184,7 @@ def _best_start(
     return best
 
 
-def _likeliest(
-    non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats
-) -> Floats:  # fmt: skip
+def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats) -> Floats:
     """(4, 4) pose up to `reach`, m, from the prior, or turned about `up`, at which most points have one near by."""
     moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR_M, up)]
     turns = np.deg2rad(START_TURNS_DEG)

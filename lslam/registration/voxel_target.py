@@ -38,15 +38,20 @@ class VoxelTarget(MapAlignment, Target):
     STATE = ("map", "scans", "_ring_gap")
 
     def __init__(
-        self, config: RegistrationConfig, preprocess: PreprocessConfig,
+        self,
+        config: RegistrationConfig,
+        preprocess: PreprocessConfig,
         make_scans: Callable[[RegistrationConfig], MapScans] = make_map_scans,
-    ) -> None:  # fmt: skip
+    ) -> None:
         residual = residual_named(config.residual or "plane")
         local_map = LocalMap(
-            config.voxel_size * residual.voxel_share, coarse_factor=config.coarse_factor,
-            min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
+            config.voxel_size * residual.voxel_share,
+            coarse_factor=config.coarse_factor,
+            min_points=config.min_points,
+            planarity=config.planarity,
+            count_cap=config.count_cap,
             reach=1.2 * preprocess.range_max,
-        )  # fmt: skip
+        )
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps
         self.preprocess, self._make_scans = preprocess, make_scans

@@ -54,18 +54,23 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         rows.append(("georeference", f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {said}"))
     control = record.manifest.get("graph", {}).get("control_points")
     if control is not None:
-        rows.append((
-            "control",
-            f"{counted(control['count'], 'point')}, {metres(control['rms_horizontal_m'])} m rms horizontally and "
-            f"{metres(control['rms_vertical_m'])} m vertically, the worst {control['worst_sigmas']:.1f} sigmas off",
-        ))  # fmt: skip
+        rows.append(
+            (
+                "control",
+                f"{counted(control['count'], 'point')}, {metres(control['rms_horizontal_m'])} m rms horizontally and "
+                f"{metres(control['rms_vertical_m'])} m vertically, the worst {control['worst_sigmas']:.1f} sigmas off",
+            )
+        )
     if record.osm is not None:
         (east, north), sigma = -record.osm.shift, float(record.osm.shift_sigma.max())
-        rows.append((
-            "OpenStreetMap",
-            f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by {len(record.osm.buildings)} buildings, "
-            f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
-        ))  # fmt: skip
+        rows.append(
+            (
+                "OpenStreetMap",
+                f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by "
+                f"{len(record.osm.buildings)} buildings, "
+                f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
+            )
+        )
     rows += [_drift_row(table) for table in drift_tables(record)]
     if record.buildings is not None:
         found = record.buildings

@@ -70,10 +70,15 @@ def drift_tables(record: RunRecord) -> list[Table]:
     if claim is None:
         return []
     words = (
-        ("east_percent", "to the east, %"), ("north_percent", "to the north, %"), ("x_percent", "along x, %"),
-        ("y_percent", "along y, %"), ("z_percent", "along z, %"), ("about_x_deg_per_100m", "turn about x, deg/100 m"),
-        ("about_y_deg_per_100m", "turn about y, deg/100 m"), ("left_deg_per_100m", "turn to the left, deg/100 m"),
-    )  # fmt: skip
+        ("east_percent", "to the east, %"),
+        ("north_percent", "to the north, %"),
+        ("x_percent", "along x, %"),
+        ("y_percent", "along y, %"),
+        ("z_percent", "along z, %"),
+        ("about_x_deg_per_100m", "turn about x, deg/100 m"),
+        ("about_y_deg_per_100m", "turn about y, deg/100 m"),
+        ("left_deg_per_100m", "turn to the left, deg/100 m"),
+    )
     told_of = [(word, claim[name]) for name, word in words if name in claim]
     rows: tuple[tuple[str, ...], ...] = tuple(
         (word, f"{one['estimate']:+.3f}", f"{one['sigma']:.3f}") for word, one in told_of
@@ -118,9 +123,15 @@ def _row(correction: BuildingCorrection) -> tuple[str, ...]:
     east, north, yaw = correction.displacement
     name = correction.building.tags.get("name", "")
     return (
-        f"{correction.building.osm_id} {name}".strip(), correction.status, f"{east:+.2f}", f"{north:+.2f}",
-        f"{np.degrees(yaw):+.2f}", f"{correction.confidence:.2f}", str(correction.used), str(correction.rejected),
-    )  # fmt: skip
+        f"{correction.building.osm_id} {name}".strip(),
+        correction.status,
+        f"{east:+.2f}",
+        f"{north:+.2f}",
+        f"{np.degrees(yaw):+.2f}",
+        f"{correction.confidence:.2f}",
+        str(correction.used),
+        str(correction.rejected),
+    )
 
 
 def _plain(reason: str) -> str:

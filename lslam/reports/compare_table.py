@@ -54,8 +54,10 @@ class CompareTable:
 def tables(comparison: Comparison, width: int | None = None) -> list[CompareTable]:
     """Tables of methods, in as many parts (errors, time, health) as `width` requires; of pairs, differences and failures."""
     splits: list[list[tuple[str, ...]]] = [
-        [("error", "time", "health")], [("error",), ("time", "health")], [("error",), ("time",), ("health",)],
-    ]  # fmt: skip
+        [("error", "time", "health")],
+        [("error",), ("time", "health")],
+        [("error",), ("time",), ("health",)],
+    ]
     for split in splits:
         titles = [TITLES[groups[0]] if len(split) > 1 else "" for groups in split]
         out = [_methods_table(comparison, groups, title) for groups, title in zip(split, titles, strict=True)]

@@ -188,18 +188,31 @@ def _points(plot: Any, run: PlottedRun, T: Floats | None = None) -> Any:
     points = points[np.argsort(points[:, 2], kind="stable")]
     low, high = np.percentile(points[:, 2], [2, 98])
     return plot.scatter(
-        points[:, 0], points[:, 1], c=points[:, 2], s=0.15, cmap="cividis", vmin=low, vmax=high, linewidths=0,
+        points[:, 0],
+        points[:, 1],
+        c=points[:, 2],
+        s=0.15,
+        cmap="cividis",
+        vmin=low,
+        vmax=high,
+        linewidths=0,
         rasterized=True,
-    )  # fmt: skip
+    )
 
 
 def _legend(figure: Any, plot: Any, markerscale: float = 1.0) -> None:
     """Draw the legend above all plots, where it hides no line."""
     lines, names = plot.get_legend_handles_labels()
     figure.legend(
-        lines, names, loc="outside upper center", ncol=4, frameon=False, handlelength=1.2, columnspacing=1.0,
+        lines,
+        names,
+        loc="outside upper center",
+        ncol=4,
+        frameon=False,
+        handlelength=1.2,
+        columnspacing=1.0,
         markerscale=markerscale,
-    )  # fmt: skip
+    )
 
 
 def _about(plot: Any, points: Floats) -> None:
@@ -227,6 +240,10 @@ def _from_above(plot: Any, x: str = "x, m", y: str = "y, m") -> None:
 
 # name -> (what draws it, its height as a share of its width)
 FIGURES = {
-    "map": (_map, 0.8), "trajectory": (_trajectory, 1.3), "errors": (_errors, 0.75), "features": (_features, 0.55),
-    "imu": (_imu, 1.1), "buildings": (_buildings, 0.9),
-}  # fmt: skip
+    "map": (_map, 0.8),
+    "trajectory": (_trajectory, 1.3),
+    "errors": (_errors, 0.75),
+    "features": (_features, 0.55),
+    "imu": (_imu, 1.1),
+    "buildings": (_buildings, 0.9),
+}

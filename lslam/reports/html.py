@@ -51,9 +51,11 @@ _COURSES = (
     _Course("Accelerometer bias", "bias, m/s²", 0, 3),
     _Course("Gyroscope bias", "bias, deg/s", 3, 6, 180 / np.pi),
     _Course("Gravity", "gravity, m/s²", 6, 9, recipe="World axes: what moves is a world that registration turned."),
-    _Course("Mounting", "rotation vector, deg", 9, 12, 180 / np.pi, recipe="From the IMU's axes to those that were given."),
+    _Course(
+        "Mounting", "rotation vector, deg", 9, 12, 180 / np.pi, recipe="From the IMU's axes to those that were given."
+    ),
     _Course("Clock offset", "to add to the IMU's stamps, ms", 12, 13, 1e3, ("offset",), ""),
-)  # fmt: skip
+)
 
 
 def imu_figures(record: RunRecord) -> list[Figure]:

@@ -106,9 +106,16 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
         before, after = row["ate"] or (None, None)
         found = f"{row['votes']} of {row['tried']}" if row["tried"] else "gives the world"
         texts.append(
-            (row["name"], str(row["scans"]), str(row["keyframes"]), found, str(row["loops_between"]),
-             "" if before is None else metres(before), "" if after is None else metres(after))
-        )  # fmt: skip
+            (
+                row["name"],
+                str(row["scans"]),
+                str(row["keyframes"]),
+                found,
+                str(row["loops_between"]),
+                "" if before is None else metres(before),
+                "" if after is None else metres(after),
+            )
+        )
     return Table(
         "Sessions",
         header,

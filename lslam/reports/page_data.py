@@ -304,9 +304,14 @@ def map_figure(
             image, heights = halved(image, heights)
             png = coloured_png(image, heights, *span)
     chart = plane_chart(
-        tracks, "merged map from above", backdrop=(data_uri(png), extent), backdrop_style=style, width=WIDTH,
-        tallest=HEIGHT, by=by,
-    )  # fmt: skip
+        tracks,
+        "merged map from above",
+        backdrop=(data_uri(png), extent),
+        backdrop_style=style,
+        width=WIDTH,
+        tallest=HEIGHT,
+        by=by,
+    )
     return MapFigure(Figure("Map", chart, tuple(legend), f"{world} {FROM_ABOVE}"), span, pixel)
 
 
@@ -321,9 +326,11 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
         return []
     crop = Crop(0.0, 0.0, 2 * DRAWN_REACH_M)
     scan = plane_chart(
-        [], f"features of scan {view.scan}", backdrop=_backdrop(view.around, crop),
+        [],
+        f"features of scan {view.scan}",
+        backdrop=_backdrop(view.around, crop),
         dots=[("s2", crop.inside(view.planes)), ("s1", crop.inside(view.edges))],
-    )  # fmt: skip
+    )
     low, high = view.map_planes[:, :2].min(axis=0, initial=np.inf), view.map_planes[:, :2].max(axis=0, initial=-np.inf)
     if not np.isfinite([low, high]).all():
         low, high = np.full(2, -DRAWN_REACH_M), np.full(2, DRAWN_REACH_M)

@@ -97,14 +97,31 @@ def _draw_scale(figure: Any, plan: ScenePlan, below: int, letter: float) -> None
     """Draw the north arrow, a scale bar of two halves with metres above it, and the grid spacing."""
     top = below - 0.5 * letter
     left = 0.9 * letter
-    _shape(figure, "Polygon", [(left, top - letter), (left - 0.5 * letter, top - 2.4 * letter), (left, top - 2 * letter),
-                               (left + 0.5 * letter, top - 2.4 * letter)], facecolor="black")  # fmt: skip
+    _shape(
+        figure,
+        "Polygon",
+        [
+            (left, top - letter),
+            (left - 0.5 * letter, top - 2.4 * letter),
+            (left, top - 2 * letter),
+            (left + 0.5 * letter, top - 2.4 * letter),
+        ],
+        facecolor="black",
+    )
     _text(figure, left, top, "N", ha="center", va="top", weight="bold")
     length = bar_length(float(plan.high[0] - plan.low[0]))
     start, pixels, y = 3 * letter, length / plan.pixel, top - 2.2 * letter
     for half, colour in enumerate(("black", "white")):
-        _shape(figure, "Rectangle", (start + half * pixels / 2, y), pixels / 2, 0.5 * letter, facecolor=colour,
-               edgecolor="black", linewidth=1)  # fmt: skip
+        _shape(
+            figure,
+            "Rectangle",
+            (start + half * pixels / 2, y),
+            pixels / 2,
+            0.5 * letter,
+            facecolor=colour,
+            edgecolor="black",
+            linewidth=1,
+        )
     for share, said in ((0, "0"), (0.5, f"{length / 2:g}"), (1, f"{length} m")):
         _text(figure, start + share * pixels, top, said, ha="center", va="top")
     said = f"a line every {FINE} m, numbers every {COARSE} m;\nx to the east, y to the north"

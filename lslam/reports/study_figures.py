@@ -93,15 +93,21 @@ def _number(value: float) -> str:
 
 # Of section 5.3, by studied parameter and figure.
 THESIS = {
-    "input.skip_frames": {"errors": "5.16 and 5.21", "zoom": "5.17", "times": "5.18 and 5.22", "stages": "5.22",
-                          "law": "5.19 and 5.28", "efficiency": "5.20"},
+    "input.skip_frames": {
+        "errors": "5.16 and 5.21",
+        "zoom": "5.17",
+        "times": "5.18 and 5.22",
+        "stages": "5.22",
+        "law": "5.19 and 5.28",
+        "efficiency": "5.20",
+    },
     "imu.inlier_distance": {"errors": "5.23a", "times": "5.23b"},
     "registration.inlier_ratio": {"errors": "5.24", "times": "5.24"},
     "preprocess.random_share": {"errors": "5.25", "times": "5.26", "law": "5.27a and 5.28", "efficiency": "5.27b"},
     "loam.grid_step": {"errors": "5.29", "times": "5.30b", "stages": "5.30a", "efficiency": "5.31"},
     "loam.feature_map_voxel": {"times": "5.32b", "stages": "5.32a", "efficiency": "5.33"},
     "loam.max_planar_points": {"errors": "5.35", "times": "5.34b", "stages": "5.34a", "efficiency": "5.35"},
-}  # fmt: skip
+}
 _STAGE_PANELS = 6
 SAMPLES = 200  # of a drawn law
 _SEEDS = (
@@ -211,9 +217,13 @@ def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) 
 
 
 def _quantity(
-    plot: Any, result: StudyResult, shown: Sequence[CurveResult], name: str, words: str,
+    plot: Any,
+    result: StudyResult,
+    shown: Sequence[CurveResult],
+    name: str,
+    words: str,
     of_row: Callable[[StudyRow], float],
-) -> None:  # fmt: skip
+) -> None:
     """Means with their intervals; crosses at the top where a curve is lost; reference runs as dotted lines."""
     tops = []
     rows_of_crosses = 0
@@ -273,10 +283,15 @@ def _with_looks(result: StudyResult, shown: Sequence[CurveResult]) -> Iterator[t
         series = list(dict.fromkeys(curve.series for curve in curves))
         shades, dashes = colormaps["viridis"](np.linspace(0.0, 0.88, len(others))), ("-", "--", ":", "-.")
         looks = [
-            {"color": tuple(shades[others.index(curve.at)]), "ls": dashes[series.index(curve.series) % 4], "marker": "o",
-             "ms": 2.5, "lw": 1.1}
+            {
+                "color": tuple(shades[others.index(curve.at)]),
+                "ls": dashes[series.index(curve.series) % 4],
+                "marker": "o",
+                "ms": 2.5,
+                "lw": 1.1,
+            }
             for curve in curves
-        ]  # fmt: skip
+        ]
     by_label = {curve.label: look for curve, look in zip(curves, looks, strict=False)}
     return ((r, by_label[r.curve.label]) for r in shown)
 

@@ -29,9 +29,14 @@ TRANSLATION = {
 }
 # Columns of the table for programs, by quantity.
 _UNITS = {
-    "translation": "m", "angular": "deg", "time_per_scan": "ms", "total_time": "s", "fallback": "%",
-    "efficiency": "1/(m deg s)", "total_efficiency": "1/(m deg s)",
-}  # fmt: skip
+    "translation": "m",
+    "angular": "deg",
+    "time_per_scan": "ms",
+    "total_time": "s",
+    "fallback": "%",
+    "efficiency": "1/(m deg s)",
+    "total_efficiency": "1/(m deg s)",
+}
 
 
 def study_tables(result: StudyResult) -> list[CompareTable]:
@@ -122,9 +127,17 @@ def _law_row(name: str, law: Law) -> tuple[str, ...]:
 def _means(result: StudyResult) -> CompareTable:
     key = result.parameters[0]
     head = (
-        "method", with_unit(key, key.rpartition(".")[2]), "translation, m", "rotation, deg", "registration, ms", "total, s",
-        "recovered, %", "E", "E tot", "lost/runs",
-    )  # fmt: skip
+        "method",
+        with_unit(key, key.rpartition(".")[2]),
+        "translation, m",
+        "rotation, deg",
+        "registration, ms",
+        "total, s",
+        "recovered, %",
+        "E",
+        "E tot",
+        "lost/runs",
+    )
     rows: list[tuple[str, ...]] = []
     best = set()
     for r in result.results:
@@ -145,10 +158,15 @@ def _beside(result: StudyResult) -> CompareTable:
 
 def _failures(result: StudyResult) -> CompareTable:
     rows = tuple(
-        (row.series, ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row.parameters.items()) or "beside",
-         str(row.seed), row.status, row.reason)
+        (
+            row.series,
+            ", ".join(f"{key.rpartition('.')[2]} {value}" for key, value in row.parameters.items()) or "beside",
+            str(row.seed),
+            row.status,
+            row.reason,
+        )
         for row in result.failed
-    )  # fmt: skip
+    )
     title = f"{counted(len(rows), 'run')} without a result"
     return CompareTable(title, ("method", "at", "seed", "outcome", "reason"), rows, 5)
 

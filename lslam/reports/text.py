@@ -213,10 +213,11 @@ def aligned(grid: Grid, names: int = 1) -> str:
     """Table of columns of equal width, two spaces between them."""
     widths = [max(len(cell) for cell in column) for column in zip(*grid, strict=True)]
     return "\n".join(
-        "  ".join(f"{c:<{w}}" if k < names else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=True)))
-        .rstrip()
+        "  ".join(
+            f"{c:<{w}}" if k < names else f"{c:>{w}}" for k, (c, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
         for row in grid
-    )  # fmt: skip
+    )
 
 
 def _escape(cell: str) -> str:

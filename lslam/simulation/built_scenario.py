@@ -115,10 +115,17 @@ def populate(scenario: Scenario, city: City, path: PosePath, seeds: tuple[int, .
         rng = np.random.default_rng([*seeds, 2**32 - 5])
         queue = add_queue(city.streets, city.terrain, path.poses(np.zeros(1))[0], traffic.queue_s, rng)
     movers = add_traffic(
-        city.streets, city.terrain, path.poses, path.duration, np.random.default_rng([*seeds, 2**32 - 4]),
-        cars_per_km=traffic.cars, people_per_km=traffic.people, lanes=traffic.lanes,
-        pavement=scenario.layout.road + 0.6 * scenario.layout.pavement, speed=traffic.speed,
-    )  # fmt: skip
+        city.streets,
+        city.terrain,
+        path.poses,
+        path.duration,
+        np.random.default_rng([*seeds, 2**32 - 4]),
+        cars_per_km=traffic.cars,
+        people_per_km=traffic.people,
+        lanes=traffic.lanes,
+        pavement=scenario.layout.road + 0.6 * scenario.layout.pavement,
+        speed=traffic.speed,
+    )
     movers = keep_out_of_walls(movers, city, path.duration) if isinstance(city, OsmCity) else movers
     return [*movers, *queue]
 

@@ -244,9 +244,14 @@ def build_woods(street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.ra
 
 
 def _add_trees(
-    builder: MeshBuilder, street: RouteCurve, terrain: Terrain, layout: Layout, rng: np.random.Generator, way: Floats,
+    builder: MeshBuilder,
+    street: RouteCurve,
+    terrain: Terrain,
+    layout: Layout,
+    rng: np.random.Generator,
+    way: Floats,
     footprints: list[Floats],
-) -> None:  # fmt: skip
+) -> None:
     """Add random trees and bushes, denser near the path, none on it or in a house."""
     from scipy.spatial import cKDTree
 

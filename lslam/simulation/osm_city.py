@@ -321,9 +321,10 @@ def _canopy(builder: MeshBuilder, footprint: Footprint, bottom: float, top: floa
         _level(builder, footprint, z)
     for ring in footprint.rings:
         following = np.roll(ring, -1, axis=0)
-        rim = [np.column_stack([p, np.full(len(p), z)]) for z, p in zip(
-            (top - SLAB, top - SLAB, top, top), (ring, following, following, ring), strict=True
-        )]  # fmt: skip
+        rim = [
+            np.column_stack([p, np.full(len(p), z)])
+            for z, p in zip((top - SLAB, top - SLAB, top, top), (ring, following, following, ring), strict=True)
+        ]
         builder.add_quads(np.stack(rim, axis=1), Surface.ROOF)
     inner = footprint_polygon(footprint).buffer(-0.4, join_style="mitre").simplify(1.0)
     polygons = [p for p in getattr(inner, "geoms", [inner]) if not p.is_empty]

@@ -40,8 +40,14 @@ HEADINGS = 72
 SEEN = 50.0  # m: a place on the line counts when a wall is that near; nothing is known farther from the map
 _ROADS = ("motorway", "trunk", "primary", "secondary", "tertiary")
 DRIVABLE = (
-    *_ROADS, *(f"{kind}_link" for kind in _ROADS), "unclassified", "residential", "living_street", "service", "road",
-)  # fmt: skip
+    *_ROADS,
+    *(f"{kind}_link" for kind in _ROADS),
+    "unclassified",
+    "residential",
+    "living_street",
+    "service",
+    "road",
+)
 WALKABLE = (*DRIVABLE, "pedestrian", "footway", "path", "cycleway", "track")
 HEADROOM = 3.0  # m; below a building that begins higher one passes
 BUILT_UP = 60.0  # m from a building: beyond, a route would leave what the extract shows

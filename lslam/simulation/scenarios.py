@@ -161,9 +161,19 @@ class SimulatedDrive(Scans):
         here = poses if poses.ndim == 2 else poses[len(poses) // 2]
         bodies = moving_meshes(self.movers, here[:3, 3], start, self.lidar.range_max + SPARE_REACH)
         return trace(
-            self.scene, self.lidar, poses, rng, index, int(self.stamps_ns[index]), period,
-            bodies, self.scenario.world.glass, self._roof, self.scenario.real_returns, self.motion_compensated,
-        )  # fmt: skip
+            self.scene,
+            self.lidar,
+            poses,
+            rng,
+            index,
+            int(self.stamps_ns[index]),
+            period,
+            bodies,
+            self.scenario.world.glass,
+            self._roof,
+            self.scenario.real_returns,
+            self.motion_compensated,
+        )
 
 
 def simulate(

@@ -54,9 +54,16 @@ def opened_line(
     """Run of a recording that is open. Raises InputError when its files cannot be listed."""
     imu = imu_digest(sequence) if config.imu.use else ""
     return RunLine(
-        words, file_safe(sequence.name), sequence.path.absolute(), input_digest(sequence, truth), imu, config, truth, folder,
+        words,
+        file_safe(sequence.name),
+        sequence.path.absolute(),
+        input_digest(sequence, truth),
+        imu,
+        config,
+        truth,
+        folder,
         reading,
-    )  # fmt: skip
+    )
 
 
 def listed_line(words: str, path: Path, config: Config, folder: Path | None, reading: dict[str, Any]) -> RunLine:
@@ -135,10 +142,20 @@ def expand_lines(lines: Sequence[RunLine], output: OutputOptions) -> ExpandedStu
             )
         jobs.append(
             Job(
-                label, name, seed, line.path, line.config, folder, digest, line.words, line.truth,
-                output.data_root, reading=line.reading, refusal=line.refusal,
+                label,
+                name,
+                seed,
+                line.path,
+                line.config,
+                folder,
+                digest,
+                line.words,
+                line.truth,
+                output.data_root,
+                reading=line.reading,
+                refusal=line.refusal,
             )
-        )  # fmt: skip
+        )
     _check_readable(jobs)
     return ExpandedStudy("batch", "batch", BATCH, text, jobs, found)
 

@@ -136,9 +136,11 @@ class Cluster:
         left = list(jobs)
         while left := self._attempt(left, progress, on_done):
             log.warning(
-                "the scheduler %s went away after %d of %d runs: it is waited for", self.address, len(jobs) - len(left),
+                "the scheduler %s went away after %d of %d runs: it is waited for",
+                self.address,
+                len(jobs) - len(left),
                 len(jobs),
-            )  # fmt: skip
+            )
             self._reconnect(len(jobs) - len(left), len(jobs))
 
     def _attempt(self, jobs: Sequence[Job], progress: StudyProgress, on_done: Callable[[Job], None]) -> list[Job]:

@@ -100,11 +100,15 @@ def _in_world_of_truth(
         errors = [score.ate["origin"] for score in scores]
     drawn = tuple(
         DrawnRun(
-            run.job.method, error.aligned_positions, score.distance, np.linalg.norm(error.errors, axis=1),
-            error.T_gt_est, _map_file(run),
+            run.job.method,
+            error.aligned_positions,
+            score.distance,
+            np.linalg.norm(error.errors, axis=1),
+            error.T_gt_est,
+            _map_file(run),
         )
         for run, score, error in zip(runs, scores, errors, strict=True)
-    )  # fmt: skip
+    )
     names = {error.alignment for error in errors}
     recipe = "; ".join(f"{name}: {ALIGNMENTS[name]}" for name in sorted(names))
     return Drawing(sequence, seed, scores[-1].gt_positions, drawn, f"moved onto the ground truth, {recipe}")
@@ -206,9 +210,12 @@ def _cells(plan: Plan, progress: StudyProgress) -> list[Cell]:
             continue
         for seed in plan.seeds:
             path = simulate_once(
-                scenes[subject.label], seed, plan.out / SIMULATED,
-                lambda stage, total: progress.on_start(stage, total, "scans", 1), lambda: progress.on_step(""),
-            )  # fmt: skip
+                scenes[subject.label],
+                seed,
+                plan.out / SIMULATED,
+                lambda stage, total: progress.on_start(stage, total, "scans", 1),
+                lambda: progress.on_step(""),
+            )
             cells.append(recorded_cell(subject.label, path, seed, needs_imu=needs_imu, own=subject.range))
     return cells
 

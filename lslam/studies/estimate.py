@@ -184,9 +184,12 @@ def _places(jobs: Sequence[Job], folder: Path, progress: StudyProgress) -> dict[
         part = replace(job.scene, scans=min(whole, start + _SIMULATED))
         began = time.monotonic()
         path = simulate_once(
-            part, job.seed, folder, lambda stage, total: progress.on_start(stage, total, "scans", 1),
+            part,
+            job.seed,
+            folder,
+            lambda stage, total: progress.on_start(stage, total, "scans", 1),
             lambda: progress.on_step(""),
-        )  # fmt: skip
+        )
         assert part.scans is not None
         places[job.sequence] = _PilotRecording(path, part.scans, whole, (time.monotonic() - began) * whole / part.scans)
     return places

@@ -37,9 +37,17 @@ class Compared:
 
 
 def compare(
-    sequences: Iterable[str | Path], methods: Iterable[str], *, seeds: Iterable[int] = (0,), out: str | Path | None = None,
-    jobs: int = 1, imu: Imu | None = None, settings: Iterable[str] = (), overwrite: bool = False, resume: bool = False,
-) -> Compared:  # fmt: skip
+    sequences: Iterable[str | Path],
+    methods: Iterable[str],
+    *,
+    seeds: Iterable[int] = (0,),
+    out: str | Path | None = None,
+    jobs: int = 1,
+    imu: Imu | None = None,
+    settings: Iterable[str] = (),
+    overwrite: bool = False,
+    resume: bool = False,
+) -> Compared:
     """Run methods on the same sequences, and weigh them against each other.
 
     Parameters
@@ -62,6 +70,11 @@ def compare(
     plan = Plan(
         subjects=tuple(find_subjects([str(sequence) for sequence in sequences])),
         variants=tuple(find_variants(list(methods), None, list(settings), imu)),
-        seeds=tuple(seeds), out=folder, jobs=jobs, overwrite=overwrite, resume=resume, command="lslam.compare",
-    )  # fmt: skip
+        seeds=tuple(seeds),
+        out=folder,
+        jobs=jobs,
+        overwrite=overwrite,
+        resume=resume,
+        command="lslam.compare",
+    )
     return Compared(compared.compare(plan), folder)

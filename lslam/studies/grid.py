@@ -111,10 +111,20 @@ def expand(
                 digest = job_digest(config, cell.digest, cell.imu)
                 jobs.append(
                     Job(
-                        cell.sequence, variant.name, seed, cell.path, config, folder, digest, command, cell.truth,
-                        cell.data_root, cell.scene, refusal=cell.refusal,
+                        cell.sequence,
+                        variant.name,
+                        seed,
+                        cell.path,
+                        config,
+                        folder,
+                        digest,
+                        command,
+                        cell.truth,
+                        cell.data_root,
+                        cell.scene,
+                        refusal=cell.refusal,
                     )
-                )  # fmt: skip
+                )
     return jobs
 
 

@@ -68,11 +68,13 @@ def run_jobs(
         jobs = sorted(jobs, key=lambda job: used(_MANY, job.config.input), reverse=True)
     tasks = [
         Task(
-            job.name, partial(work, job, context), said_file(job.folder),
+            job.name,
+            partial(work, job, context),
+            said_file(job.folder),
             str(job.path) if pool.is_persistent else "",
         )
         for job in jobs
-    ]  # fmt: skip
+    ]
 
     def on_end(index: int, cause: str) -> None:
         ensure_state(jobs[index], cause, context)

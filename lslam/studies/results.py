@@ -30,9 +30,11 @@ from lslam.studies.variants import Variant
 log = logging.getLogger("lslam")
 
 COUNTS = {
-    "bridged": "bridged scans of a run", "skipped": "skipped scans of a run", "degenerate": "degenerate scans of a run",
+    "bridged": "bridged scans of a run",
+    "skipped": "skipped scans of a run",
+    "degenerate": "degenerate scans of a run",
     "fallback": "scans of a run that a recovery policy or a fallback posed",
-}  # fmt: skip
+}
 IMU = "imu_used"
 # The metric that is told of a run's odometry too, before the graph moved it.
 ONLY_BEFORE = next(metric for metric in METRICS if metric.key == "thesis1")
@@ -53,9 +55,17 @@ def collect_run(job: Job, is_reused: bool = False) -> RunScore:
     if state is None:
         return RunScore(job.sequence, job.method, job.seed, job.folder, "crashed", "the process left no state behind")
     score = RunScore(
-        job.sequence, job.method, job.seed, job.folder, state.status, state.reason, jobs=state.jobs, load=state.load,
-        is_reused=is_reused, is_timed_alone=state.jobs == 1 and is_comparable(state),
-    )  # fmt: skip
+        job.sequence,
+        job.method,
+        job.seed,
+        job.folder,
+        state.status,
+        state.reason,
+        jobs=state.jobs,
+        load=state.load,
+        is_reused=is_reused,
+        is_timed_alone=state.jobs == 1 and is_comparable(state),
+    )
     if state.status not in FINAL:
         return score  # what lies in the folder may be an earlier run's
     try:
@@ -78,9 +88,13 @@ def _with_values(score: RunScore, state: State) -> RunScore:
         values[IMU] = float(manifest["imu"]["used"])
     note = _add_errors(score.folder / "evaluation.json", manifest, values)
     return replace(
-        score, values=values, stages={name: stage.mean for name, stage in timing.stages.items()}, limit=timing.period,
-        note=note, machine={"lslam": manifest["lslam"], **manifest["machine"]},
-    )  # fmt: skip
+        score,
+        values=values,
+        stages={name: stage.mean for name, stage in timing.stages.items()},
+        limit=timing.period,
+        note=note,
+        machine={"lslam": manifest["lslam"], **manifest["machine"]},
+    )
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -58,9 +58,16 @@ def read_state(path: Path) -> State | None:
     try:
         tree = parse_json(path.read_text(encoding="utf-8"))
         return State(
-            str(tree["digest"]), str(tree["status"]), str(tree["reason"]), int(tree["jobs"]), float(tree["load"]),
-            float(tree["seconds"]), bool(tree["is_alone"]), float(tree["waited"]), str(tree["machine"]),
-        )  # fmt: skip
+            str(tree["digest"]),
+            str(tree["status"]),
+            str(tree["reason"]),
+            int(tree["jobs"]),
+            float(tree["load"]),
+            float(tree["seconds"]),
+            bool(tree["is_alone"]),
+            float(tree["waited"]),
+            str(tree["machine"]),
+        )
     except (OSError, *MISFIT):
         return None
 

@@ -53,9 +53,11 @@ def scene_digest(scene: Scene, seed: int) -> str:
     """
     scenario = scenario_named(scene.scenario, scene.settings)
     said = {
-        "scenario": scenario.model_dump(mode="json"), "scene": {**asdict(scene), "scenario": ""}, "seed": seed,
+        "scenario": scenario.model_dump(mode="json"),
+        "scene": {**asdict(scene), "scenario": ""},
+        "seed": seed,
         "lslam": __version__,
-    }  # fmt: skip
+    }
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
 
@@ -102,9 +104,15 @@ def drive_of(scene: Scene, seed: int) -> SimulatedDrive:
     scenario = scenario_named(scene.scenario, scene.settings)
     lidar = lidar_named(scene.lidar or scenario.lidar)
     return simulate(
-        scenario, seed=seed, count=scene.scans, speed=scene.speed, motion_compensated=scene.compensated, imu=scene.imu,
-        gnss=GnssModel(), lidar=lidar if scene.columns is None else replace(lidar, columns=scene.columns),
-    )  # fmt: skip
+        scenario,
+        seed=seed,
+        count=scene.scans,
+        speed=scene.speed,
+        motion_compensated=scene.compensated,
+        imu=scene.imu,
+        gnss=GnssModel(),
+        lidar=lidar if scene.columns is None else replace(lidar, columns=scene.columns),
+    )
 
 
 log = logging.getLogger("lslam")
@@ -154,8 +162,9 @@ def _find(word: str, data_root: Path | None) -> Subject:
     if is_scenario:
         log.warning(
             "%s is a recording in %s and also a scenario: the recording is taken; rename it for the scenario",
-            word, path,
-        )  # fmt: skip
+            word,
+            path,
+        )
     return Subject(file_safe(open_sequence(path).name), path=path)
 
 

@@ -28,8 +28,12 @@ DRAW_NOTHING = ("kiss-icp", "small-gicp", "open3d-gicp", "loam-odom", "loam", "f
 # One thread: a run then keeps one core busy, as many go at once as there are cores, and times mean the same. Keyframes go
 # with the run that made them, so they are not packed.
 _ALWAYS = (
-    "input.threads=1", "keyframes.deflate=0", "map.write=false", "map.write_features=false", "report.html=false",
-)  # fmt: skip
+    "input.threads=1",
+    "keyframes.deflate=0",
+    "map.write=false",
+    "map.write_features=false",
+    "report.html=false",
+)
 
 
 @dataclass(frozen=True)

@@ -158,9 +158,16 @@ def execute(job: Job, context: WorkerContext) -> None:
         if context.is_persistent and status != "interrupted":  # one of hundreds: nothing asks for its clouds again
             shutil.rmtree(job.folder / KEYFRAMES, ignore_errors=True)
         state = State(
-            job.digest, status, reason, context.at_once, context.load, round(seconds, 3), context.is_alone,
-            round((_waited_s() - waited) / max(seconds, 1e-9), 4), platform.node(),
-        )  # fmt: skip
+            job.digest,
+            status,
+            reason,
+            context.at_once,
+            context.load,
+            round(seconds, 3),
+            context.is_alone,
+            round((_waited_s() - waited) / max(seconds, 1e-9), 4),
+            platform.node(),
+        )
         write_state(job.state_file, state)
 
 
@@ -205,9 +212,13 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     ended: list[RunOutcome] = []
     config = job.config
     key = (
-        job.path, job.data_root, config.input.vertical_correction_deg, config.imu.use, config.gnss.mode != "off",
+        job.path,
+        job.data_root,
+        config.input.vertical_correction_deg,
+        config.imu.use,
+        config.gnss.mode != "off",
         tuple(sorted(job.reading.items())),
-    )  # fmt: skip
+    )
     sequence = _sequences().get(key, _opening(job)) if is_persistent else _opening(job)()
     stop = current()
 
@@ -222,10 +233,16 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
         # A gate of the run's own (input.strict): it is done all the same.
         with contextlib.suppress(GateError):
             run(
-                sequence, job.config, out=job.folder, ground_truth=job.truth, overwrite=True, resume=goes_on,
-                command=job.command, watch=watch,
+                sequence,
+                job.config,
+                out=job.folder,
+                ground_truth=job.truth,
+                overwrite=True,
+                resume=goes_on,
+                command=job.command,
+                watch=watch,
                 reading={name: str(value) for name, value in job.reading.items() if value is not None},
-            )  # fmt: skip
+            )
 
     # What lies there may be another run, or a finished one that left no state: it is replaced.
     with contextlib.suppress(OutputExistsError, RunFinishedError):
@@ -246,9 +263,13 @@ def _opening(job: Job) -> Callable[[], Sequence]:
             simulate_once(job.scene, job.seed, job.path.parents[2])
         config = job.config
         return open_sequence(
-            job.path, data_root=job.data_root, vertical_correction_deg=config.input.vertical_correction_deg,
-            imu=config.imu.use, gnss=config.gnss.mode != "off", **job.reading,
-        )  # fmt: skip
+            job.path,
+            data_root=job.data_root,
+            vertical_correction_deg=config.input.vertical_correction_deg,
+            imu=config.imu.use,
+            gnss=config.gnss.mode != "off",
+            **job.reading,
+        )
 
     return opening
 

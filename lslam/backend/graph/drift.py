@@ -210,9 +210,13 @@ def linear_basis(distances: Floats, apart: float = MEMORY_M) -> Floats:
 
 
 def rate_roots(
-    length: float, config: GraphConfig, axes: list[int], lasting: tuple[float, ...] = LASTING, apart: float = MEMORY_M,
+    length: float,
+    config: GraphConfig,
+    axes: list[int],
+    lasting: tuple[float, ...] = LASTING,
+    apart: float = MEMORY_M,
     is_smooth: bool = True,
-) -> list[Floats]:  # fmt: skip
+) -> list[Floats]:
     """(n d, n d) each, square roots of the prior covariance of the rates at the knots over `length` m, per constant share.
 
     axes : the d among x, y, z and the rotations about them

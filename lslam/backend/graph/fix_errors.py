@@ -68,10 +68,12 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
     offsets = np.arange(-LARGEST_S, LARGEST_S + 0.5 * STEP_S, STEP_S)
     sizes = np.stack([np.linalg.norm(off(float(offset)), axis=1) for offset in offsets])
     inside = np.isfinite(sizes)
-    costs = np.array([
-        np.median(row[ok]) if ok.sum() >= max(FEWEST, 0.6 * len(first)) else np.inf
-        for row, ok in zip(sizes, inside, strict=True)
-    ])  # fmt: skip
+    costs = np.array(
+        [
+            np.median(row[ok]) if ok.sum() >= max(FEWEST, 0.6 * len(first)) else np.inf
+            for row, ok in zip(sizes, inside, strict=True)
+        ]
+    )
     best = int(np.argmin(costs))
     both = inside[best] & np.isfinite(unmoved := np.linalg.norm(off(0.0), axis=1))
     if not np.isfinite(costs[best]) or not both.any():

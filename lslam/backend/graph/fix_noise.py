@@ -64,9 +64,14 @@ class DriftOfFixes:
 
 
 def fit_gauss_markov(
-    seconds: Floats, residuals: Floats, sigmas: Floats, antenna: Floats, probability: float, drift: DriftOfFixes,
+    seconds: Floats,
+    residuals: Floats,
+    sigmas: Floats,
+    antenna: Floats,
+    probability: float,
+    drift: DriftOfFixes,
     largest: float | None = None,
-) -> tuple[GaussMarkovNoise | None, float]:  # fmt: skip
+) -> tuple[GaussMarkovNoise | None, float]:
     """Correlated noise of the fixes, and the factor on odometry's drift beside it.
 
     None where fixes scatter by their stated sigmas, so that their errors may be independent.
@@ -114,9 +119,15 @@ def _near_neighbours(scaled: Floats, probability: float) -> Bools:
 
 
 def _likeliest(
-    seconds: Floats, scaled: Floats, sigmas: Floats, antenna: Floats, white: float, slow: Floats, drift: DriftOfFixes,
+    seconds: Floats,
+    scaled: Floats,
+    sigmas: Floats,
+    antenna: Floats,
+    white: float,
+    slow: Floats,
+    drift: DriftOfFixes,
     least_gain: float,
-) -> tuple[float, float, float]:  # fmt: skip
+) -> tuple[float, float, float]:
     """Time constant, s, and variance of what residuals `scaled` (F, 3) have beside their `white` part, and drift factor.
 
     slow : (V,) variances that are tried; a single one is known
@@ -150,10 +161,12 @@ def _likeliest(
     # Six rates: the rank of their covariance.
     values, axes = np.linalg.eigh(rate)
     root = axes[:, -6:] * np.sqrt(np.maximum(values[-6:], 0.0))
-    tried = np.array([
-        [_log_likelihoods(known + variance * exponential, walk, root, sides) for variance in slow]
-        for exponential in (np.kron(np.exp(-apart / memory), np.eye(3)) for memory in memories)
-    ])  # fmt: skip
+    tried = np.array(
+        [
+            [_log_likelihoods(known + variance * exponential, walk, root, sides) for variance in slow]
+            for exponential in (np.kron(np.exp(-apart / memory), np.eye(3)) for memory in memories)
+        ]
+    )
     memories, likelihoods = _interpolated(memories, tried, 0)
     slow, likelihoods = _interpolated(slow, likelihoods, 1)
     # Both drifts are as probable, and so are all time constants.

@@ -118,9 +118,13 @@ class InertialSmoother(Stateful):
         J = _into_house(T)
         covariance = J @ joint @ J.T
         return InertialState(
-            T, solver.calculateEstimatePoint3(speed), biases.accelerometer(), biases.gyroscope(),
-            solver.calculateEstimatePoint3(GRAVITY_KEY), 0.5 * (covariance + covariance.T),
-        )  # fmt: skip
+            T,
+            solver.calculateEstimatePoint3(speed),
+            biases.accelerometer(),
+            biases.gyroscope(),
+            solver.calculateEstimatePoint3(GRAVITY_KEY),
+            0.5 * (covariance + covariance.T),
+        )
 
     def _walked(self, state: InertialState) -> InertialState:
         """The state as a prior of the next graph: gravity has turned with the world of the map while this one held it."""
@@ -163,10 +167,14 @@ def _prior(state: InertialState) -> Any:
         if jacobians is not None:
             for i, part in enumerate((POSE, SPEED, BIASES, DOWN)):
                 jacobians[i] = np.eye(18)[:, part]
-        return np.concatenate([
-            origin.localCoordinates(values.atPose3(0)), values.atPoint3(1) - state.velocity,
-            bias.localCoordinates(values.atConstantBias(2)), values.atPoint3(GRAVITY_KEY) - state.gravity,
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                origin.localCoordinates(values.atPose3(0)),
+                values.atPoint3(1) - state.velocity,
+                bias.localCoordinates(values.atConstantBias(2)),
+                values.atPoint3(GRAVITY_KEY) - state.gravity,
+            ]
+        )
 
     return gtsam.CustomFactor(model, [0, 1, 2, GRAVITY_KEY], error)
 

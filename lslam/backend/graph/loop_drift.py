@@ -88,9 +88,13 @@ class _Fit:
     """
 
     def __init__(
-        self, graph: PoseGraph, loops: Sequence[Constraint], found: Floats, turned: Floats,
+        self,
+        graph: PoseGraph,
+        loops: Sequence[Constraint],
+        found: Floats,
+        turned: Floats,
         config: GraphConfig,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._poses = se3.make(np.eye(3), -graph.poses[:, :3, 3].mean(0)) @ graph.poses
         self._ends, self._way = Ends(loops), (graph.distances, turned)
         ends, P = self._ends, self._poses

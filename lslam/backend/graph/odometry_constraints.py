@@ -97,9 +97,13 @@ def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Flo
 
 
 def corrected(
-    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats, covariances: Floats, drift: float,
+    results: Sequence[ScanResult],
+    keyframes: Sequence[Keyframe],
+    poses: Floats,
+    covariances: Floats,
+    drift: float,
     config: GraphConfig,
-) -> list[ScanResult]:  # fmt: skip
+) -> list[ScanResult]:
     """All scans corrected by the optimised keyframes `poses` (K, 4, 4), with covariances.
 
     Between two keyframes the correction is interpolated on SE(3) over time.
@@ -147,9 +151,15 @@ def positive(covariance: Floats) -> Floats:
 
 
 def _covariance(
-    result: ScanResult, keyframe: ScanResult, final: Floats, moved: Floats, pose: Floats, covariance: Floats,
-    drift: float, config: GraphConfig,
-) -> Floats:  # fmt: skip
+    result: ScanResult,
+    keyframe: ScanResult,
+    final: Floats,
+    moved: Floats,
+    pose: Floats,
+    covariance: Floats,
+    drift: float,
+    config: GraphConfig,
+) -> Floats:
     """(6, 6) of a scan's pose: its keyframe's, odometry's growth between them, and its own registration."""
     step = final[:3, 3] - pose[:3, 3]
     first, last = (keyframe, result) if keyframe.stamp_ns <= result.stamp_ns else (result, keyframe)

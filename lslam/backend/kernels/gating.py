@@ -26,9 +26,16 @@ def largest_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: floa
 
 @kernel
 def gated(
-    b: int, among: NDArray[np.int64], positions: Floats, distances: Floats, covariances: Floats, sums: Floats, squares: Floats,
-    rates: tuple[float, float], bounds: tuple[float, float, float],
-) -> NDArray[np.int64]:  # fmt: skip
+    b: int,
+    among: NDArray[np.int64],
+    positions: Floats,
+    distances: Floats,
+    covariances: Floats,
+    sums: Floats,
+    squares: Floats,
+    rates: tuple[float, float],
+    bounds: tuple[float, float, float],
+) -> NDArray[np.int64]:
     """Indices of the keyframes among `among`, in the same order, that lie within the gate about keyframe `b`.
 
     positions : (K, 3) world, m; distances : (K,) m travelled; covariances : (K, 6, 6) of the poses, or none
@@ -74,11 +81,15 @@ def gated(
                         E[i, j] = S[i, j] - v
                 reach2 += max(
                     largest_eigenvalue(
-                        E[0, 0], 0.5 * (E[0, 1] + E[1, 0]), 0.5 * (E[0, 2] + E[2, 0]), E[1, 1],
-                        0.5 * (E[1, 2] + E[2, 1]), E[2, 2],
+                        E[0, 0],
+                        0.5 * (E[0, 1] + E[1, 0]),
+                        0.5 * (E[0, 2] + E[2, 0]),
+                        E[1, 1],
+                        0.5 * (E[1, 2] + E[2, 1]),
+                        E[2, 2],
                     ),
                     0.0,
-                )  # fmt: skip
+                )
             if away > near + sigmas * math.sqrt(reach2):
                 continue
         kept[count] = k

@@ -26,9 +26,13 @@ def neighbours(count: int, number: int, size: int) -> range:
 
 
 def submap(
-    store: KeyframeStore, poses: Floats, number: int, size: int, voxel: float | None = None,
+    store: KeyframeStore,
+    poses: Floats,
+    number: int,
+    size: int,
+    voxel: float | None = None,
     T_world_frame: Floats | None = None,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame or in `T_world_frame` (4, 4).
 
     poses : (K, 4, 4) T_world_lidar of all keyframes, odometry's or optimised ones

@@ -70,9 +70,13 @@ class PriorMap:
 
 
 def make_prior_map(
-    points: Floats, config: RegistrationConfig, georeference: Georeference | None = None, source: str = "",
-    origin: Floats | None = None, up: Floats = Z,
-) -> PriorMap:  # fmt: skip
+    points: Floats,
+    config: RegistrationConfig,
+    georeference: Georeference | None = None,
+    source: str = "",
+    origin: Floats | None = None,
+    up: Floats = Z,
+) -> PriorMap:
     """Level a cloud (N, 3), m, of the map's coordinates, which may be as large as those of a projection.
 
     origin : (3,) m, what is taken from the coordinates of the file; up : (3,) unit vector in them, about which it is looked for
@@ -85,9 +89,12 @@ def make_prior_map(
     middle = np.round(np.median(points, axis=0))
     local = (points - middle).astype(np.float32)
     planes = GaussianMap(
-        config.voxel_size, min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
+        config.voxel_size,
+        min_points=config.min_points,
+        planarity=config.planarity,
+        count_cap=config.count_cap,
         reach=np.inf,
-    )  # fmt: skip
+    )
     insert_all(planes, local[:: max(len(local) // LOOKED_AT, 1)])
     T = se3.make(level_rotation(find_up([planes], up)).T, middle)
     level = np.empty_like(local)
@@ -130,8 +137,13 @@ class LocalView:
         centre = (np.array(block) + 0.5) * BLOCK_M
         # Nobody knows which beams saw a point of a finished map.
         target = LocalMap(
-            c.voxel_size, coarse_factor=c.coarse_factor, min_points=c.min_points, planarity=c.planarity,
-            count_cap=c.count_cap, reach=np.inf, breadth=0.0,
-        )  # fmt: skip
+            c.voxel_size,
+            coarse_factor=c.coarse_factor,
+            min_points=c.min_points,
+            planarity=c.planarity,
+            count_cap=c.count_cap,
+            reach=np.inf,
+            breadth=0.0,
+        )
         insert_all(target, self._map.around(centre, self._reach + BLOCK_M / 2))
         return MapAlignment(target, c)

@@ -158,9 +158,12 @@ class Vicinity:
 
 
 def tie(
-    session: Session, known: Sequence[Session], config: Config, should_stop: Callable[[], bool] = lambda: False,
+    session: Session,
+    known: Sequence[Session],
+    config: Config,
+    should_stop: Callable[[], bool] = lambda: False,
     vicinity: Vicinity | None = None,
-) -> tuple[Session | None, str]:  # fmt: skip
+) -> tuple[Session | None, str]:
     """The session in the common world of the known ones, or None and why it is not found among them."""
     cloud = np.concatenate([_cloud_of(s) for s in known])
     prior_map = make_prior_map(

@@ -145,10 +145,17 @@ class Detector:
         check = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
         closed = self._constraint(a, b, check)
         return LoopCandidate(
-            a, b, self._away(a, b), float("nan"), Verdict.REJECTED if check.reason else Verdict.ACCEPTED,
-            check.stage if check.reason else LoopStage.MANUAL, check.reason, check.rmse, check.overlap,
+            a,
+            b,
+            self._away(a, b),
+            float("nan"),
+            Verdict.REJECTED if check.reason else Verdict.ACCEPTED,
+            check.stage if check.reason else LoopStage.MANUAL,
+            check.reason,
+            check.rmse,
+            check.overlap,
             None if closed is None else replace(closed, is_held=not check.reason),
-        )  # fmt: skip
+        )
 
     def _due_after(self, b: int, gated: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
         """The next keyframes after `b` that are due if all verdicts are as the last one."""
@@ -278,9 +285,17 @@ class Detector:
             reason = self._beyond(check, expected, uncertainty)
             stage = LoopStage.GATE if reason else stage
         return LoopCandidate(
-            a, b, self._away(a, b), match.distance, Verdict.REJECTED if reason else Verdict.ACCEPTED, stage, reason, check.rmse,
-            check.overlap, self._constraint(a, b, check),
-        )  # fmt: skip
+            a,
+            b,
+            self._away(a, b),
+            match.distance,
+            Verdict.REJECTED if reason else Verdict.ACCEPTED,
+            stage,
+            reason,
+            check.rmse,
+            check.overlap,
+            self._constraint(a, b, check),
+        )
 
     def _reach_between(self, older: int, newer: int) -> float:
         """m, gate of odometry between two keyframes."""

@@ -62,9 +62,14 @@ def find_loops(
 
 
 def verify_known(
-    store: KeyframeStore, pairs: Sequence[KnownPair], config: LoopsConfig, registration: RegistrationConfig,
-    submap_size: int = 5, should_stop: Callable[[], bool] = lambda: False, up: Floats = Z,
-) -> list[LoopCandidate]:  # fmt: skip
+    store: KeyframeStore,
+    pairs: Sequence[KnownPair],
+    config: LoopsConfig,
+    registration: RegistrationConfig,
+    submap_size: int = 5,
+    should_stop: Callable[[], bool] = lambda: False,
+    up: Floats = Z,
+) -> list[LoopCandidate]:
     """The known pairs as candidates, verified wherever their scans may lie; an accepted one is held by the graph.
 
     Raises InterruptedRunError when `should_stop` said so between two.
@@ -79,9 +84,14 @@ def verify_known(
 
 
 def _detector(
-    store: KeyframeStore, keyframes: Sequence[Keyframe], config: LoopsConfig, registration: RegistrationConfig,
-    submap_size: int, forbidden: Sequence[tuple[int, int]] = (), up: Floats = Z,
-) -> Detector:  # fmt: skip
+    store: KeyframeStore,
+    keyframes: Sequence[Keyframe],
+    config: LoopsConfig,
+    registration: RegistrationConfig,
+    submap_size: int,
+    forbidden: Sequence[tuple[int, int]] = (),
+    up: Floats = Z,
+) -> Detector:
     poses = np.array([keyframe.T_world_lidar for keyframe in keyframes]).reshape(-1, 4, 4)
     return Detector(
         keyframes, lambda number: submap(store, poses, number, submap_size), config, registration, forbidden, up

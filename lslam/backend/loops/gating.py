@@ -74,10 +74,19 @@ class OdometryUncertainty:
         so many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
         """
         covariances = np.zeros((0, 6, 6)) if self.covariances is None else self.covariances
-        return np.asarray(gating.gated(
-            b, among, self.positions, self.distances, covariances, self._sum, self._squares,
-            (self._per_m, float(self._turn_per_m)), (float(least), float(near), float(sigmas)),
-        ))  # fmt: skip
+        return np.asarray(
+            gating.gated(
+                b,
+                among,
+                self.positions,
+                self.distances,
+                covariances,
+                self._sum,
+                self._squares,
+                (self._per_m, float(self._turn_per_m)),
+                (float(least), float(near), float(sigmas)),
+            )
+        )
 
     def _lever(self, b: int, older: Longs) -> Floats:
         """(C,) m, rms distance of keyframe `b` from the keyframes since each of `older`."""

@@ -53,9 +53,13 @@ def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
     R = level_rotation(up)
     T, turn = se3.make(R, np.zeros(3)), np.kron(np.eye(2), R)
     return [
-        replace(k, T_world_lidar=T @ k.T_world_lidar, covariance=None if k.covariance is None else turn @ k.covariance @ turn.T)
+        replace(
+            k,
+            T_world_lidar=T @ k.T_world_lidar,
+            covariance=None if k.covariance is None else turn @ k.covariance @ turn.T,
+        )
         for k in keyframes
-    ]  # fmt: skip
+    ]
 
 
 # m; larger voxels serve sparse single scans; a submap is dense.
@@ -91,9 +95,13 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
     Voxels with too few points for a Gaussian give no source points either.
     """
     fine = GaussianMap(
-        min(config.voxel_size, LARGEST), min_points=config.min_points, planarity=config.planarity, count_cap=config.count_cap,
-        reach=np.inf, capacity=CAPACITY,
-    )  # fmt: skip
+        min(config.voxel_size, LARGEST),
+        min_points=config.min_points,
+        planarity=config.planarity,
+        count_cap=config.count_cap,
+        reach=np.inf,
+        capacity=CAPACITY,
+    )
     for first in range(0, len(points), CAPACITY // 4):
         fine.insert(points[first : first + CAPACITY // 4], np.eye(4))
     kind = fine.planes[:, 7]

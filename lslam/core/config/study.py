@@ -16,18 +16,44 @@ from lslam.core.config.section import Section
 from lslam.core.errors import ConfigError, nearest
 
 Kind = Literal[
-    "diverges_beyond", "holds_up_to", "best_between", "largest_between", "elbow_at", "good_from", "matters_little",
-    "linear", "inverse", "product", "acts_only_on", "rises", "falls", "imu_lowers", "imu_flattens", "imu_steepens",
-]  # fmt: skip
+    "diverges_beyond",
+    "holds_up_to",
+    "best_between",
+    "largest_between",
+    "elbow_at",
+    "good_from",
+    "matters_little",
+    "linear",
+    "inverse",
+    "product",
+    "acts_only_on",
+    "rises",
+    "falls",
+    "imu_lowers",
+    "imu_flattens",
+    "imu_steepens",
+]
 Quantity = Literal["translation", "angular", "time_per_scan", "total_time", "efficiency", "total_efficiency"]
 
 # Smallest and largest number of `values` of each kind.
 _COUNTS: dict[str, tuple[int, int]] = {
-    "diverges_beyond": (1, 1), "holds_up_to": (1, 1), "best_between": (2, 2), "largest_between": (2, 2),
-    "elbow_at": (1, 1), "good_from": (1, 1), "matters_little": (1, 1),
-    "linear": (0, 1), "inverse": (0, 1), "product": (0, 1), "acts_only_on": (0, 0),
-    "rises": (0, 0), "falls": (0, 0), "imu_lowers": (0, 0), "imu_flattens": (0, 0), "imu_steepens": (0, 0),
-}  # fmt: skip
+    "diverges_beyond": (1, 1),
+    "holds_up_to": (1, 1),
+    "best_between": (2, 2),
+    "largest_between": (2, 2),
+    "elbow_at": (1, 1),
+    "good_from": (1, 1),
+    "matters_little": (1, 1),
+    "linear": (0, 1),
+    "inverse": (0, 1),
+    "product": (0, 1),
+    "acts_only_on": (0, 0),
+    "rises": (0, 0),
+    "falls": (0, 0),
+    "imu_lowers": (0, 0),
+    "imu_flattens": (0, 0),
+    "imu_steepens": (0, 0),
+}
 _LAWS = ("linear", "inverse", "product")
 
 

@@ -22,8 +22,9 @@ ROUNDING_SHARE = 1e-12
 
 
 @inline_with_arrays
-def solve_observed(H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats,
-                   weak: Floats) -> int:  # fmt: skip
+def solve_observed(
+    H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats, weak: Floats
+) -> int:
     """Step d = -inv(H) g, (6,) m and rad, in the observed directions; returns the number of degenerate ones, rows of `weak`.
 
     Rotations are scaled by the rms lever arm, m, which makes the six eigenvalues comparable. A direction is degenerate when
@@ -129,8 +130,9 @@ def make_whole(sums: Sums) -> None:
 
 
 @kernel
-def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
-         weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
+def step(
+    pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats, weak: Floats
+) -> tuple[bool, int, float, float]:
     """Move the pose by one step in the observed directions, and write the step to d (6,), m and rad.
 
     sums : of a linearisation; H has its upper triangle alone, and is filled in
@@ -151,8 +153,9 @@ def step(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, 
 
 
 @kernel
-def step_on_surfaces(pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats,
-                     weak: Floats) -> tuple[bool, int, float, float]:  # fmt: skip
+def step_on_surfaces(
+    pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats, weak: Floats
+) -> tuple[bool, int, float, float]:
     """As `step`, with degenerate directions by S; a kernel of its own, so that runs of other residuals need not compile it."""
     R, t = pose
     H, S, g, facts = sums

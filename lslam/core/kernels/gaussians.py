@@ -42,8 +42,9 @@ def find(key: int, keys: Longs, table: Ints) -> int:
 
 
 @inline
-def _claim(key: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, table: Ints, state: Longs,
-           free: Ints) -> int:  # fmt: skip
+def _claim(
+    key: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, table: Ints, state: Longs, free: Ints
+) -> int:
     """Slot of a key, taking a fresh one when it is new; -1 when the pool is full."""
     h = place_of(key, keys, table)
     if table[h] >= 0:
@@ -89,8 +90,17 @@ def _release(slot: int, keys: Longs, table: Ints, state: Longs, free: Ints, plan
 
 
 @inline
-def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Longs, min_points: float,
-             planarity: float, floor: float, breadth: float) -> None:  # fmt: skip
+def _refresh(
+    slot: int,
+    size: float,
+    moments: Floats,
+    planes: Floats,
+    keys: Longs,
+    min_points: float,
+    planarity: float,
+    floor: float,
+    breadth: float,
+) -> None:
     """Mean, normal and kind of one voxel, its row of `planes`, from its moments.
 
     The points of one ring of one scan lie on the cone of its beams, and those of the next scan lie on the same cone wherever
@@ -130,8 +140,9 @@ def _refresh(slot: int, size: float, moments: Floats, planes: Floats, keys: Long
 
 
 @inline
-def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float,
-               dz: float) -> float:  # fmt: skip
+def breadth_of(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, dx: float, dy: float, dz: float
+) -> float:
     """Smaller variance, m2, of points of covariance xx..zz across the direction d of the beams that measured them.
 
     The smaller eigenvalue of the covariance projected along d. It is the variance about the best plane that holds d.
@@ -142,16 +153,34 @@ def breadth_of(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
     along = (xx * dx * dx + yy * dy * dy + zz * dz * dz + 2.0 * (xy * dx * dy + xz * dx * dz + yz * dy * dz)) / d2
     total = xx + yy + zz - along
     product = (
-        (yy * zz - yz * yz) * dx * dx + (xx * zz - xz * xz) * dy * dy + (xx * yy - xy * xy) * dz * dz
+        (yy * zz - yz * yz) * dx * dx
+        + (xx * zz - xz * xz) * dy * dy
+        + (xx * yy - xy * xy) * dz * dz
         + 2.0 * ((xz * yz - xy * zz) * dx * dy + (xy * yz - xz * yy) * dx * dz + (xy * xz - xx * yz) * dy * dz)
-    ) / d2  # fmt: skip
+    ) / d2
     return 0.5 * (total - math.sqrt(max(total * total - 4.0 * product, 0.0)))
 
 
 @kernel
-def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: float, min_points: float,
-           planarity: float, floor: float, breadth: float, reach: float, moments: Floats, planes: Floats, keys: Longs,
-           refreshed: Floats, table: Ints, state: Longs, free: Ints) -> int:  # fmt: skip
+def insert(
+    points: NDArray[np.float32],
+    R: Floats,
+    t: Floats,
+    size: float,
+    cap: float,
+    min_points: float,
+    planarity: float,
+    floor: float,
+    breadth: float,
+    reach: float,
+    moments: Floats,
+    planes: Floats,
+    keys: Longs,
+    refreshed: Floats,
+    table: Ints,
+    state: Longs,
+    free: Ints,
+) -> int:
     """Add points (N, 3), LiDAR frame, m, measured from the pose R (3, 3), t (3,); returns the number that found no slot.
 
     Moments of a voxel with more than `cap` points are scaled down, so that new points keep their weight. A voxel's plane is
@@ -237,8 +266,9 @@ def insert(points: NDArray[np.float32], R: Floats, t: Floats, size: float, cap: 
 
 
 @inline
-def _evict(steps: int, t: Floats, size: float, reach: float, keys: Longs, table: Ints, state: Longs, free: Ints,
-           planes: Floats) -> None:  # fmt: skip
+def _evict(
+    steps: int, t: Floats, size: float, reach: float, keys: Longs, table: Ints, state: Longs, free: Ints, planes: Floats
+) -> None:
     if state[USED] == 0:
         return
     far = reach * reach
@@ -270,9 +300,24 @@ def rehash(keys: Longs, table: Ints, used: int) -> None:
 
 
 @kernel
-def coarsen(factor: int, size: float, min_points: float, planarity: float, floor: float, breadth: float, fine_moments: Floats,
-            fine_keys: Longs, used: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats,
-            table: Ints, state: Longs, free: Ints) -> None:  # fmt: skip
+def coarsen(
+    factor: int,
+    size: float,
+    min_points: float,
+    planarity: float,
+    floor: float,
+    breadth: float,
+    fine_moments: Floats,
+    fine_keys: Longs,
+    used: int,
+    moments: Floats,
+    planes: Floats,
+    keys: Longs,
+    refreshed: Floats,
+    table: Ints,
+    state: Longs,
+    free: Ints,
+) -> None:
     """Fill an empty map of voxels of `size`, m, = factor * fine size with the moments of a finer map, which add up exactly."""
     fine = size / factor
     for j in range(used):

@@ -32,8 +32,9 @@ def place(source: Floats, i: int, R: Floats, t: Floats) -> tuple[float, float, f
 
 
 @inline
-def add_facts(facts: Floats, information: float, squared: float, robust: float, rx: float, ry: float,
-              rz: float) -> None:  # fmt: skip
+def add_facts(
+    facts: Floats, information: float, squared: float, robust: float, rx: float, ry: float, rz: float
+) -> None:
     """Sums of one residual at a point r, seen from the sensor: its information, its weighted square and its robust weight."""
     facts[INFORMATION] += information
     facts[SQUARED] += squared
@@ -42,8 +43,9 @@ def add_facts(facts: Floats, information: float, squared: float, robust: float, 
 
 
 @inline
-def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: Longs,
-                 slots: Ints, keys: Longs, table: Ints) -> bool:  # fmt: skip
+def octant_slots(
+    x: float, y: float, z: float, i: int, inverse: float, cells: Longs, slots: Ints, keys: Longs, table: Ints
+) -> bool:
     """Look up the slots (8,) of the voxels around point i at x, y, z, world, when it has left its octant cell; True then."""
     ix, iy, iz = (
         index_of(x - 0.5 / inverse, inverse),
@@ -64,8 +66,9 @@ def octant_slots(x: float, y: float, z: float, i: int, inverse: float, cells: Lo
 
 
 @inline
-def nearest(x: float, y: float, z: float, i: int, slots: Ints, chosen: Ints, asked: Floats,
-            planes: Floats) -> tuple[int, float, int, float]:  # fmt: skip
+def nearest(
+    x: float, y: float, z: float, i: int, slots: Ints, chosen: Ints, asked: Floats, planes: Floats
+) -> tuple[int, float, int, float]:
     """Nearest plane and nearest blob among the slots of point i: for each the slot, or -1, and its mean's squared distance, m2.
 
     The nearest one stays the same while the point moves by less than half of the difference between the distances to the
@@ -121,8 +124,15 @@ def variance_of(p: Floats, off: float, d2: float) -> float:
 
 
 @kernel
-def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
-              width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise(
+    points: tuple[Floats, Floats],
+    voxels: Voxels,
+    settings: Settings,
+    search: Search,
+    pose: Pose,
+    width: Width,
+    sums: Sums,
+) -> None:
     """Add all source points (S, 3), LiDAR frame, with scatter (S, 6) around each, to H, g and facts, see `linearisation`.
 
     Points that are matched already are skipped; points that are matched with a plane here are marked. A coarser map takes the
@@ -168,9 +178,11 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
             lz = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
             q = scatter[i]
             spread = (
-                q[0] * lx * lx + q[3] * ly * ly + q[5] * lz * lz
+                q[0] * lx * lx
+                + q[3] * ly * ly
+                + q[5] * lz * lz
                 + 2.0 * (q[1] * lx * ly + q[2] * lx * lz + q[4] * ly * lz)
-            )  # fmt: skip
+            )
             robust = c2 / (c2 + r * r)
             robust *= robust
             w = plane_weight * robust / (variance_of(p, r, best_d) + max(spread, 0.0) + sigma2)
@@ -195,16 +207,30 @@ def linearise(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings,
             q = scatter[i]
             w = blob_weight * robust / (p[6] + (q[0] + q[3] + q[5]) / 3.0 + sigma2)
             add_information(
-                H, g, w, 1.0 - drop * ux * ux, -drop * ux * uy, -drop * ux * uz, 1.0 - drop * uy * uy, -drop * uy * uz,
-                1.0 - drop * uz * uz, ex, ey, ez, rx, ry, rz,
-            )  # fmt: skip
+                H,
+                g,
+                w,
+                1.0 - drop * ux * ux,
+                -drop * ux * uy,
+                -drop * ux * uz,
+                1.0 - drop * uy * uy,
+                -drop * uy * uz,
+                1.0 - drop * uz * uz,
+                ex,
+                ey,
+                ez,
+                rx,
+                ry,
+                rz,
+            )
             facts[INFORMATION] += (2.0 + along) * w
             facts[LEVER] += (2.0 + along) * w * (rx * rx + ry * ry + rz * rz)
 
 
 @inline
-def add_row(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: float, j3: float, j4: float,
-         j5: float) -> None:  # fmt: skip
+def add_row(
+    H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: float, j3: float, j4: float, j5: float
+) -> None:
     """Upper triangle of H += w j j^T and g += w r j."""
     w0, w1, w2, w3, w4, w5 = w * j0, w * j1, w * j2, w * j3, w * j4, w * j5
     H[0, 0] += w0 * j0
@@ -237,8 +263,23 @@ def add_row(H: Floats, g: Floats, w: float, r: float, j0: float, j1: float, j2: 
 
 
 @inline
-def add_information(H: Floats, g: Floats, w: float, xx: float, xy: float, xz: float, yy: float, yz: float, zz: float,
-                    ex: float, ey: float, ez: float, rx: float, ry: float, rz: float) -> None:  # fmt: skip
+def add_information(
+    H: Floats,
+    g: Floats,
+    w: float,
+    xx: float,
+    xy: float,
+    xz: float,
+    yy: float,
+    yz: float,
+    zz: float,
+    ex: float,
+    ey: float,
+    ez: float,
+    rx: float,
+    ry: float,
+    rz: float,
+) -> None:
     """Upper triangle of H += w J^T M J and g += w J^T M e, with J = [I, -hat(r)] and M the symmetric matrix xx..zz."""
     xx, xy, xz, yy, yz, zz = w * xx, w * xy, w * xz, w * yy, w * yz, w * zz
     H[0, 0] += xx
@@ -280,8 +321,9 @@ def add_information(H: Floats, g: Floats, w: float, xx: float, xy: float, xz: fl
 # but it is the only information along a corridor, and it pulls the pose towards where the map was measured. So degenerate
 # directions are found without it, and the pose keeps the motion prior along them.
 @inline
-def add_surface(S: Floats, unused: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float,
-                rz: float) -> None:  # fmt: skip
+def add_surface(
+    S: Floats, unused: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float, rz: float
+) -> None:
     """Upper triangle of S (6, 6) += w j j^T with j = [n, r x n]; `unused` (6,) takes no gradient."""
     add_information(S, unused, w, nx * nx, nx * ny, nx * nz, ny * ny, ny * nz, nz * nz, 0.0, 0.0, 0.0, rx, ry, rz)
 
@@ -295,8 +337,9 @@ def thin_information(p: Floats, xx: float, xy: float, xz: float, yy: float, yz: 
 
 
 @inline_with_arrays
-def solve_on_surfaces(H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, least: float, d: Floats,
-                      weak: Floats) -> int:  # fmt: skip
+def solve_on_surfaces(
+    H: Floats, S: Floats, g: Floats, facts: Floats, weak_share: float, least: float, d: Floats, weak: Floats
+) -> int:
     """As `gauss_newton.solve_observed`, with the observed directions by the share of S; d solves H in them.
 
     `least` applies to H. Both matrices are full, not triangles.

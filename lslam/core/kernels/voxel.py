@@ -39,9 +39,14 @@ def index_of(x: float, inverse_size: float) -> int:
 
 @inline
 def _passes(
-    a: np.float32, b: np.float32, c: np.float32, range_min: float, range_max: float, is_cylinder: bool,
+    a: np.float32,
+    b: np.float32,
+    c: np.float32,
+    range_min: float,
+    range_max: float,
+    is_cylinder: bool,
     box: NDArray[np.float64],
-) -> bool:  # fmt: skip
+) -> bool:
     """Whether a point is finite, not zero, inside the range gate and outside the ego box."""
     x, y, z = float(a), float(b), float(c)
     d = x * x + y * y
@@ -73,9 +78,13 @@ def gate(
 
 @kernel
 def gated(
-    points: NDArray[np.float32], times: NDArray[np.float32], range_min: float, range_max: float, is_cylinder: bool,
+    points: NDArray[np.float32],
+    times: NDArray[np.float32],
+    range_min: float,
+    range_max: float,
+    is_cylinder: bool,
     box: NDArray[np.float64],
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The points (K, 3) that `gate` keeps, and their times (K,); no times where none are given."""
     n = len(points)
     is_timed = len(times) == n

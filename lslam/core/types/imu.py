@@ -46,9 +46,12 @@ class GravityDirection:
 XYZ = ("x", "y", "z")
 # In the order of the values.
 IMU_STATES = (
-    *(f"accel_bias_{axis}" for axis in XYZ), *(f"gyro_bias_{axis}" for axis in XYZ), *(f"gravity_{axis}" for axis in XYZ),
-    *(f"mounting_{axis}" for axis in XYZ), "offset_s",
-)  # fmt: skip
+    *(f"accel_bias_{axis}" for axis in XYZ),
+    *(f"gyro_bias_{axis}" for axis in XYZ),
+    *(f"gravity_{axis}" for axis in XYZ),
+    *(f"mounting_{axis}" for axis in XYZ),
+    "offset_s",
+)
 
 
 @dataclass(frozen=True)

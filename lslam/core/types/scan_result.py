@@ -205,10 +205,13 @@ class ScanResult:
             return None if covariance is None else noise.rotated(covariance, R)
 
         return replace(
-            self, T_world_lidar=se3.normalise(T @ self.T_world_lidar), covariance=turned(self.covariance),
-            points_covariance=turned(self.points_covariance), registration_covariance=turned(self.registration_covariance),
+            self,
+            T_world_lidar=se3.normalise(T @ self.T_world_lidar),
+            covariance=turned(self.covariance),
+            points_covariance=turned(self.points_covariance),
+            registration_covariance=turned(self.registration_covariance),
             degenerate=self.degenerate @ np.kron(np.eye(2), R).T,
-        )  # fmt: skip
+        )
 
     @property
     def by_points(self) -> ScanResult:

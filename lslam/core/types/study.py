@@ -138,8 +138,17 @@ class Curve:
     @property
     def label(self) -> str:
         """The series and where it stands in a two-way study."""
-        return ", ".join([self.series, *(f"{key.rpartition('.')[2]} {value:g}" if isinstance(value, float) else
-                                         f"{key.rpartition('.')[2]} {value}" for key, value in self.at)])  # fmt: skip
+        return ", ".join(
+            [
+                self.series,
+                *(
+                    f"{key.rpartition('.')[2]} {value:g}"
+                    if isinstance(value, float)
+                    else f"{key.rpartition('.')[2]} {value}"
+                    for key, value in self.at
+                ),
+            ]
+        )
 
     @property
     def scored(self) -> Bools:

@@ -142,10 +142,17 @@ def _sensor(found: dict[str, Any], layout: str) -> OusterSensor:
     if offset_mm is None:
         offset_mm = 0.0 if T_lidar_beam is None else np.array(T_lidar_beam, np.float64).ravel()[3]
     sensor = OusterSensor(
-        str(found.get("prod_line") or "Ouster"), PROFILES[layout], columns, width, altitudes, azimuths,
-        float(offset_mm) * 1e-3, _transform(found.get("lidar_to_sensor_transform") or _LIDAR_TO_SENSOR),
-        _transform(found.get("imu_to_sensor_transform") or _IMU_TO_SENSOR), float(rate),
-    )  # fmt: skip
+        str(found.get("prod_line") or "Ouster"),
+        PROFILES[layout],
+        columns,
+        width,
+        altitudes,
+        azimuths,
+        float(offset_mm) * 1e-3,
+        _transform(found.get("lidar_to_sensor_transform") or _LIDAR_TO_SENSOR),
+        _transform(found.get("imu_to_sensor_transform") or _IMU_TO_SENSOR),
+        float(rate),
+    )
     numbers = (sensor.altitudes, sensor.azimuths, sensor.T_sensor_lidar, sensor.T_sensor_imu, np.array(sensor.offset_m))
     is_right = all(np.isfinite(values).all() for values in numbers)
     is_right &= 0 < sensor.beams == len(sensor.azimuths) <= 1024 and 0 < columns <= width <= 65536 and 0 < rate <= 1000

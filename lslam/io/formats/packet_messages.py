@@ -50,8 +50,11 @@ def read_packets(topic: BagTopic, data: bytes) -> tuple[Longs, NDArray[np.uint8]
         word = f"{header.order}u4"
         count = int(np.frombuffer(data, word, 1, at)[0])
         fields: Any = [
-            ("s", word), ("ns", word), ("data", np.uint8, velodyne_packets.SIZE), ("gap", np.uint8, gap),
-        ]  # fmt: skip
+            ("s", word),
+            ("ns", word),
+            ("data", np.uint8, velodyne_packets.SIZE),
+            ("gap", np.uint8, gap),
+        ]
         table = np.frombuffer(data[at + 4 :] + bytes(gap), fields, count)
     except (ValueError, IndexError):
         raise InputError(f"a message of {topic.name} with {len(data)} bytes is no {topic.type}") from None

@@ -206,9 +206,16 @@ def _assemble(data: NDArray[np.uint8], frames: Longs, loss: str) -> Datagrams:
         loss = f"{loss}; " if loss else ""
         loss += f"{lost} datagrams of the capture lack a part and are left out"
     return Datagrams(
-        data, stamps[first][is_right], size[is_right] - _UDP_BYTES, sources[is_right], first[is_right], count[is_right],
-        begin, length, loss,
-    )  # fmt: skip
+        data,
+        stamps[first][is_right],
+        size[is_right] - _UDP_BYTES,
+        sources[is_right],
+        first[is_right],
+        count[is_right],
+        begin,
+        length,
+        loss,
+    )
 
 
 def _datagram_of(address: Longs, number: Longs, is_piece: Bools) -> Longs:

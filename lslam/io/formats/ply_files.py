@@ -16,10 +16,23 @@ from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.point_cloud import beyond, packed_columns, text_columns
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
-    "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -55,9 +68,14 @@ def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_ply(
-    path: Path, points: NDArray[Any], intensity: NDArray[Any] | None = None, comment: str = "", *,
-    scalars: Mapping[str, NDArray[Any]] | None = None, colours: NDArray[np.uint8] | None = None,
-) -> None:  # fmt: skip
+    path: Path,
+    points: NDArray[Any],
+    intensity: NDArray[Any] | None = None,
+    comment: str = "",
+    *,
+    scalars: Mapping[str, NDArray[Any]] | None = None,
+    colours: NDArray[np.uint8] | None = None,
+) -> None:
     """Write points (N, 3), m, intensity (N,) and further `scalars` (N,) by name as float32, binary little endian, atomically.
 
     colours : (N, 3) red, green, blue, which viewers show at once

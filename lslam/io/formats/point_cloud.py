@@ -23,26 +23,90 @@ AXIS_NAMES = {
     axis: (axis, f"pos_{axis}", f"position_{axis}", f"point_{axis}", f"p{axis}", f"{axis}_m") for axis in AXES
 }
 INTENSITY_NAMES = (
-    "intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "remittance", "amplitude", "signal",
+    "intensity",
+    "intensities",
+    "i",
+    "reflectivity",
+    "reflectance",
+    "remission",
+    "remittance",
+    "amplitude",
+    "signal",
     "echo_intensity",
-)  # fmt: skip
+)
 # Nothing else is called so; the others are rings when their values can be.
 _SURE_RING_NAMES = ("ring", "rings", "ring_id", "ring_index")
 RING_NAMES = (
-    *_SURE_RING_NAMES, "channel", "line", "laser_id", "channel_id", "line_id", "line_index", "laser", "laser_number", "beam",
-    "beam_id", "beam_index", "layer", "row", "scan_line", "scanline", "shorter_side",
-)  # fmt: skip
+    *_SURE_RING_NAMES,
+    "channel",
+    "line",
+    "laser_id",
+    "channel_id",
+    "line_id",
+    "line_index",
+    "laser",
+    "laser_number",
+    "beam",
+    "beam_id",
+    "beam_index",
+    "layer",
+    "row",
+    "scan_line",
+    "scanline",
+    "shorter_side",
+)
 TIME_NAMES = (
-    "t", "time", "times", "timestamp", "timestamps", "time_stamp", "offset_time", "time_offset", "timeoffset", "stamp", "ts",
-    "point_time_offset", "relative_timestamp", "relative_time", "rel_time", "point_time", "point_timestamp", "gps_time",
-    "gpstime", "utc_time", "delta_time", "delta_t", "dt", "lidar_timestamp", "sensor_timestamp", "firing_time", "fire_time",
-    "capture_time", "offset_ns", "offset_us", "curvature",
-)  # fmt: skip
+    "t",
+    "time",
+    "times",
+    "timestamp",
+    "timestamps",
+    "time_stamp",
+    "offset_time",
+    "time_offset",
+    "timeoffset",
+    "stamp",
+    "ts",
+    "point_time_offset",
+    "relative_timestamp",
+    "relative_time",
+    "rel_time",
+    "point_time",
+    "point_timestamp",
+    "gps_time",
+    "gpstime",
+    "utc_time",
+    "delta_time",
+    "delta_t",
+    "dt",
+    "lidar_timestamp",
+    "sensor_timestamp",
+    "firing_time",
+    "fire_time",
+    "capture_time",
+    "offset_ns",
+    "offset_us",
+    "curvature",
+)
 # The likeliest first; Livox's `tag` says how sure a return is.
 LABEL_NAMES = (
-    "label", "labels", "semantic", "semantics", "semantic_label", "semantic_id", "semantic_class", "sem_label", "sem_class",
-    "label_id", "class", "class_id", "class_label", "classification", "category", "tag",
-)  # fmt: skip
+    "label",
+    "labels",
+    "semantic",
+    "semantics",
+    "semantic_label",
+    "semantic_id",
+    "semantic_class",
+    "sem_label",
+    "sem_class",
+    "label_id",
+    "class",
+    "class_id",
+    "class_label",
+    "classification",
+    "category",
+    "tag",
+)
 # FAST-LIO's clouds keep ms in a field that other software fills with the curvature of the surface.
 _DOUBTFUL_TIMES = {"curvature": "ms"}
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}  # ns
@@ -125,9 +189,16 @@ def beyond(count: int, more: int) -> dict[str, NDArray[Any]]:
 
 
 def packed_columns(
-    path: Path, kind: str, names: Sequence[str], dtype: np.dtype[Any], count: int, data: memoryview, at: int = 0, *,
+    path: Path,
+    kind: str,
+    names: Sequence[str],
+    dtype: np.dtype[Any],
+    count: int,
+    data: memoryview,
+    at: int = 0,
+    *,
     is_last: bool = True,
-) -> dict[str, NDArray[Any]]:  # fmt: skip
+) -> dict[str, NDArray[Any]]:
     """Read `count` records of `dtype` from byte `at` on: one array per field. Raises InputError when the data end early.
 
     is_last : nothing else follows; trailing zeros that pad a file are no points

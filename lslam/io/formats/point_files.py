@@ -212,8 +212,10 @@ def read_cloud(path: Path) -> ArrayCloud:
     if step > COARSE_M:
         log.warning(
             "%s: its coordinates lie in steps of %.3g m, too coarse so far from the origin: write "
-            "them as double, or less an offset", path, step,
-        )  # fmt: skip
+            "them as double, or less an offset",
+            path,
+            step,
+        )
     return cloud
 
 

@@ -14,8 +14,14 @@ from lslam.io.formats.point_cloud import PointCloud, cloud_from_fields, organise
 # sensor_msgs/PointField
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _LIVOX = [
-    ("offset_time", "u4"), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
-]  # fmt: skip
+    ("offset_time", "u4"),
+    ("x", "f4"),
+    ("y", "f4"),
+    ("z", "f4"),
+    ("reflectivity", "u1"),
+    ("tag", "u1"),
+    ("line", "u1"),
+]
 
 
 def decode_pointcloud2(message: Any, where: Path) -> PointCloud:

@@ -175,8 +175,10 @@ def sequence_toml_text(info: SequenceInfo) -> str:
     tree = {f.name: getattr(info, f.name) for f in fields(info) if f.name not in (*EXTRINSICS, *_TABLES)}
     extrinsics = {key: getattr(info, key) for key in EXTRINSICS}
     tables: dict[str, Mapping[str, Matrix | None]] = {
-        "extrinsics": extrinsics, "lidars": info.lidars or {}, "frames": info.frames or {}
-    }  # fmt: skip
+        "extrinsics": extrinsics,
+        "lidars": info.lidars or {},
+        "frames": info.frames or {},
+    }
     for key, matrices in tables.items():
         rows = {name: np.asarray(T, np.float64).tolist() for name, T in matrices.items() if T is not None}
         tree[key] = rows or None

@@ -23,11 +23,32 @@ log = logging.getLogger("lslam")
 # The columns of a time, one or two, and the nanoseconds in the unit of each, None where nothing states it.
 Units = dict[int, int | None]
 UNITS_NS = {
-    "ns": 1, "nsec": 1, "nsecs": 1, "nanosec": 1, "nanosecs": 1, "nanosecond": 1, "nanoseconds": 1, "nanos": 1,
-    "us": 1_000, "usec": 1_000, "micros": 1_000, "usecs": 1_000, "microsec": 1_000, "microsecs": 1_000, "microseconds": 1_000,
-    "ms": 1_000_000, "msec": 1_000_000, "millis": 1_000_000, "msecs": 1_000_000, "milliseconds": 1_000_000,
-    "s": 1_000_000_000, "sec": 1_000_000_000, "secs": 1_000_000_000, "second": 1_000_000_000, "seconds": 1_000_000_000,
-}  # fmt: skip
+    "ns": 1,
+    "nsec": 1,
+    "nsecs": 1,
+    "nanosec": 1,
+    "nanosecs": 1,
+    "nanosecond": 1,
+    "nanoseconds": 1,
+    "nanos": 1,
+    "us": 1_000,
+    "usec": 1_000,
+    "micros": 1_000,
+    "usecs": 1_000,
+    "microsec": 1_000,
+    "microsecs": 1_000,
+    "microseconds": 1_000,
+    "ms": 1_000_000,
+    "msec": 1_000_000,
+    "millis": 1_000_000,
+    "msecs": 1_000_000,
+    "milliseconds": 1_000_000,
+    "s": 1_000_000_000,
+    "sec": 1_000_000_000,
+    "secs": 1_000_000_000,
+    "second": 1_000_000_000,
+    "seconds": 1_000_000_000,
+}
 SECOND_NS = 1_000_000_000
 _TIMES = ("t", "time", "times", "datetime", "epoch", "ts", "utc")
 # Poses, samples and scans are less than a minute apart.
@@ -108,8 +129,9 @@ def read_stamps(path: Path, must_increase: bool = False) -> Longs:
     elif not table.names and not (clock.stamps_ns % SECOND_NS).any() and table.numbers(beside)[:1] >= 0:
         log.warning(
             "%s: whole seconds, column %d beside them is not read: if it is their fraction, name the columns (sec,usec)",
-            path, beside + 1,
-        )  # fmt: skip
+            path,
+            beside + 1,
+        )
     if must_increase:
         table.check_increasing(clock.stamps_ns)
     return clock.stamps_ns

@@ -25,14 +25,44 @@ Prefix = tuple[str, ...]
 _POSITIONS = ("position", "positions", "pos", "translation", "trans", "point", "p", "t", "xyz")
 _ROTATIONS = ("orientation", "ori", "rotation", "quaternion", "quat", "rot", "q")
 # Words before a bare x, y or z that leave it a position.
-_BODIES = frozenset((
-    "field", "pose", "poses", "gt", "est", "ref", "true", "truth", "ground", "groundtruth", "reference", "utm", "enu", "world",
-    "map", "odom", "lidar", "base", "imu", "body", "cam", "camera", "local", "global", "prism", "leica", "rtk", "gps", "gnss",
-))  # fmt: skip
+_BODIES = frozenset(
+    (
+        "field",
+        "pose",
+        "poses",
+        "gt",
+        "est",
+        "ref",
+        "true",
+        "truth",
+        "ground",
+        "groundtruth",
+        "reference",
+        "utm",
+        "enu",
+        "world",
+        "map",
+        "odom",
+        "lidar",
+        "base",
+        "imu",
+        "body",
+        "cam",
+        "camera",
+        "local",
+        "global",
+        "prism",
+        "leica",
+        "rtk",
+        "gps",
+        "gnss",
+    )
+)
 _EARTH = {
-    **dict.fromkeys(("east", "easting", "e"), "x"), **dict.fromkeys(("north", "northing", "n"), "y"),
+    **dict.fromkeys(("east", "easting", "e"), "x"),
+    **dict.fromkeys(("north", "northing", "n"), "y"),
     **dict.fromkeys(("up", "u", "height", "h", "altitude", "alt"), "z"),
-}  # fmt: skip
+}
 _WAY_OUT = "name the columns t, x, y, z, qx, qy, qz, qw"
 # Share of a table's quaternions that must have length 1, and how far from it they may be.
 _MOST, _UNIT = 0.95, 0.05

@@ -85,13 +85,21 @@ def open_sequence(
     if rate_hz is not None and not is_rate(rate_hz):
         raise UsageError(f"a scan rate of {rate_hz} Hz makes no sense")
     topics: dict[str, Any] = {
-        "lidar_topic": lidar_topic, "lidar_frame": lidar_frame, "imu_topic": imu_topic, "gnss_topic": gnss_topic,
-    }  # fmt: skip
+        "lidar_topic": lidar_topic,
+        "lidar_frame": lidar_frame,
+        "imu_topic": imu_topic,
+        "gnss_topic": gnss_topic,
+    }
     overrides = SequenceInfo(
-        rows=rows, cols=cols, rate_hz=rate_hz, motion_compensated=motion_compensated,
-        vertical_correction_deg=vertical_correction_deg, point_times=None if point_times == "auto" else point_times,
-        T_lidar_imu=None if extrinsics is None else read_transform(extrinsics), **topics,
-    )  # fmt: skip
+        rows=rows,
+        cols=cols,
+        rate_hz=rate_hz,
+        motion_compensated=motion_compensated,
+        vertical_correction_deg=vertical_correction_deg,
+        point_times=None if point_times == "auto" else point_times,
+        T_lidar_imu=None if extrinsics is None else read_transform(extrinsics),
+        **topics,
+    )
     with _readable(name_or_path):
         sequence = _open(folder, overrides)
     from lslam.io.readers.kitti_raw import with_streams

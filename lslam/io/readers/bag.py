@@ -214,14 +214,26 @@ def _lidars_of(bag: Bag, topic: BagTopic, info: SequenceInfo, voice: Voice, has_
 def _scans_of(bag: Bag, index: ScanIndex, opened: Opened | None, info: SequenceInfo, voice: Voice) -> BagSequence:
     """Scans of one LiDAR, from the packets `opened` or from messages, without IMU and fixes."""
     sequence = BagSequence(
-        name=info.name or printable(stem_of(bag.path)), path=bag.path, kind=KIND, bag=bag, topic=index.topic,
-        messages=index.messages, headers_ns=index.stamps_ns, stamps_ns=index.stamps_ns,
+        name=info.name or printable(stem_of(bag.path)),
+        path=bag.path,
+        kind=KIND,
+        bag=bag,
+        topic=index.topic,
+        messages=index.messages,
+        headers_ns=index.stamps_ns,
+        stamps_ns=index.stamps_ns,
         rate_hz=info.rate_hz or (opened.rate_hz if opened else measured_rate(index.stamps_ns)),
-        motion_compensated=info.motion_compensated, rings=info.rings or (opened.rings if opened else None),
-        sensor=info.sensor or (opened.sensor if opened else None), revolutions=opened.revolutions if opened else None,
-        notes=voice.notes, problems=voice.problems, halves=index.halves, stated_times=stated_times(info),
-        unit_m=LENGTHS.get(info.point_unit or ""), uses=dict(opened.uses) if opened else {},
-    )  # fmt: skip
+        motion_compensated=info.motion_compensated,
+        rings=info.rings or (opened.rings if opened else None),
+        sensor=info.sensor or (opened.sensor if opened else None),
+        revolutions=opened.revolutions if opened else None,
+        notes=voice.notes,
+        problems=voice.problems,
+        halves=index.halves,
+        stated_times=stated_times(info),
+        unit_m=LENGTHS.get(info.point_unit or ""),
+        uses=dict(opened.uses) if opened else {},
+    )
     if opened is not None:
         return sequence
     settle_unit(sequence)

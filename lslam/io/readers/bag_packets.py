@@ -95,9 +95,15 @@ def _gather(bag: Bag, topics: list[BagTopic], positions: tuple[int, ...], voice:
         raise InputError(f"{bag.path}: {topics[0].name} holds no packets that can be read")
     all_sizes = np.concatenate(sizes)
     packets_of_all = BagPackets(
-        bag, tuple(topics), np.concatenate(stamps), all_sizes, np.zeros_like(all_sizes),
-        np.concatenate(places), positions, np.concatenate(heads),
-    )  # fmt: skip
+        bag,
+        tuple(topics),
+        np.concatenate(stamps),
+        all_sizes,
+        np.zeros_like(all_sizes),
+        np.concatenate(places),
+        positions,
+        np.concatenate(heads),
+    )
     return packets_of_all, frame
 
 

@@ -142,13 +142,26 @@ class Folder:
         info, problems = self.info, self.voice.problems
         if "imu" not in parts:
             parts["imu"], parts["gnss"] = load_streams(self.path, info, self.voice)
-        sequence = FolderSequence(**{
-            "name": info.name or printable(self.path.name), "path": self.path, "kind": self.kind, "files": self.files,
-            "motion_compensated": info.motion_compensated, "record": self.record, "rows": info.rows, "cols": info.cols,
-            "per_point": per_point_folder(self.path, info), "rings": info.rings or info.rows, "sensor": info.sensor,
-            "unit_m": LENGTHS.get(info.point_unit or ""), "stated_times": stated_times(info),
-            "notes": self.voice.notes, "problems": problems, **parts,
-        })  # fmt: skip
+        sequence = FolderSequence(
+            **{
+                "name": info.name or printable(self.path.name),
+                "path": self.path,
+                "kind": self.kind,
+                "files": self.files,
+                "motion_compensated": info.motion_compensated,
+                "record": self.record,
+                "rows": info.rows,
+                "cols": info.cols,
+                "per_point": per_point_folder(self.path, info),
+                "rings": info.rings or info.rows,
+                "sensor": info.sensor,
+                "unit_m": LENGTHS.get(info.point_unit or ""),
+                "stated_times": stated_times(info),
+                "notes": self.voice.notes,
+                "problems": problems,
+                **parts,
+            }
+        )
         return settle_unit(sequence)
 
 
@@ -157,9 +170,11 @@ def _read_per_point(
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.uint16] | None]:
     """Times and rings of a scan's points, (count,) each; only those in `names` are read."""
     with (
-        input_errors(f"{path}, named by per_point of sequence.toml,", *DAMAGE), HEADERS, path.open("rb") as stream,
+        input_errors(f"{path}, named by per_point of sequence.toml,", *DAMAGE),
+        HEADERS,
+        path.open("rb") as stream,
         np.load(stream, allow_pickle=False) as file,
-    ):  # fmt: skip
+    ):
         held = {name: np.asarray(file[name], _PER_POINT[name]) for name in names if name in file}
     for name, values in held.items():
         if values.shape != (count,):

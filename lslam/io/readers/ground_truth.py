@@ -25,9 +25,21 @@ from lslam.io.readers.listing import file_numbers, filled_stamps, rows_of
 from lslam.io.remote import RemotePath, as_path
 
 USUAL_NAMES = (
-    "gt.tum", "groundtruth.tum", "ground_truth.tum", "gt_poses.tum", "poses.tum", "gt.csv", "groundtruth.csv",
-    "ground_truth.csv", "pose_inW.csv", "poses.csv", "gt.txt", "groundtruth.txt", "ground_truth.txt", "poses.txt",
-)  # fmt: skip
+    "gt.tum",
+    "groundtruth.tum",
+    "ground_truth.tum",
+    "gt_poses.tum",
+    "poses.tum",
+    "gt.csv",
+    "groundtruth.csv",
+    "ground_truth.csv",
+    "pose_inW.csv",
+    "poses.csv",
+    "gt.txt",
+    "groundtruth.txt",
+    "ground_truth.txt",
+    "poses.txt",
+)
 
 _NUMBER_COLUMNS = ("num", "number", "index", "scan")
 # Above this the reference is worse than LiDAR odometry over the length of a drive.

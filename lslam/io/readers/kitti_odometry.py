@@ -55,13 +55,16 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
     if is_benchmark:
         voice.notes.append("scans are motion compensated, as in the KITTI odometry benchmark")
     return folder.sequence(
-        name=info.name or (f"seq{path.name}" if path.name.isdigit() else printable(path.name)), stamps_ns=stamps,
-        rate_hz=rate, motion_compensated=compensated, calibration=calibration,
+        name=info.name or (f"seq{path.name}" if path.name.isdigit() else printable(path.name)),
+        stamps_ns=stamps,
+        rate_hz=rate,
+        motion_compensated=compensated,
+        calibration=calibration,
         ground_truth=_ground_truth(folder, stamps, calibration),
         correction_deg=vertical_correction(info, folder.files, record, voice.notes),
         sensor=info.sensor or (None if folder.has_toml or record != KITTI else "HDL-64E"),
         clock=folder.clock(stamps, rate) if has_times and not compensated else None,
-    )  # fmt: skip
+    )
 
 
 def _stamps(folder: Folder) -> tuple[Longs, float]:

@@ -46,10 +46,18 @@ _EVEN = 21
 AT_START, AHEAD = 0.0, 0.5
 # Sequence -> drive and its first frame (KITTI odometry development kit).
 DRIVES = {
-    "00": ("2011_10_03", 27, 0), "01": ("2011_10_03", 42, 0), "02": ("2011_10_03", 34, 0), "03": ("2011_09_26", 67, 0),
-    "04": ("2011_09_30", 16, 0), "05": ("2011_09_30", 18, 0), "06": ("2011_09_30", 20, 0), "07": ("2011_09_30", 27, 0),
-    "08": ("2011_09_30", 28, 1100), "09": ("2011_09_30", 33, 0), "10": ("2011_09_30", 34, 0),
-}  # fmt: skip
+    "00": ("2011_10_03", 27, 0),
+    "01": ("2011_10_03", 42, 0),
+    "02": ("2011_10_03", 34, 0),
+    "03": ("2011_09_26", 67, 0),
+    "04": ("2011_09_30", 16, 0),
+    "05": ("2011_09_30", 18, 0),
+    "06": ("2011_09_30", 20, 0),
+    "07": ("2011_09_30", 27, 0),
+    "08": ("2011_09_30", 28, 1100),
+    "09": ("2011_09_30", 33, 0),
+    "10": ("2011_09_30", 34, 0),
+}
 CALIBRATION = "calib_imu_to_velo.txt"
 # The IMU in `base_link` as kitti2bag has it, m: on the ground in the middle of the car, axes alike.
 T_BASE_IMU = se3.make(np.eye(3), np.array([-2.71 / 2 - 0.05, 0.32, 0.93]))
@@ -94,9 +102,10 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
         if passed is not None and passed != wanted:
             stamps = stamps + np.round(1e9 * (wanted - passed) * seconds).astype(np.int64)
             voice.notes.append(
-                "these stamps are of the scanner looking ahead: each scan begins half a sweep earlier" if is_extract else
-                "these stamps are of the beginnings of sweeps: the scanner looks ahead half a sweep later"
-            )  # fmt: skip
+                "these stamps are of the scanner looking ahead: each scan begins half a sweep earlier"
+                if is_extract
+                else "these stamps are of the beginnings of sweeps: the scanner looks ahead half a sweep later"
+            )
     if info.motion_compensated is None:
         voice.notes.append(
             "motion compensated: no (KITTI's raw drives are distorted; motion_compensated = true in sequence.toml "
@@ -107,12 +116,17 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
         of_oxts = oxts_streams(oxts, oxts.stamps_ns)
         imu, gnss = imu or of_oxts[0], gnss or of_oxts[1]
     return folder.sequence(
-        stamps_ns=stamps, rate_hz=rate, motion_compensated=compensated, calibration=calibration,
+        stamps_ns=stamps,
+        rate_hz=rate,
+        motion_compensated=compensated,
+        calibration=calibration,
         ground_truth=_ground_truth(folder, stamps, oxts, calibration),
-        imu=imu, gnss=gnss,
-        correction_deg=vertical_correction(info, folder.files, folder.record, voice.notes), sweep_s=sweep,
+        imu=imu,
+        gnss=gnss,
+        correction_deg=vertical_correction(info, folder.files, folder.record, voice.notes),
+        sweep_s=sweep,
         sensor=info.sensor or (None if folder.has_toml else "HDL-64E"),
-    )  # fmt: skip
+    )
 
 
 def _oxts(folder: Folder) -> Oxts | None:
@@ -295,9 +309,10 @@ def _with_oxts(sequence: Sequence, data_root: Path | None, kind: Companion, what
     known = replace(sequence.calibration, frames={**_frames(T_lidar_imu), **sequence.calibration.frames})
     # The position that OXTS gives is that of the IMU's origin (devkit readme).
     parts: dict[str, Any] = (
-        {"imu": imu, "calibration": replace(known, T_lidar_imu=T_lidar_imu)} if kind is IMU else
-        {"gnss": gnss, "calibration": replace(known, T_lidar_gnss=T_lidar_imu)}
-    )  # fmt: skip
+        {"imu": imu, "calibration": replace(known, T_lidar_imu=T_lidar_imu)}
+        if kind is IMU
+        else {"gnss": gnss, "calibration": replace(known, T_lidar_gnss=T_lidar_imu)}
+    )
     problems = list(dict.fromkeys([*sequence.problems, *oxts.problems]))
     return replace(sequence, notes=[*sequence.notes, f"{kind.name} of {source}"], problems=problems, **parts)
 

@@ -70,13 +70,20 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> PcapSequence:
     opened = _opener(path, datagrams)(path, datagrams, voice)
     revolutions = opened.revolutions
     sequence = PcapSequence(
-        name=info.name or printable(path.stem), path=path, kind=KIND,
-        revolutions=revolutions, stamps_ns=revolutions.stamps_ns,
-        rate_hz=info.rate_hz or opened.rate_hz, rings=info.rings or opened.rings, sensor=info.sensor or opened.sensor,
-        motion_compensated=bool(info.motion_compensated), notes=voice.notes, problems=voice.problems,
+        name=info.name or printable(path.stem),
+        path=path,
+        kind=KIND,
+        revolutions=revolutions,
+        stamps_ns=revolutions.stamps_ns,
+        rate_hz=info.rate_hz or opened.rate_hz,
+        rings=info.rings or opened.rings,
+        sensor=info.sensor or opened.sensor,
+        motion_compensated=bool(info.motion_compensated),
+        notes=voice.notes,
+        problems=voice.problems,
         stated_times=stated_times(info),
         calibration=calibration_over(info, Calibration(T_lidar_imu=opened.T_lidar_imu)),
-    )  # fmt: skip
+    )
     beside, sequence.gnss = load_streams(path.parent, info, voice)
     sequence.imu = opened.imu if beside is None else beside
     if beside is not None and info.T_lidar_imu is None:

@@ -129,11 +129,15 @@ def _agree(
     ns = UNITS[usual]
     farthest = max(max(abs(r.low), abs(r.high)) for r in readings)
     return TimeRule(
-        ns, is_absolute, is_before_stamp=not is_absolute and instant == "scan_end", field=name, points=points,
+        ns,
+        is_absolute,
+        is_before_stamp=not is_absolute and instant == "scan_end",
+        field=name,
+        points=points,
         sentence=f"per-point times from field {name!r} ({readings[0].dtype}), {usual}, {words}{how}",
         sweep=float(np.median([r.high - r.low for r in readings])),
         reach=np.inf if is_absolute else max(_LONGEST * 1e9 / rate_hz / ns, 1.5 * farthest),
-    )  # fmt: skip
+    )
 
 
 def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, reference: str | None) -> _TimeReading:

@@ -60,10 +60,15 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
     if info.rows and info.cols:
         voice.notes.append(f"organised clouds of {info.rows} rows x {info.cols} columns: the row is the ring")
     return folder.sequence(
-        stamps_ns=scans.stamps_ns, rate_hz=scans.rate_hz, calibration=calibration, ground_truth=truth, clock=clock,
-        imu=_with_scans(imu, scans, "IMU", folder), gnss=_with_scans(gnss, scans, "GNSS", folder),
+        stamps_ns=scans.stamps_ns,
+        rate_hz=scans.rate_hz,
+        calibration=calibration,
+        ground_truth=truth,
+        clock=clock,
+        imu=_with_scans(imu, scans, "IMU", folder),
+        gnss=_with_scans(gnss, scans, "GNSS", folder),
         correction_deg=info.vertical_correction_deg or 0.0,
-    )  # fmt: skip
+    )
 
 
 def _scans_in(folder: Path) -> tuple[list[Path], list[str]]:

@@ -191,9 +191,10 @@ def compare_clocks(windows: list[ClockWindow], better: SweepClock | None, worse:
     difference = bad - good
     spread = float(difference.std(ddof=1)) / np.sqrt(len(difference))
     return ClockComparison(
-        float(difference.mean()) / max(spread, 1e-12), float((difference > 0).mean()),
+        float(difference.mean()) / max(spread, 1e-12),
+        float((difference > 0).mean()),
         float(difference.sum()) / max(float(good.sum()), 1e-12),
-    )  # fmt: skip
+    )
 
 
 def mean_score(windows: list[ClockWindow], clock: SweepClock | None) -> float:

@@ -123,9 +123,12 @@ def _best(windows: list[ClockWindow], clocks: list[SweepClock | None]) -> SweepC
 
 
 def _verdict(
-    windows: list[ClockWindow], candidates: list[SweepClock | None], best: SweepClock | None, sample: Scan,
+    windows: list[ClockWindow],
+    candidates: list[SweepClock | None],
+    best: SweepClock | None,
+    sample: Scan,
     is_guess: bool,
-) -> ClockChoice:  # fmt: skip
+) -> ClockChoice:
     scores = {_name(clock): mean_score(windows, clock) for clock in candidates}
     rivals = [clock for clock in candidates if clock is not best and not _is_alike(best, clock, sample)]
     results = {_name(clock): compare_clocks(windows, best, clock) for clock in rivals}
@@ -149,15 +152,19 @@ def _verdict(
         is_clear, margin = False, "a sweep of half the time between scans fits better"
     if not is_clear:
         return ClockChoice(
-            None, "unclear",
+            None,
+            "unclear",
             f"point times: not clear whether {_name(best or candidates[1])} tells them ({margin}): left without, point_times "
-            "states them", scores,
-        )  # fmt: skip
+            "states them",
+            scores,
+        )
     if best is None:
         return ClockChoice(
-            None, "compensated",
-            f"point times: none fits, the scans agree best as they are, as motion compensated ones do ({margin})", scores,
-        )  # fmt: skip
+            None,
+            "compensated",
+            f"point times: none fits, the scans agree best as they are, as motion compensated ones do ({margin})",
+            scores,
+        )
     return ClockChoice(best, "clear", f"point times: by {best}; clear by the agreement of scans ({margin})", scores)
 
 

@@ -184,9 +184,12 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     # The sweep of the first scan is not known before the second without an IMU.
     turns = slice(1 if motion is None else 0, None)
     return FirstPoses(
-        np.array(stamps, np.int64), np.stack(poses), np.array(instants[turns], np.int64),
-        np.array(middles[turns]).reshape(-1, 4, 4), np.stack(covariances)[turns] if len(covariances) == len(poses) else None,
-    )  # fmt: skip
+        np.array(stamps, np.int64),
+        np.stack(poses),
+        np.array(instants[turns], np.int64),
+        np.array(middles[turns]).reshape(-1, 4, 4),
+        np.stack(covariances)[turns] if len(covariances) == len(poses) else None,
+    )
 
 
 def first_imu_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int:

@@ -215,9 +215,12 @@ def _candidates(clock: SweepClock) -> tuple[SweepClock | None, ...]:
 
 
 def _refuting(
-    sequence: Sequence, first: int, clock: SweepClock | None, rivals: tuple[SweepClock | None, ...],
+    sequence: Sequence,
+    first: int,
+    clock: SweepClock | None,
+    rivals: tuple[SweepClock | None, ...],
     preprocess: PreprocessConfig,
-) -> ClockWindow | None:  # fmt: skip
+) -> ClockWindow | None:
     """The scans from `first` on where they agree beyond doubt better under a rival of the clock; else None."""
     window = read_window(sequence, first, preprocess)
     if window is None or not window.is_moving or window.is_astray(None) or window.is_astray(clock):

@@ -142,9 +142,15 @@ class Tracker(Stateful):
             self._last = result
 
     def _fused(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, located: RegistrationResult, prior: MotionPrior,
-        expected: MotionPrior, clock: StageClock,
-    ) -> tuple[RegistrationResult, MotionPrior]:  # fmt: skip
+        self,
+        odometry: Deskewing,
+        scan: Scan,
+        prepared: Any,
+        located: RegistrationResult,
+        prior: MotionPrior,
+        expected: MotionPrior,
+        clock: StageClock,
+    ) -> tuple[RegistrationResult, MotionPrior]:
         """The registration fused with the IMU, or one near the prediction `expected`, and the motion within the sweep."""
         fused = self._checked(odometry, scan.stamp_ns, located, prior, expected, clock)
         if fused.is_accepted or not self.motion.is_inertial or not odometry.is_searching:
@@ -153,9 +159,14 @@ class Tracker(Stateful):
         return near, expected if near.sweep is None else near.sweep
 
     def _checked(
-        self, odometry: Deskewing, stamp_ns: int, located: RegistrationResult, prior: MotionPrior,
-        expected: MotionPrior | None, clock: StageClock,
-    ) -> RegistrationResult:  # fmt: skip
+        self,
+        odometry: Deskewing,
+        stamp_ns: int,
+        located: RegistrationResult,
+        prior: MotionPrior,
+        expected: MotionPrior | None,
+        clock: StageClock,
+    ) -> RegistrationResult:
         """The registration fused with the IMU; rejected where no vehicle gets to its pose from the last one."""
         with clock.stage("imu"):
             fused = _fuse(odometry, self.motion, stamp_ns, located, prior)
@@ -177,9 +188,13 @@ class Tracker(Stateful):
         self.middle = (instant_ns, middle)
 
     def _recorded(
-        self, result: ScanResult, expected: MotionPrior, steady: Floats | None,
-        trial: RegistrationResult | None, clock: StageClock,
-    ) -> ScanResult:  # fmt: skip
+        self,
+        result: ScanResult,
+        expected: MotionPrior,
+        steady: Floats | None,
+        trial: RegistrationResult | None,
+        clock: StageClock,
+    ) -> ScanResult:
         """The result beside its predictions, and beside what registration from constant velocity took.
 
         The map's update is no part of either.
@@ -191,9 +206,10 @@ class Tracker(Stateful):
             if name != "imu" or self.motion.coasting is not None
         }
         imu = ImuDiagnostics(
-            self.motion.imu_state(), self.motion.gravity_at(pose) if is_ok else None,
+            self.motion.imu_state(),
+            self.motion.gravity_at(pose) if is_ok else None,
             None if steady is None else _matrix_norm(steady, pose),
-        )  # fmt: skip
+        )
         stages = {**result.stages, **own}
         if trial is not None and trial.is_accepted and result.status != "bridged":
             work_s = sum(seconds for name, seconds in stages.items() if name not in ("update", "standing"))
@@ -202,9 +218,15 @@ class Tracker(Stateful):
         return replace(result, prior_norm=_matrix_norm(expected.pose, pose), imu=imu, stages=stages)
 
     def _refined(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, prior: MotionPrior, located: RegistrationResult,
-        motion: MotionModel | None = None, clock: StageClock | None = None,
-    ) -> tuple[RegistrationResult, MotionPrior]:  # fmt: skip
+        self,
+        odometry: Deskewing,
+        scan: Scan,
+        prepared: Any,
+        prior: MotionPrior,
+        located: RegistrationResult,
+        motion: MotionModel | None = None,
+        clock: StageClock | None = None,
+    ) -> tuple[RegistrationResult, MotionPrior]:
         """Registered again with the motion within the sweep that follows from the pose; also the motion of the final deskewing.
 
         motion : refines the prior by the registered pose; None: no second registration
@@ -221,9 +243,15 @@ class Tracker(Stateful):
         return _both(located, odometry.register(scan, prepared, better)), better
 
     def _near(
-        self, odometry: Deskewing, scan: Scan, prepared: Any, expected: MotionPrior, located: RegistrationResult,
-        rejected: RegistrationResult, clock: StageClock,
-    ) -> RegistrationResult:  # fmt: skip
+        self,
+        odometry: Deskewing,
+        scan: Scan,
+        prepared: Any,
+        expected: MotionPrior,
+        located: RegistrationResult,
+        rejected: RegistrationResult,
+        clock: StageClock,
+    ) -> RegistrationResult:
         """Register again near the IMU's prediction, after a registration that failed or that the IMU rejected.
 
         With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
@@ -246,9 +274,14 @@ class Tracker(Stateful):
         return _both(located, moved)
 
     def _begin_again(
-        self, odometry: Deskewing, first: Scan, prepared: Any, pose: Floats, second: Scan,
+        self,
+        odometry: Deskewing,
+        first: Scan,
+        prepared: Any,
+        pose: Floats,
+        second: Scan,
         located: RegistrationResult,
-    ) -> MotionPrior:  # fmt: skip
+    ) -> MotionPrior:
         """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
 
         The prior of the second scan, whose registration told the speed.

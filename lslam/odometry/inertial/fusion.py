@@ -43,8 +43,16 @@ class InertialMotion(Stateful):
     # Whether it has states for the device, the rotation of its extrinsics and its clock.
     HAS_DEVICE: ClassVar[bool] = True
     STATE: ClassVar[tuple[str, ...]] = (
-        "estimate", "coasting", "refusal", "gap_scans", "_scans", "_has_gap", "_was_bridged", "_instant_ns", "_pose",
-    )  # fmt: skip
+        "estimate",
+        "coasting",
+        "refusal",
+        "gap_scans",
+        "_scans",
+        "_has_gap",
+        "_was_bridged",
+        "_instant_ns",
+        "_pose",
+    )
     CLEARED: ClassVar[tuple[str, ...]] = ("_taught", "_increments", "_expected")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:

@@ -65,9 +65,14 @@ NOISE_MEMORY_SCANS = 20
 # of two clocks drifts (some ppm), s per sqrt(s).
 MOUNTING_SIGMA, OFFSET_SIGMA, OFFSET_WALK = np.deg2rad(3.0), 0.03, 1e-5
 # (3, 9) rotation vector of what rotation there is in the rows of the axes, to first order: their antisymmetric part.
-MOUNTING = 0.5 * np.array([
-    [0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0],
-], dtype=float)  # fmt: skip
+MOUNTING = 0.5 * np.array(
+    [
+        [0, 0, 0, 0, 0, -1, 0, 1, 0],
+        [0, 0, 1, 0, 0, 0, -1, 0, 0],
+        [0, -1, 0, 1, 0, 0, 0, 0, 0],
+    ],
+    dtype=float,
+)
 
 
 @dataclass(frozen=True)
@@ -169,9 +174,17 @@ class Gyroscope:
         if self.has_offset:
             return self._learnt_with_offset(step, rest, noise)
         x, P, excess = kalman.turned(
-            np.concatenate([self.bias, self.axes.ravel()]), self.covariance, self._variance(step), step.rotations[-1],
-            step.velocity_arms[-1], step.duration, rest, noise, self.noise.gyro_walk, INNOVATION_SIGMAS,
-        )  # fmt: skip
+            np.concatenate([self.bias, self.axes.ravel()]),
+            self.covariance,
+            self._variance(step),
+            step.rotations[-1],
+            step.velocity_arms[-1],
+            step.duration,
+            rest,
+            noise,
+            self.noise.gyro_walk,
+            INNOVATION_SIGMAS,
+        )
         return self._moved(x, P, excess, step)
 
     def with_bias(self, bias: Floats, covariance: Floats) -> Gyroscope:

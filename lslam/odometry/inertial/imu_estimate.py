@@ -98,9 +98,15 @@ class ImuEstimate:
         return self.gyroscope.learnt(step, vector_between(R_imu, R_end), 2 * R_imu.T @ noise @ R_imu)
 
     def corrected(
-        self, imu: ImuStream, step: Increments, R: Floats, R_end: Floats, moved: Floats,
-        gyroscope: Gyroscope, noise: Floats | None = None,
-    ) -> ImuEstimate:  # fmt: skip
+        self,
+        imu: ImuStream,
+        step: Increments,
+        R: Floats,
+        R_end: Floats,
+        moved: Floats,
+        gyroscope: Gyroscope,
+        noise: Floats | None = None,
+    ) -> ImuEstimate:
         """The estimate at the last instant of `step`, updated by the registered motion over it.
 
         step : as this estimate finds it `over` the two instants
@@ -140,6 +146,13 @@ def _propagate(estimate: ImuEstimate, step: Increments, R: Floats) -> tuple[Floa
     if (mounting := estimate.gyroscope.mounting) is not None:
         velocity_arm, position_arm = velocity_arm @ mounting, position_arm @ mounting
     return kalman.propagate(
-        x, estimate.covariance, step.duration, step.velocities[-1], step.positions[-1], velocity_arm, position_arm, R,
+        x,
+        estimate.covariance,
+        step.duration,
+        step.velocities[-1],
+        step.positions[-1],
+        velocity_arm,
+        position_arm,
+        R,
         math.sqrt(estimate.gyroscope.noise.force**2 + step.hidden_density[0]),
-    )  # fmt: skip
+    )

@@ -189,9 +189,13 @@ def _bias_sigma(bias: Floats, device: Gyroscope) -> float:
 
 
 def _first_guess(
-    imu: ImuStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, config: ImuConfig,
+    imu: ImuStream,
+    T_lidar_imu: Floats,
+    stamps_ns: Longs,
+    poses: Floats,
+    config: ImuConfig,
     mean_bias: Floats | None,
-) -> tuple[ImuEstimate, bool]:  # fmt: skip
+) -> tuple[ImuEstimate, bool]:
     """Biases as given, or of a standing sensor, or by the mean turn; gravity as the scans' path and the forces need it."""
     stands, rates = _is_stationary(imu, stamps_ns, poses)
     gyro_bias, gyro_sigma = (np.zeros(3), ANY_GYRO_BIAS) if mean_bias is None else (mean_bias, MEAN_GYRO_BIAS)

@@ -77,9 +77,14 @@ class Increments:
 
 
 def integrate(
-    imu: ImuStream, instants_ns: Longs, gyro_bias: Floats, accel_bias: Floats,
-    gyro_axes: Floats | None = None, mounting: Floats | None = None, offset_ns: int = 0,
-) -> Increments:  # fmt: skip
+    imu: ImuStream,
+    instants_ns: Longs,
+    gyro_bias: Floats,
+    accel_bias: Floats,
+    gyro_axes: Floats | None = None,
+    mounting: Floats | None = None,
+    offset_ns: int = 0,
+) -> Increments:
     """Integrate the stream over increasing `instants_ns` (K,), K >= 1, with the biases (3,) taken off.
 
     gyro_axes : (3, 3) that makes true rates of the gyroscope's readings less their bias; None takes them as they are

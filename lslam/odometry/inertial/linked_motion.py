@@ -126,9 +126,18 @@ def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
     if step.hidden is not None:
         C += cut_noise(step.hidden, transition(step, R, R @ step.rotations[-1], e.gyroscope))
     return PreintegratedStep(
-        t, step.rotations[-1], step.velocities[-1], step.positions[-1], step.velocity_arms[-1], step.position_arms[-1],
-        e.gyroscope.columns(step), e.accel_bias, e.gyroscope.bias, e.gyroscope.axes, C[np.ix_(OWN, OWN)],
-    )  # fmt: skip
+        t,
+        step.rotations[-1],
+        step.velocities[-1],
+        step.positions[-1],
+        step.velocity_arms[-1],
+        step.position_arms[-1],
+        e.gyroscope.columns(step),
+        e.accel_bias,
+        e.gyroscope.bias,
+        e.gyroscope.axes,
+        C[np.ix_(OWN, OWN)],
+    )
 
 
 def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep:
@@ -139,6 +148,15 @@ def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep
     C[:6, :6] = PRIOR_COVARIANCE
     none = np.zeros((3, 3))
     return PreintegratedStep(
-        0.0, moved[:3, :3], np.zeros(3), moved[:3, 3], none, none, np.zeros((3, 12)), e.accel_bias, e.gyroscope.bias,
-        e.gyroscope.axes, C,
-    )  # fmt: skip
+        0.0,
+        moved[:3, :3],
+        np.zeros(3),
+        moved[:3, 3],
+        none,
+        none,
+        np.zeros((3, 12)),
+        e.accel_bias,
+        e.gyroscope.bias,
+        e.gyroscope.axes,
+        C,
+    )

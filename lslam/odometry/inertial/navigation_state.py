@@ -127,9 +127,9 @@ class NavigationState:
         """After the pose was found to be another (4, 4), with its `covariance` (6, 6), by what knows nothing of the rest."""
         P = self.covariance
         gain = np.linalg.solve(P[POSE, POSE], P[POSE]).T
-        d = np.concatenate([
-            T_world_imu[:3, 3] - self.T_world_imu[:3, 3], so3.log(T_world_imu[:3, :3] @ self.T_world_imu[:3, :3].T)
-        ])  # fmt: skip
+        d = np.concatenate(
+            [T_world_imu[:3, 3] - self.T_world_imu[:3, 3], so3.log(T_world_imu[:3, :3] @ self.T_world_imu[:3, :3].T)]
+        )
         P = P - gain @ (P[POSE, POSE] - covariance) @ gain.T
         state = self._shifted(gain @ d, 0.5 * (P + P.T))._with_gravity()
         return replace(state, T_world_imu=T_world_imu)._shared()
@@ -138,13 +138,18 @@ class NavigationState:
         """All states but the pose, moved by the error x (N,), with the covariance P."""
         e, gyro = self.estimate, x[DEVICE]
         gyroscope = replace(
-            e.gyroscope, bias=e.gyroscope.bias + gyro[:3], axes=e.gyroscope.axes + gyro[3:12].reshape(3, 3),
+            e.gyroscope,
+            bias=e.gyroscope.bias + gyro[:3],
+            axes=e.gyroscope.axes + gyro[3:12].reshape(3, 3),
             offset_s=e.gyroscope.offset_s + (float(gyro[12]) if e.gyroscope.has_offset else 0.0),
-        )  # fmt: skip
+        )
         e = replace(
-            e, velocity=e.velocity + x[SPEED], gravity=e.gravity + x[DOWN], accel_bias=e.accel_bias + x[FORCE],
+            e,
+            velocity=e.velocity + x[SPEED],
+            gravity=e.gravity + x[DOWN],
+            accel_bias=e.accel_bias + x[FORCE],
             gyroscope=gyroscope,
-        )  # fmt: skip
+        )
         return replace(self, estimate=e, covariance=P)
 
     def _with_gravity(self) -> NavigationState:

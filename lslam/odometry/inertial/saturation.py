@@ -38,8 +38,9 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9 if len(imu) else np.zeros(0)
     parts, hidden, words = [], [], []  # readings, sigmas, words
     for values, least, unit, name in (
-        (imu.accel, LEAST_FORCE, "m/s2", "accelerometer"), (imu.gyro, LEAST_RATE, "rad/s", "gyroscope")
-    ):  # fmt: skip
+        (imu.accel, LEAST_FORCE, "m/s2", "accelerometer"),
+        (imu.gyro, LEAST_RATE, "rad/s", "gyroscope"),
+    ):
         cut = _cuts(values, least)
         filled = np.stack([_excess(seconds, values[:, k], cut[:, k]) for k in range(3)], axis=-1)
         parts.append(values + np.sign(values) * filled[0])

@@ -184,9 +184,14 @@ class SmootherMotion(InertialMotion):
 
         gyroscope = self.estimate.gyroscope
         return InertialStep(
-            np.diff(at), means(self.imu.accel), (means(self.imu.gyro) - self._usual_bias) @ gyroscope.axes.T,
-            gyroscope.turn_covariance(step) / step.duration, T_world_imu, C, step.hidden_density[0],
-        )  # fmt: skip
+            np.diff(at),
+            means(self.imu.accel),
+            (means(self.imu.gyro) - self._usual_bias) @ gyroscope.axes.T,
+            gyroscope.turn_covariance(step) / step.duration,
+            T_world_imu,
+            C,
+            step.hidden_density[0],
+        )
 
     def _beginning(self) -> InertialState:
         e = self.estimate

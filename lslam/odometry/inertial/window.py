@@ -64,16 +64,23 @@ class Moment:
         """After an error d (15,)."""
         T = se3.make(so3.exp(d[3:6]) @ self.T_world_imu[:3, :3], self.T_world_imu[:3, 3] + d[:3])
         return replace(
-            self, T_world_imu=T, velocity=self.velocity + d[6:9], accel_bias=self.accel_bias + d[9:12],
+            self,
+            T_world_imu=T,
+            velocity=self.velocity + d[6:9],
+            accel_bias=self.accel_bias + d[9:12],
             gyro_bias=self.gyro_bias + d[12:15],
-        )  # fmt: skip
+        )
 
     def away(self, other: Moment) -> Floats:
         """(15,) error by which this is away from another."""
-        return np.concatenate([
-            off_by(other.T_world_imu, self.T_world_imu), self.velocity - other.velocity,
-            self.accel_bias - other.accel_bias, self.gyro_bias - other.gyro_bias,
-        ])  # fmt: skip
+        return np.concatenate(
+            [
+                off_by(other.T_world_imu, self.T_world_imu),
+                self.velocity - other.velocity,
+                self.accel_bias - other.accel_bias,
+                self.gyro_bias - other.gyro_bias,
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -144,9 +151,11 @@ class Window:
         """After an error d (12 + 15 W,)."""
         each = d[SHARED:].reshape(-1, EACH)
         return replace(
-            self, gravity=self.gravity + d[DOWN], axes=self.axes + d[AXES].reshape(3, 3),
+            self,
+            gravity=self.gravity + d[DOWN],
+            axes=self.axes + d[AXES].reshape(3, 3),
             moments=tuple(m.moved(one) for m, one in zip(self.moments, each, strict=True)),
-        )  # fmt: skip
+        )
 
     def equations(self, imu: ImuStream) -> tuple[Floats, Floats]:
         """Normal equations H, g of past, scans, increments and the length of gravity."""
@@ -165,9 +174,9 @@ class Window:
 
     def _add_past(self, H: Floats, g: Floats) -> None:
         past = self.past
-        x = np.concatenate([
-            self.gravity - past.gravity, (self.axes - past.axes).ravel(), self.moments[0].away(past.moment)
-        ])  # fmt: skip
+        x = np.concatenate(
+            [self.gravity - past.gravity, (self.axes - past.axes).ravel(), self.moments[0].away(past.moment)]
+        )
         H[: len(x), : len(x)] += past.information
         g[: len(x)] += past.gradient + past.information @ x
 
@@ -206,9 +215,7 @@ class Window:
         step = integrate(imu, np.array([a.instant_ns, b.instant_ns]), a.gyro_bias, a.accel_bias, self.axes)
         R = a.T_world_imu[:3, :3]
         R_end, velocities, moved = step.motion(0, R, a.velocity, self.gravity)
-        led = replace(
-            a, T_world_imu=se3.make(R_end[-1], a.T_world_imu[:3, 3] + moved[-1]), velocity=velocities[-1]
-        )  # fmt: skip
+        led = replace(a, T_world_imu=se3.make(R_end[-1], a.T_world_imu[:3, 3] + moved[-1]), velocity=velocities[-1])
         F = transition(step, R, R_end[-1], Gyroscope(a.gyro_bias, self.axes))
         nanoseconds = b.instant_ns - a.instant_ns
         W = certainty(nanoseconds, self.rate_variance, self.noise)
@@ -260,9 +267,7 @@ def certainty(nanoseconds: int, rate_variance: float, noise: ImuNoise) -> Floats
 def moment_of(state: NavigationState, instant_ns: int, stamp_ns: int, T_imu_scan: Floats) -> Moment:
     """A moment where the state is."""
     e = state.estimate
-    return Moment(
-        instant_ns, stamp_ns, state.T_world_imu, e.velocity, e.accel_bias, e.gyroscope.bias, T_imu_scan
-    )  # fmt: skip
+    return Moment(instant_ns, stamp_ns, state.T_world_imu, e.velocity, e.accel_bias, e.gyroscope.bias, T_imu_scan)
 
 
 def off_by(a: Floats, b: Floats) -> Floats:

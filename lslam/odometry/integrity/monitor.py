@@ -173,9 +173,19 @@ class IntegrityMonitor(Stateful):
         is_as_claimed = is_still(se3.relative(claimed, near_claim.motion))
         as_claimed = near_claim if is_as_claimed else pair.at(claimed)
         check = MotionCheck(
-            first.position, last.position, seconds, claimed, best.motion, best.sigma, best.agreement,
-            as_claimed.agreement, usual, self._is_broken, None if rival is None else rival.motion, emptied_share,
-        )  # fmt: skip
+            first.position,
+            last.position,
+            seconds,
+            claimed,
+            best.motion,
+            best.sigma,
+            best.agreement,
+            as_claimed.agreement,
+            usual,
+            self._is_broken,
+            None if rival is None else rival.motion,
+            emptied_share,
+        )
         self.checks.append(check)
         if check.is_conclusive and seconds > 0:
             self._motion = best.motion, seconds

@@ -81,11 +81,16 @@ class PairRegistration:
         # One scan has no fine planes.
         self._planes = tuple(
             GaussianMap(
-                LARGEST_M * wider, min_points=SETTINGS.min_points, planarity=SETTINGS.planarity,
-                count_cap=SETTINGS.count_cap, reach=1e4, capacity=1 << 13, breadth=LEAST_BREADTH,
+                LARGEST_M * wider,
+                min_points=SETTINGS.min_points,
+                planarity=SETTINGS.planarity,
+                count_cap=SETTINGS.count_cap,
+                reach=1e4,
+                capacity=1 << 13,
+                breadth=LEAST_BREADTH,
             )
             for wider in (1, *WIDE_FACTORS)
-        )  # fmt: skip
+        )
         self._edge = LARGEST_M
         self._terms: list[Term] = []
         self._matches = Correspondences(0)

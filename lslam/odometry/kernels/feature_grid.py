@@ -73,8 +73,21 @@ def _gap(low: float, size: float, v: float) -> float:
 
 
 @inline
-def nearest(x: float, y: float, z: float, size: float, limit: float, ring: int | np.int64, nearby: int, skipped: int,
-            points: Floats, rings: Rings, starts: Ints, keys: Longs, table: Ints) -> tuple[int, float]:  # fmt: skip
+def nearest(
+    x: float,
+    y: float,
+    z: float,
+    size: float,
+    limit: float,
+    ring: int | np.int64,
+    nearby: int,
+    skipped: int,
+    points: Floats,
+    rings: Rings,
+    starts: Ints,
+    keys: Longs,
+    table: Ints,
+) -> tuple[int, float]:
     """Index of the point of the grid that is nearest to x, y, z and less than `limit`, m, away, and its squared distance, m2.
 
     The index is -1 when there is none.

@@ -41,8 +41,19 @@ SHORTEST_M = 1e-3  # m, of a line or a side of a triangle
 
 
 @inline
-def _add_point(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: float, rx: float, ry: float, rz: float,
-               variance: float, c2: float) -> None:  # fmt: skip
+def _add_point(
+    H: Floats,
+    g: Floats,
+    facts: Floats,
+    ex: float,
+    ey: float,
+    ez: float,
+    rx: float,
+    ry: float,
+    rz: float,
+    variance: float,
+    c2: float,
+) -> None:
     """Point to point: all three components of e."""
     d2 = ex * ex + ey * ey + ez * ez
     robust = c2 / (c2 + d2)
@@ -58,8 +69,20 @@ def _add_point(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: fl
 
 
 @inline
-def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: float, nz: float, rx: float, ry: float,
-               rz: float, variance: float, c2: float) -> float:  # fmt: skip
+def _add_plane(
+    H: Floats,
+    g: Floats,
+    facts: Floats,
+    e: float,
+    nx: float,
+    ny: float,
+    nz: float,
+    rx: float,
+    ry: float,
+    rz: float,
+    variance: float,
+    c2: float,
+) -> float:
     """Point to plane: e along the unit normal n; returns its weight."""
     robust = c2 / (c2 + e * e)
     robust *= robust
@@ -73,8 +96,9 @@ def _add_plane(H: Floats, g: Floats, facts: Floats, e: float, nx: float, ny: flo
 
 
 @kernel
-def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: tuple[()], pose: Pose, width: Width,
-                    sums: Sums) -> None:  # fmt: skip
+def linearise_edges(
+    points: tuple[Floats], grid: Grid, settings: Reach, search: tuple[()], pose: Pose, width: Width, sums: Sums
+) -> None:
     """Add all edges (S, 3), LiDAR frame, to H, S, g and facts, see `linearisation`. Both H and S take all of them."""
     (source,) = points
     edges, rings, starts, keys, table = grid
@@ -114,8 +138,9 @@ def linearise_edges(points: tuple[Floats], grid: Grid, settings: Reach, search: 
 
 
 @kernel
-def add_normals(points: Floats, size: float, thick: float, waver: float, rows: Floats, keys: Longs, table: Ints,
-                normals: Floats) -> None:  # fmt: skip
+def add_normals(
+    points: Floats, size: float, thick: float, waver: float, rows: Floats, keys: Longs, table: Ints, normals: Floats
+) -> None:
     """Fill in `normals` (N, 3), where they are zero, from the plane voxels of `size`, m, in which points (N, 3) lie.
 
     thick : m2, variance along the normal above which a voxel holds more than one surface
@@ -132,8 +157,9 @@ def add_normals(points: Floats, size: float, thick: float, waver: float, rows: F
 
 
 @kernel
-def linearise_planes(points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: tuple[()], pose: Pose,
-                     width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise_planes(
+    points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: tuple[()], pose: Pose, width: Width, sums: Sums
+) -> None:
     """As `linearise_edges`, for planar points (S, 3). S takes the planes alone whose normal is known well.
 
     normals : (N, 3) of the surface around each point of the grid, zero where it is not known. The normal of three points

@@ -123,9 +123,16 @@ def update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats, outlier
 
 @kernel
 def propagate(
-    x: Floats, covariance: Floats, t: float, gained: Floats, moved: Floats, velocity_arm: Floats, position_arm: Floats,
-    R: Floats, force_noise: float,
-) -> tuple[Floats, Floats]:  # fmt: skip
+    x: Floats,
+    covariance: Floats,
+    t: float,
+    gained: Floats,
+    moved: Floats,
+    velocity_arm: Floats,
+    position_arm: Floats,
+    R: Floats,
+    force_noise: float,
+) -> tuple[Floats, Floats]:
     """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias after `t` seconds.
 
     x (9,), covariance (9, 9) : velocity, m/s, gravity and accelerometer bias, m/s2, at the beginning
@@ -229,9 +236,17 @@ def turn_covariance(
 
 @kernel
 def turned(
-    x: Floats, covariance: Floats, rate_variance: float, rotation: Floats, velocity_arm: Floats, seconds: float,
-    rest: Floats, noise: Floats, bias_walk: float, outlier: float,
-) -> tuple[Floats, Floats, float]:  # fmt: skip
+    x: Floats,
+    covariance: Floats,
+    rate_variance: float,
+    rotation: Floats,
+    velocity_arm: Floats,
+    seconds: float,
+    rest: Floats,
+    noise: Floats,
+    bias_walk: float,
+    outlier: float,
+) -> tuple[Floats, Floats, float]:
     """Bias and rows of the axes, x (12,), and their covariance (12, 12), updated by a rotation larger by `rest` (3,), rad.
 
     noise : (3, 3) covariance of the measured rotation, rad2; bias_walk : rad/s per sqrt(s); the others as in `turn_covariance`

@@ -32,8 +32,17 @@ ELONGATION = 3.0
 
 
 @inline
-def line_of(slot: int, size: float, min_points: float, floor: float, moments: Floats, keys: Longs, lines: Floats,
-            line_keys: Longs, line_sums: Floats) -> None:  # fmt: skip
+def line_of(
+    slot: int,
+    size: float,
+    min_points: float,
+    floor: float,
+    moments: Floats,
+    keys: Longs,
+    lines: Floats,
+    line_keys: Longs,
+    line_sums: Floats,
+) -> None:
     """Bring the row of one slot up to date with the moments of its voxel."""
     s = moments[slot]
     key = keys[slot]
@@ -50,9 +59,13 @@ def line_of(slot: int, size: float, min_points: float, floor: float, moments: Fl
     mx, my, mz = s[1] * w, s[2] * w, s[3] * w
     # The smallest eigenvector of -C is the largest of C.
     l2, l1, l0, ux, uy, uz = plane_of(
-        mx * mx - s[4] * w, mx * my - s[5] * w, mx * mz - s[6] * w,
-        my * my - s[7] * w, my * mz - s[8] * w, mz * mz - s[9] * w,
-    )  # fmt: skip
+        mx * mx - s[4] * w,
+        mx * my - s[5] * w,
+        mx * mz - s[6] * w,
+        my * my - s[7] * w,
+        my * mz - s[8] * w,
+        mz * mz - s[9] * w,
+    )
     l2, l1, l0 = -l2, -l1, -l0
     if l2 < ELONGATION * max(l1, floor):
         return
@@ -65,8 +78,22 @@ def line_of(slot: int, size: float, min_points: float, floor: float, moments: Fl
 
 
 @inline
-def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: float, ux: float, uy: float, uz: float,
-             rx: float, ry: float, rz: float, variance: float, c2: float) -> None:  # fmt: skip
+def add_line(
+    H: Floats,
+    g: Floats,
+    facts: Floats,
+    ex: float,
+    ey: float,
+    ez: float,
+    ux: float,
+    uy: float,
+    uz: float,
+    rx: float,
+    ry: float,
+    rz: float,
+    variance: float,
+    c2: float,
+) -> None:
     """Point to line, equation 2.24 of Girolimetto, squared: (I - u u^T) e has two components across the unit direction u.
 
     `e` goes from a point of the line to the transformed point, `r` is that point seen from the sensor, world axes.
@@ -98,8 +125,15 @@ def add_line(H: Floats, g: Floats, facts: Floats, ex: float, ey: float, ez: floa
 
 
 @kernel
-def linearise_lines(points: tuple[Floats], voxels: LineVoxels, settings: tuple[float, float, float, float],
-                    search: tuple[Longs, Ints, Floats], pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise_lines(
+    points: tuple[Floats],
+    voxels: LineVoxels,
+    settings: tuple[float, float, float, float],
+    search: tuple[Longs, Ints, Floats],
+    pose: Pose,
+    width: Width,
+    sums: Sums,
+) -> None:
     """Add all edge points (S, 3), LiDAR frame, to H, g and facts, see `linearisation`.
 
     Each takes the line voxel, of the eight around it, whose line passes nearest: residual across the line, variance =

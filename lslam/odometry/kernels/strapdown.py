@@ -13,9 +13,15 @@ Floats = NDArray[np.float64]
 
 @kernel
 def integrate(
-    stamps_ns: NDArray[np.int64], gyro: Floats, accel: Floats, s: int, instants_ns: NDArray[np.int64],
-    gyro_bias: Floats, accel_bias: Floats, gyro_axes: Floats,
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:  # fmt: skip
+    stamps_ns: NDArray[np.int64],
+    gyro: Floats,
+    accel: Floats,
+    s: int,
+    instants_ns: NDArray[np.int64],
+    gyro_bias: Floats,
+    accel_bias: Floats,
+    gyro_axes: Floats,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Rotations, velocities, positions, velocity arms and position arms at `instants_ns` (K,), as in `Increments`.
 
     stamps_ns (N,), gyro (N, 3), rad/s, accel (N, 3), m/s2, N >= 1 : the samples; s : index of the first one after instant 0
@@ -83,9 +89,16 @@ def _readings(
 
 @kernel
 def poses(
-    rotations: Floats, velocities: Floats, positions: Floats, seconds: Floats, anchor: int,
-    T_world_imu: Floats, velocity: Floats, gravity: Floats, T_imu_lidar: Floats,
-) -> Floats:  # fmt: skip
+    rotations: Floats,
+    velocities: Floats,
+    positions: Floats,
+    seconds: Floats,
+    anchor: int,
+    T_world_imu: Floats,
+    velocity: Floats,
+    gravity: Floats,
+    T_imu_lidar: Floats,
+) -> Floats:
     """(K, 4, 4) T_world_lidar of an IMU whose pose T_world_imu (4, 4) and velocity (3,) are those at instant `anchor`.
 
     rotations (K, 3, 3), velocities, positions (K, 3), seconds (K,) : as in `Increments`; gravity : (3,) m/s2, downwards
@@ -107,10 +120,15 @@ def poses(
         for i in range(3):
             out[k, i, 3] = (
                 T_world_imu[i, 3]
-                + tau * velocity[i] + 0.5 * tau * tau * gravity[i]
-                + R_first[i, 0] * moved[0] + R_first[i, 1] * moved[1] + R_first[i, 2] * moved[2]
-                + R_imu[i, 0] * T_imu_lidar[0, 3] + R_imu[i, 1] * T_imu_lidar[1, 3] + R_imu[i, 2] * T_imu_lidar[2, 3]
-            )  # fmt: skip
+                + tau * velocity[i]
+                + 0.5 * tau * tau * gravity[i]
+                + R_first[i, 0] * moved[0]
+                + R_first[i, 1] * moved[1]
+                + R_first[i, 2] * moved[2]
+                + R_imu[i, 0] * T_imu_lidar[0, 3]
+                + R_imu[i, 1] * T_imu_lidar[1, 3]
+                + R_imu[i, 2] * T_imu_lidar[2, 3]
+            )
         straighten(R)
         for i in range(3):
             for j in range(3):

@@ -215,9 +215,17 @@ def fit(
 
 @kernel
 def refine(
-    source: Floats, target: Floats, pose: Floats, prior: Floats, trust: Floats, gates: Floats, more: int, likeness: float,
-    short: float, by_coverage: bool,
-) -> tuple[Floats, Floats, Floats, float, Longs]:  # fmt: skip
+    source: Floats,
+    target: Floats,
+    pose: Floats,
+    prior: Floats,
+    trust: Floats,
+    gates: Floats,
+    more: int,
+    likeness: float,
+    short: float,
+    by_coverage: bool,
+) -> tuple[Floats, Floats, Floats, float, Longs]:
     """Gauss-Newton from `pose` on the distances of walls from their partners' lines; new pairs for each of the `gates`, m.
 
     The last gate is repeated until the pose converges, `more` times at most: walls with half weight converge slowly.

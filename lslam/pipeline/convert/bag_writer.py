@@ -97,7 +97,14 @@ def _latched(kind: str) -> dict[str, Any]:
 
     never = QosTime(2147483647, 4294967295)
     quality = Qos(
-        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
-        QosLiveliness.AUTOMATIC, never, False,
-    )  # fmt: skip
+        QosHistory.KEEP_LAST,
+        1,
+        QosReliability.RELIABLE,
+        QosDurability.TRANSIENT_LOCAL,
+        never,
+        never,
+        QosLiveliness.AUTOMATIC,
+        never,
+        False,
+    )
     return {"offered_qos_profiles": [quality]}

@@ -124,9 +124,17 @@ def write_kml(path: Path, places: Sequence[Place], times: Sequence[datetime] | N
     coordinates = [(lon, lat, height) for lat, lon, height in places]
     # KML asks for two points of a line.
     line = geometry.LineString(coordinates if len(coordinates) > 1 else coordinates * 2)
-    marks = [Placemark(name=name, description=about, kml_geometry=LineString(
-        geometry=line, tessellate=True, altitude_mode=AltitudeMode.clamp_to_ground,
-    ))]  # fmt: skip
+    marks = [
+        Placemark(
+            name=name,
+            description=about,
+            kml_geometry=LineString(
+                geometry=line,
+                tessellate=True,
+                altitude_mode=AltitudeMode.clamp_to_ground,
+            ),
+        )
+    ]
     if times is not None:
         track = gx.Track(
             altitude_mode=AltitudeMode.clamp_to_ground, whens=[KmlDateTime(t) for t in times], coords=coordinates

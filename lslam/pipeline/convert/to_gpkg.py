@@ -77,10 +77,15 @@ def _write_layer(package: Any, layer: GeoLayer) -> None:
     }
     shape, make = kinds[layer.shape]
     made = package.create_feature_class(
-        layer.name, package.spatial_references[_WGS84], shape, z_enabled=layer.shape != "polygons",
+        layer.name,
+        package.spatial_references[_WGS84],
+        shape,
+        z_enabled=layer.shape != "polygons",
         fields=[Field(name, _type_of(values)) for name, values in layer.columns.items()],
-        description=layer.about, spatial_index=False, geom_name="geom",
-    )  # fmt: skip
+        description=layer.about,
+        spatial_index=False,
+        geom_name="geom",
+    )
     rows = zip(map(make, layer.features), *(map(_plain, values) for values in layer.columns.values()), strict=True)
     names = ", ".join(f'"{name}"' for name in ("geom", *layer.columns))
     marks = ", ".join("?" * (1 + len(layer.columns)))

@@ -48,10 +48,11 @@ def examine_jumps(truth: Trajectory | None) -> list[Finding]:
         what += f", as if {plural(missing, 'pose')} were missing"
     return [
         Finding(
-            "truth-jumps", what,
+            "truth-jumps",
+            what,
             "rows that go with scans by index belong to other scans behind a missing one; give a row for every scan, or stamps",
         )
-    ]  # fmt: skip
+    ]
 
 
 def examine_gaps(sequence: Sequence) -> list[Finding]:

@@ -27,9 +27,12 @@ _SWEEP = 4.0
 
 
 def examine_units(
-    sequence: Sequence, truth: Trajectory | None = None, with_imu: bool = True, with_gnss: bool = True,
+    sequence: Sequence,
+    truth: Trajectory | None = None,
+    with_imu: bool = True,
+    with_gnss: bool = True,
     sweep: Span | None = None,
-) -> list[Finding]:  # fmt: skip
+) -> list[Finding]:
     """Findings about stamps of the scans, IMU, fixes and `truth`, and about per-point times, which span `sweep`."""
     stamps = sequence.stamps_ns
     if len(stamps) < 2:
@@ -48,8 +51,10 @@ def examine_units(
     if poses is not None and np.isin(poses, stamps).all():
         poses = None  # theirs are those of the scans
     for code, who, other, usual in (
-        ("imu-unit", "IMU", imu, _IMU), ("gnss-unit", "GNSS", fixes, _FIXES), ("truth-unit", "ground truth", poses, _TRUTH)
-    ):  # fmt: skip
+        ("imu-unit", "IMU", imu, _IMU),
+        ("gnss-unit", "GNSS", fixes, _FIXES),
+        ("truth-unit", "ground truth", poses, _TRUTH),
+    ):
         factor = 0.0 if other is None else _factor_beside(other, span, usual)
         if factor and other is not None:
             rate = f"{factor / _step(other):.4g} Hz"

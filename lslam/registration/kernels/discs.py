@@ -24,15 +24,19 @@ def disc(
     """Covariance xx, xy, xz, yy, yz, zz, m2, of a disc with unit normal n: variance `thin` along it, `extent2` across."""
     a = extent2 - thin
     return (
-        extent2 - a * nx * nx, -a * nx * ny, -a * nx * nz,
-        extent2 - a * ny * ny, -a * ny * nz,
+        extent2 - a * nx * nx,
+        -a * nx * ny,
+        -a * nx * nz,
+        extent2 - a * ny * ny,
+        -a * ny * nz,
         extent2 - a * nz * nz,
-    )  # fmt: skip
+    )
 
 
 @kernel
-def source_discs(source: Floats, size: float, planes: Floats, keys: Longs, table: Ints, thin: float,
-                 out: Floats) -> int:  # fmt: skip
+def source_discs(
+    source: Floats, size: float, planes: Floats, keys: Longs, table: Ints, thin: float, out: Floats
+) -> int:
     """Write the discs, covariances (S, 6), m2, of the source points in plane voxels of their own scan to `out`.
 
     Returns the number of such points. Rows of the other points are not changed.

@@ -26,9 +26,16 @@ Floats = NDArray[np.float64]
 
 
 @inline
-def certainty_of_pair(p: Floats, is_plane: bool, ex: float, ey: float, ez: float,
-                      spread: tuple[float, float, float, float, float, float], sigma2: float,
-                      extent2: float) -> tuple[float, float, float, float, float, float, float]:  # fmt: skip
+def certainty_of_pair(
+    p: Floats,
+    is_plane: bool,
+    ex: float,
+    ey: float,
+    ez: float,
+    spread: tuple[float, float, float, float, float, float],
+    sigma2: float,
+    extent2: float,
+) -> tuple[float, float, float, float, float, float, float]:
     """Inverse xx..zz of the sum of both covariances, and the squared Mahalanobis distance, m2, scaled by `thin`.
 
     p : (8,) row of `planes`; e : from its mean to the point, m; spread : m2, of the point, world axes
@@ -50,8 +57,15 @@ def certainty_of_pair(p: Floats, is_plane: bool, ex: float, ey: float, ez: float
 
 
 @kernel
-def linearise_gicp(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
-                   width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise_gicp(
+    points: tuple[Floats, Floats],
+    voxels: Voxels,
+    settings: Settings,
+    search: Search,
+    pose: Pose,
+    width: Width,
+    sums: Sums,
+) -> None:
     """Add all source points (S, 3) with covariance (S, 6), LiDAR frame, not matched yet, to the sums, see `linearisation`.
 
     e = R s + t - mean of the nearest plane voxel of eight, and M = inv(C_t + R C_s R^T) with the voxel's disc C_t. The disc's

@@ -38,8 +38,16 @@ def mixture(size: float) -> tuple[float, float]:
 
 
 @kernel
-def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, used: int, floor: float,
-             extent2: float, shapes: Floats) -> None:  # fmt: skip
+def describe(
+    moments: Floats,
+    planes: Floats,
+    keys: Longs,
+    refreshed: Floats,
+    used: int,
+    floor: float,
+    extent2: float,
+    shapes: Floats,
+) -> None:
     """Bring shapes (C, 14) up to date: mean, inverse covariance xx..zz, smallest eigenvalue, count when it was computed,
     unit vector of the smallest eigenvalue.
 
@@ -67,16 +75,21 @@ def describe(moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, us
         if p[7] >= 0.0:
             xx, xy, xz, yy, yz, zz = disc(nx, ny, nz, l0, extent2)
         q[3], q[4], q[5], q[6], q[7], q[8] = invert_symmetric(
-            xx + lift * nx * nx, xy + lift * nx * ny, xz + lift * nx * nz,
-            yy + lift * ny * ny, yz + lift * ny * nz, zz + lift * nz * nz,
-        )  # fmt: skip
+            xx + lift * nx * nx,
+            xy + lift * nx * ny,
+            xz + lift * nx * nz,
+            yy + lift * ny * ny,
+            yz + lift * ny * nz,
+            zz + lift * nz * nz,
+        )
         q[9] = l0 + lift
         q[11], q[12], q[13] = nx, ny, nz
 
 
 @kernel
-def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose, width: Width,
-                  sums: Sums) -> None:  # fmt: skip
+def linearise_ndt(
+    points: tuple[Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose, width: Width, sums: Sums
+) -> None:
     """Add all source points (S, 3), LiDAR frame, not matched yet, to the sums, see `linearisation`.
 
     The cost is the negative score: -d1 u exp(-d2 / (2 u) e^T C^-1 e) over the eight voxels around R s + t, where u =
@@ -114,9 +127,11 @@ def linearise_ndt(points: tuple[Floats], voxels: Voxels, settings: Settings, sea
                 continue
             ex, ey, ez = x - q[0], y - q[1], z - q[2]
             m2 = (
-                q[3] * ex * ex + q[6] * ey * ey + q[8] * ez * ez
+                q[3] * ex * ex
+                + q[6] * ey * ey
+                + q[8] * ez * ez
                 + 2.0 * (q[4] * ex * ey + q[5] * ex * ez + q[7] * ey * ez)
-            )  # fmt: skip
+            )
             away = q[9] * m2
             weight = math.exp(-0.5 * d2 * m2 / widening)
             if away < best:

@@ -15,8 +15,15 @@ Floats = NDArray[np.float64]
 
 
 @kernel
-def linearise_point(points: tuple[Floats, Floats], voxels: Voxels, settings: Settings, search: Search, pose: Pose,
-                    width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise_point(
+    points: tuple[Floats, Floats],
+    voxels: Voxels,
+    settings: Settings,
+    search: Search,
+    pose: Pose,
+    width: Width,
+    sums: Sums,
+) -> None:
     """Add all source points (S, 3), LiDAR frame, not matched yet, to H, g and facts, see `linearisation`.
 
     Residual e = R s + t - mean of the nearest of eight voxels of any kind. Its variance is sigma2 plus that of a uniform

@@ -13,8 +13,15 @@ Floats = NDArray[np.float64]
 
 
 @kernel
-def linearise(points: Floats, target: tuple[Floats, Floats, Floats], settings: float, search: float, pose: Pose,
-              width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise(
+    points: Floats,
+    target: tuple[Floats, Floats, Floats],
+    settings: float,
+    search: float,
+    pose: Pose,
+    width: Width,
+    sums: Sums,
+) -> None:
     """Add the prior R0 (3, 3), t0 (3,) with its information (6, 6), world axes, to H and g, see `linearisation`.
 
     The residual is t - t0, m, and the rotation vector of R R0^T, rad. Its Jacobian is approximated by the identity, which is

@@ -26,8 +26,15 @@ Ints = NDArray[np.int32]
 
 
 @kernel
-def linearise_vgicp(points: tuple[Floats, Floats], voxels: tuple[Floats, Floats, Longs, Ints], settings: Settings,
-                    search: Search, pose: Pose, width: Width, sums: Sums) -> None:  # fmt: skip
+def linearise_vgicp(
+    points: tuple[Floats, Floats],
+    voxels: tuple[Floats, Floats, Longs, Ints],
+    settings: Settings,
+    search: Search,
+    pose: Pose,
+    width: Width,
+    sums: Sums,
+) -> None:
     """Add all source points (S, 3) with covariance (S, 6), LiDAR frame, not matched yet, to the sums, see `linearisation`.
 
     As `linearise_gicp`, but on all plane voxels of the eight around R s + t, each times the number of points in it,

@@ -123,17 +123,31 @@ def features_along(
     """As `extract_features`, of a scan whose rings are walked already."""
     slope = np.tan(np.radians(config.parallel_deg))
     curved, bend, breaks = curvature.curvatures(
-        walk.points, walk.ranges, walk.steps, walk.starts,
-        _GAP_STEPS * walk.step, config.occlusion, slope * walk.step, slope,
-    )  # fmt: skip
+        walk.points,
+        walk.ranges,
+        walk.steps,
+        walk.starts,
+        _GAP_STEPS * walk.step,
+        config.occlusion,
+        slope * walk.step,
+        slope,
+    )
     noise = curvature_noise(walk.ranges)
     both = np.full(len(scan), 7, np.uint8) if allowed is None else np.ascontiguousarray(allowed, np.uint8)
     labels = curvature.pick(
-        curved, bend, walk.ranges, breaks, both[walk.order], walk.starts, config.regions,
+        curved,
+        bend,
+        walk.ranges,
+        breaks,
+        both[walk.order],
+        walk.starts,
+        config.regions,
         (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
-        config.edge_curvature * walk.step, config.planar_curvature * walk.step,
-        config.edge_noise * noise, SIGNIFICANT_SIGMAS * noise,
-    )  # fmt: skip
+        config.edge_curvature * walk.step,
+        config.planar_curvature * walk.step,
+        config.edge_noise * noise,
+        SIGNIFICANT_SIGMAS * noise,
+    )
     return gather_features(scan, walk, labels, config.grid_step)
 
 

@@ -52,9 +52,7 @@ class Ground:
         return ground.above(points, self.R, GROUND_CELL_M, self.half, self.top, height)
 
 
-def above_ground(
-    points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z
-) -> Longs:  # fmt: skip
+def above_ground(points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z) -> Longs:
     """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground (`ground_of`), increasing."""
     return ground_of(points, slope, tolerance, up).above(points, tolerance)
 

@@ -207,7 +207,12 @@ def _joined(scan: Scan, parts: list[Scan], is_timed: bool) -> Scan:
         return None if any(values is None for values in columns) else np.concatenate(columns)
 
     return replace(
-        scan, points=np.concatenate([part.points for part in full]), intensity=column("intensity"), rings=column("rings"),
-        labels=column("labels"), times=column("times") if is_timed else None, lidars=column("lidars"),
+        scan,
+        points=np.concatenate([part.points for part in full]),
+        intensity=column("intensity"),
+        rings=column("rings"),
+        labels=column("labels"),
+        times=column("times") if is_timed else None,
+        lidars=column("lidars"),
         fault="; ".join(filter(None, dict.fromkeys(part.fault for part in full))),
-    )  # fmt: skip
+    )

@@ -54,15 +54,31 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
     slope = np.tan(np.radians(config.parallel_deg))
     brightness = _brightness(scan, walk)
     curved, bend, contrast, breaks = petals.smoothness(
-        walk.points, walk.ranges, walk.starts, _left_out(walk, brightness), brightness,
-        config.occlusion, slope * walk.step, np.sin(np.radians(config.parallel_deg)),
-    )  # fmt: skip
+        walk.points,
+        walk.ranges,
+        walk.starts,
+        _left_out(walk, brightness),
+        brightness,
+        config.occlusion,
+        slope * walk.step,
+        np.sin(np.radians(config.parallel_deg)),
+    )
     allowed, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.PETAL_SIDE)
     limits, usual = (config.max_edge_points, config.max_less_edge_points), _SHORTER * walk.step
     labels = curvature.pick(
-        curved, bend, walk.ranges, breaks, allowed, walk.starts, 1, (*limits, config.max_planar_points),
-        config.edge_curvature * usual, config.planar_curvature * usual, config.edge_noise * noise, SIGNIFICANT_SIGMAS * noise,
-    )  # fmt: skip
+        curved,
+        bend,
+        walk.ranges,
+        breaks,
+        allowed,
+        walk.starts,
+        1,
+        (*limits, config.max_planar_points),
+        config.edge_curvature * usual,
+        config.planar_curvature * usual,
+        config.edge_noise * noise,
+        SIGNIFICANT_SIGMAS * noise,
+    )
     if len(brightness):
         allowed.fill(MAY_BE_EDGE)
         painted = curvature.pick(

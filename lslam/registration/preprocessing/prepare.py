@@ -203,9 +203,13 @@ Down = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 def _source_points(
-    cloud: NDArray[np.float32], cloud_times: NDArray[np.float32], map_points: NDArray[np.float32],
-    map_times: NDArray[np.float32], config: PreprocessConfig, index: int,
-) -> Down:  # fmt: skip
+    cloud: NDArray[np.float32],
+    cloud_times: NDArray[np.float32],
+    map_points: NDArray[np.float32],
+    map_times: NDArray[np.float32],
+    config: PreprocessConfig,
+    index: int,
+) -> Down:
     if config.downsample == "target":
         return _target_count(map_points, map_times, config)
     if config.downsample == "grid":

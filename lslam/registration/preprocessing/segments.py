@@ -88,15 +88,18 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: Floats) -
         walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE
     )
     labels = range_image.cluster(
-        walk.ranges, nearest, ground, columns, elevation, np.radians(config.segment_angle_deg),
+        walk.ranges,
+        nearest,
+        ground,
+        columns,
+        elevation,
+        np.radians(config.segment_angle_deg),
         (config.segment_points, config.small_segment_points, config.small_segment_rings),
-    )  # fmt: skip
+    )
     return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
 
 
-def _floor(
-    walk: RingWalk, lowest: Longs, vertical: Floats
-) -> tuple[Floats, float]:  # fmt: skip
+def _floor(walk: RingWalk, lowest: Longs, vertical: Floats) -> tuple[Floats, float]:
     """The upward direction (3,) and the height of the dominant plane along it, m.
 
     It is looked for where the vehicle stands or the drone hovers: within a few times the range at which the `lowest` rings
