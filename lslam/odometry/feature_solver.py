@@ -78,30 +78,6 @@ def solve_on_scan(
     return optimise(terms, T_prior, annealing, limits, Correspondences(len(edges) + len(planes)))
 
 
-def solve_on_map(
-    target: FeatureMap,
-    edges: Floats,
-    planes: Floats,
-    T_prior: Floats,
-    annealing: Annealing,
-    noise: FeatureNoise,
-    *,
-    scatter: Floats | None = None,
-    levels: Sequence[GaussianMap] | None = None,
-    inlier_ratio: float = 1.0,
-) -> RegistrationResult:
-    """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map, starting at `T_prior` (4, 4).
-
-    scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
-    levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
-    inlier_ratio : share of the correspondences, the nearest, that have a say from the second step on
-    """
-    problem = map_problem(
-        target, edges, planes, T_prior, annealing, noise, scatter=scatter, levels=levels, inlier_ratio=inlier_ratio
-    )
-    return optimise(*problem)
-
-
 def map_problem(
     target: FeatureMap,
     edges: Floats,
@@ -115,7 +91,13 @@ def map_problem(
     inlier_ratio: float = 1.0,
     information: Floats | None = None,
 ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:
-    """The arguments of `optimise` by which `solve_on_map` aligns; `information` (6, 6) of the prior joins the features."""
+    """The arguments of `optimise` that align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map.
+
+    T_prior : (4, 4) start; information : (6, 6) of it as a prior beside the features; None: it is only a start
+    scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
+    levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
+    inlier_ratio : share of the correspondences, the nearest, that have a say from the second step on
+    """
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
     lines, matches = target.edges, Correspondences(len(planes) + len(edges))

@@ -12,7 +12,7 @@ from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, FeatureScan, feature_scan, surface_size, thinned
-from lslam.odometry.feature_solver import NONE, FeatureNoise, ScanStep, map_problem, remap_solution, solve_on_map
+from lslam.odometry.feature_solver import NONE, FeatureNoise, ScanStep, map_problem, remap_solution
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
 from lslam.registration.optimiser import optimise
@@ -166,7 +166,8 @@ class FeatureTarget(Target):
         points, scatter = thinned(attempt.points)
         annealing = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
         edges = attempt.points.edges.points
-        return attempt.judge(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
+        problem = map_problem(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter)
+        return attempt.judge(optimise(*problem))
 
     def enter(self, result: RegistrationResult) -> None:
         """Into the feature map, and as what the next scan is registered on."""
@@ -194,13 +195,15 @@ class FeatureTarget(Target):
         def on_coarse(start: Floats, width: float) -> RegistrationResult:
             slow = Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
             levels = target.planes.coarser[:1]
-            return attempt.judge(solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels))
+            problem = map_problem(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels)
+            return attempt.judge(optimise(*problem))
 
         def edges_at(result: RegistrationResult) -> int:
             """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""
             once = Annealing(c.kernel_max / 2, c.kernel_max / 2, 0.5, 1)
             edges = attempt.points.less_edges.points
-            return solve_on_map(target, edges, NONE, result.T_world_lidar, once, noise).inliers if result.ok else -1
+            problem = map_problem(target, edges, NONE, result.T_world_lidar, once, noise)
+            return optimise(*problem).inliers if result.ok else -1
 
         result = on_coarse(T_prior, c.coarse_kernel)
         if history.inserted > 1 or not self._with_start_search:

@@ -41,10 +41,8 @@ def first_pose(
     first in all directions, or an initial one was not registered, or taken at rest. So it is where a smoother links each scan
     to the one before.
     """
-    stays, later = (
-        decided[0].result.T_world_lidar,
-        [k for k in range(initial_scans, len(decided)) if _is_placed(decided[k])],
-    )
+    stays = decided[0].result.T_world_lidar
+    later = [k for k in range(initial_scans, len(decided)) if _is_placed(decided[k])]
     is_linked = any(tracked.sweep.link is not None for tracked in decided)
     if is_linked or len(later) < initial_scans or not all(_is_placed(tracked) for tracked in decided[:initial_scans]):
         return stays, None
@@ -99,7 +97,7 @@ def _is_registered(tracked: Tracked) -> bool:
 # Scans: two seconds, which are held in memory.
 WINDOW_SCANS = 20
 # Of a run that began at rest, the first scan and the pose (4, 4) of its spot.
-Rest = tuple[Tracked, Floats]
+StartAtRest = tuple[Tracked, Floats]
 
 
 class WindowTracker(Stateful):
@@ -137,7 +135,7 @@ class WindowTracker(Stateful):
         # The tracker's world in that of the first pose as later scans tell it; None until they do.
         self._world: Floats | None = None if self._can_look_back else np.eye(4)
         # Of a run that began at rest, until then.
-        self._rest: Rest | None = None
+        self._rest: StartAtRest | None = None
         # From then on, of such a run: the first position (3,), and the covariance (6, 6) of its registration, in that world.
         self._start: tuple[Floats, Floats] | None = None
 
@@ -206,7 +204,7 @@ class WindowTracker(Stateful):
             return count >= 2 * WINDOW_SCANS or len(self._elsewhere(self._decided, rest)) >= WINDOW_SCANS
         return end or count >= WINDOW_SCANS
 
-    def _resting(self) -> Rest | None:
+    def _resting(self) -> StartAtRest | None:
         """The first scan of a run that began at rest and was not registered again yet, and its spot; None of other runs.
 
         The scans after it tell the spot: it alone is known badly.
@@ -221,11 +219,11 @@ class WindowTracker(Stateful):
             return None
         return replace(initial[0], sweep=_priors(initial)[0]), rest[1]
 
-    def _has_left(self, pose: Floats, rest: Rest) -> bool:
+    def _has_left(self, pose: Floats, rest: StartAtRest) -> bool:
         """Whether a pose (4, 4) is so far from the first spot that a single point would tell, at three sigma."""
         return apart(rest[1], pose) ** 2 > INLIER_CHI2 * self._noise_m**2
 
-    def _elsewhere(self, decided: list[Tracked], rest: Rest) -> list[Tracked]:
+    def _elsewhere(self, decided: list[Tracked], rest: StartAtRest) -> list[Tracked]:
         """The registered scans that lie beyond the surroundings of the first spot."""
         start = rest[1][:3, 3]
         far = [np.linalg.norm(t.result.T_world_lidar[:3, 3] - start) > self._beyond_m for t in decided]
