@@ -23,6 +23,7 @@ class GaussianMap(Stateful):
     min_points, planarity, count_cap : when a voxel is matched, when it is a plane, how much it remembers
     reach : m, voxels farther than this from the sensor are given back
     breadth : how broad points must lie across the beams that saw them, see `kernels.gaussians`; 0: not asked
+    shared : m2, variance that the points of one scan share, along the normal: of their pose, in a map of several scans
     """
 
     def __init__(
@@ -35,10 +36,11 @@ class GaussianMap(Stateful):
         reach: float = 150.0,
         capacity: int = 1 << 16,
         breadth: float = 0.0,
+        shared: float = 0.0,
     ) -> None:
         self.size, self.min_points, self.planarity = size, min_points, planarity
         self.count_cap, self.reach = count_cap, reach
-        self.breadth = breadth
+        self.breadth, self.shared = breadth, shared
         self.moments = np.zeros((capacity, 13))
         self.planes = np.zeros((capacity, 8))
         self.keys = np.full(capacity, gaussians.FREE, np.int64)
@@ -69,6 +71,7 @@ class GaussianMap(Stateful):
             float(self.min_points),
             self.planarity,
             FLOOR_M2,
+            self.shared,
             self.breadth,
             self.reach,
             self.moments,
@@ -120,6 +123,7 @@ class GaussianMap(Stateful):
             reach=self.reach,
             capacity=capacity,
             breadth=self.breadth,
+            shared=self.shared,
         )
         gaussians.coarsen(
             factor,
@@ -127,6 +131,7 @@ class GaussianMap(Stateful):
             float(coarse.min_points),
             self.planarity,
             FLOOR_M2,
+            self.shared,
             self.breadth,
             self.moments,
             self.keys,

@@ -38,7 +38,7 @@ class LocalMap(Stateful):
     Parameters
     ----------
     size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach, breadth : as in `GaussianMap`; None: `LEAST_BREADTH`
+    min_points, planarity, count_cap, reach, shared, breadth : as in `GaussianMap`; None: `LEAST_BREADTH`
     """
 
     def __init__(
@@ -50,12 +50,19 @@ class LocalMap(Stateful):
         planarity: float,
         count_cap: float,
         reach: float,
+        shared: float = 0.0,
         breadth: float | None = None,
     ) -> None:
         breadth = LEAST_BREADTH if breadth is None else breadth
         self.levels = tuple(
             GaussianMap(
-                edge, min_points=min_points, planarity=planarity, count_cap=count_cap, reach=reach, breadth=breadth
+                edge,
+                min_points=min_points,
+                planarity=planarity,
+                count_cap=count_cap,
+                reach=reach,
+                breadth=breadth,
+                shared=shared,
             )
             for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE_FACTORS)))
         )

@@ -13,8 +13,9 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
+from lslam.registration.gaussian_map import FLOOR_M2
 from lslam.registration.history import History
-from lslam.registration.local_map import LocalMap, MapScans, make_map_scans
+from lslam.registration.local_map import LastScan, LocalMap, MapScans, make_map_scans
 from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.beams import ring_gap
 from lslam.registration.preprocessing.prepare import PreparedPoints
@@ -43,7 +44,7 @@ class VoxelTarget(MapAlignment, Target):
         preprocess: PreprocessConfig,
         make_scans: Callable[[RegistrationConfig], MapScans] = make_map_scans,
     ) -> None:
-        residual = residual_named(config.residual or "plane")
+        residual, scans = residual_named(config.residual or "plane"), make_scans(config)
         local_map = LocalMap(
             config.voxel_size * residual.voxel_share,
             coarse_factor=config.coarse_factor,
@@ -51,11 +52,12 @@ class VoxelTarget(MapAlignment, Target):
             planarity=config.planarity,
             count_cap=config.count_cap,
             reach=1.2 * preprocess.range_max,
+            shared=0.0 if isinstance(scans, LastScan) else FLOOR_M2,
         )
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps
         self.preprocess, self._make_scans = preprocess, make_scans
-        self.scans = make_scans(config)
+        self.scans = scans
         # Vertical angular resolution, rad, for point to point; 0 where unknown.
         self._ring_gap = 0.0
 

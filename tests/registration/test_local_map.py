@@ -11,7 +11,7 @@ from analytic_scenes import pose_at, room
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
-from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.local_map import LEAST_BREADTH, LocalMap, make_map_scans
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
@@ -21,7 +21,7 @@ ARRAYS = ("moments", "planes", "keys", "table")
 
 
 def new_map() -> LocalMap:
-    return LocalMap(0.8, coarse_factor=3, min_points=6, planarity=0.3, count_cap=200.0, reach=100.0)
+    return LocalMap(0.8, coarse_factor=3, min_points=6, planarity=0.3, count_cap=200.0, reach=100.0, shared=FLOOR_M2)
 
 
 def scan(seed: int) -> PreparedPoints:
@@ -36,7 +36,14 @@ def assert_same(a: GaussianMap, b: GaussianMap) -> None:
 def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> None:
     target, points, T = new_map(), scan(0), pose_at((1.0, 2.0, 0.5), 30.0)
     target.insert(points.map_points, points.source, T)
-    kept = {"min_points": 6, "planarity": 0.3, "count_cap": 200.0, "reach": 100.0, "breadth": LEAST_BREADTH}
+    kept = {
+        "min_points": 6,
+        "planarity": 0.3,
+        "count_cap": 200.0,
+        "reach": 100.0,
+        "breadth": LEAST_BREADTH,
+        "shared": FLOOR_M2,
+    }
     fine, *coarser = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8, 6 * 0.8, 12 * 0.8))
     fine.insert(points.map_points, T)
     assert_same(target.fine, fine)

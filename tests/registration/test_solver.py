@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import repeat
+
 import numpy as np
 import pytest
 from analytic_scenes import (
@@ -21,13 +24,15 @@ from numpy.typing import NDArray
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.registration.alignment import upright_directions
-from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 
 Floats = NDArray[np.float64]
+# Of the points of a room.
+LEVER_ARM_M = 8.0
 FINE = Annealing(1.0, 0.15, 0.5, 20)
 
 
@@ -98,18 +103,37 @@ def test_covariance_is_symmetric_and_shrinks_as_points_come_in(room_map: Gaussia
     np.testing.assert_allclose(traces[1] / traces[2], 4.0, rtol=0.25)
 
 
-def test_covariance_is_the_spread_of_the_results(room_map: GaussianMap) -> None:
-    """Forty draws of the source noise; the map, the floor under its voxels and the robust kernel widen it a little."""
-    rng = np.random.default_rng(3)
+def _spread_over_claim(targets: Iterable[GaussianMap], rng: np.random.Generator) -> Floats:
+    """(6,) standard deviation of the results of one draw of a scan on each of the maps, over the mean of what they claim."""
     found, claimed = [], []
-    for _ in range(40):
-        result = on(room_map, room(rng, 40).astype(np.float32), np.eye(4))
+    for target in targets:
+        result = on(target, room(rng, 40).astype(np.float32), np.eye(4))
         delta = result.T_world_lidar
         found.append(np.concatenate([delta[:3, 3], so3.log(delta[:3, :3])]))
         assert result.covariance is not None
         claimed.append(np.sqrt(np.diag(result.covariance)))
-    ratio = np.std(found, axis=0) / np.mean(claimed, axis=0)
+    spread: Floats = np.std(found, axis=0) / np.mean(claimed, axis=0)
+    return spread
+
+
+def test_covariance_is_the_spread_of_the_results(room_map: GaussianMap) -> None:
+    """Forty draws of the source noise; the map, the floor under its voxels and the robust kernel widen it a little."""
+    ratio = _spread_over_claim(repeat(room_map, 40), np.random.default_rng(3))
     assert ((ratio > 0.4) & (ratio < 1.6)).all()
+
+
+def test_covariance_is_the_spread_over_maps_whose_scans_err() -> None:
+    """Four scans make each map; their poses err so that points move by what these are said to share."""
+    rng = np.random.default_rng(3)
+
+    def erring() -> GaussianMap:
+        target = GaussianMap(0.8, shared=FLOOR_M2)
+        for error in rng.normal(0.0, np.sqrt(FLOOR_M2), (4, 6)):
+            target.insert(room(rng, 2000).astype(np.float32), se3.exp(error / np.repeat([1.0, LEVER_ARM_M], 3)))
+        return target
+
+    ratio = _spread_over_claim((erring() for _ in range(40)), rng)
+    assert ((ratio > 0.7) & (ratio < 1.4)).all()
 
 
 @pytest.mark.parametrize(

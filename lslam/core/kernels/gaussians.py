@@ -99,6 +99,7 @@ def _refresh(
     min_points: float,
     planarity: float,
     floor: float,
+    shared: float,
     breadth: float,
 ) -> None:
     """Mean, normal and kind of one voxel, its row of `planes`, from its moments.
@@ -132,8 +133,9 @@ def _refresh(
     if is_plane:
         p[3], p[4], p[5] = nx, ny, nz
         p[6] = max(l0, 0.0) + floor
-        # The normal of a narrow strip of few points is uncertain about the strip's axis.
-        p[7] = p[6] / (n * max(l1, 1e-12))
+        # The normal of a narrow strip is uncertain about the strip's axis. The scatter of points averages out, what those of a
+        # scan share does not.
+        p[7] = (p[6] / n + shared) / max(l1, 1e-12)
     else:
         p[6] = max((l0 + l1 + l2) / 3.0, 0.0) + floor
         p[7] = BLOB
@@ -171,6 +173,7 @@ def insert(
     min_points: float,
     planarity: float,
     floor: float,
+    shared: float,
     breadth: float,
     reach: float,
     moments: Floats,
@@ -259,7 +262,7 @@ def insert(
                 w = cap / s[0]
                 for k in range(13):
                     s[k] *= w
-            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, breadth)
+            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, shared, breadth)
             refreshed[slot] = s[0]
     _evict(2 * count, t, size, reach, keys, table, state, free, planes)
     return lost
@@ -306,6 +309,7 @@ def coarsen(
     min_points: float,
     planarity: float,
     floor: float,
+    shared: float,
     breadth: float,
     fine_moments: Floats,
     fine_keys: Longs,
@@ -351,5 +355,5 @@ def coarsen(
         s[11] += m[11] + n * oy
         s[12] += m[12] + n * oz
     for slot in range(state[USED]):
-        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, breadth)
+        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, shared, breadth)
         refreshed[slot] = moments[slot, 0]

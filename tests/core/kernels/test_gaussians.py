@@ -41,6 +41,20 @@ def live_slots(m: GaussianMap) -> NDArray[np.int64]:
     return np.flatnonzero(m.keys != gaussians.FREE)
 
 
+def test_the_slope_of_a_narrow_strip_stays_uncertain_however_many_points_it_has() -> None:
+    """Its points may all be a centimetre too high at one end: more of them do not tell."""
+    rng = np.random.default_rng(4)
+    strip = np.column_stack([rng.uniform(0.2, 0.7, 2000), rng.uniform(0.1, 0.9, 2000), rng.normal(0.5, 0.002, 2000)])
+    m = GaussianMap(1.0, count_cap=1e9, shared=FLOOR)
+    tilts = []
+    for points in np.array_split(strip.astype(np.float32), 10):
+        m.insert(points, at(0.0, 0.0, 0.0))
+        tilts.append(float(m.planes[live_slots(m)[0], 7]))
+    across2 = 0.5**2 / 12
+    assert np.sqrt(tilts[-1]) == pytest.approx(np.sqrt(FLOOR / across2), rel=0.05)
+    assert tilts[-1] > 0.9 * tilts[0]
+
+
 def test_the_place_of_the_sensor_is_kept_about_the_middle_of_each_voxel() -> None:
     """The mean over its points, of two scans from two places: what tells a surface from what one ring of it shows."""
     m, places = GaussianMap(1.0), (np.array([1.0, -2.0, 3.0]), np.array([-4.0, 0.5, 0.25]))
