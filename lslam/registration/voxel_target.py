@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.core.kernels.residuals import TILT_FACTOR
 from lslam.core.types.arrays import Floats
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
@@ -52,7 +53,7 @@ class VoxelTarget(MapAlignment, Target):
             planarity=config.planarity,
             count_cap=config.count_cap,
             reach=1.2 * preprocess.range_max,
-            shared=0.0 if isinstance(scans, LastScan) else FLOOR_M2,
+            shared=0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR,
         )
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
+from lslam.core.kernels.residuals import TILT_FACTOR
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
@@ -127,7 +128,7 @@ def test_covariance_is_the_spread_over_maps_whose_scans_err() -> None:
     rng = np.random.default_rng(3)
 
     def erring() -> GaussianMap:
-        target = GaussianMap(0.8, shared=FLOOR_M2)
+        target = GaussianMap(0.8, shared=FLOOR_M2 / TILT_FACTOR)
         for error in rng.normal(0.0, np.sqrt(FLOOR_M2), (4, 6)):
             target.insert(room(rng, 2000).astype(np.float32), se3.exp(error / np.repeat([1.0, LEVER_ARM_M], 3)))
         return target
