@@ -251,8 +251,9 @@ def cloud_from_fields(
         raise InputError(f"{path}: no field {', '.join(missing)}; the file has {', '.join(columns) or 'no fields'}")
     first = {name: values if values.ndim == 1 else values[:, 0] for name, values in columns.items()}
     points = np.empty((len(first[axes[0] or ""]), 3), kind)
-    for k, axis in enumerate(axes):
-        points[:, k] = first[axis or ""]
+    with np.errstate(over="ignore"):  # farther than `kind` can tell is no place: infinite
+        for k, axis in enumerate(axes):
+            points[:, k] = first[axis or ""]
     intensity = _first(names, INTENSITY_NAMES)
     ring, rings = _find_rings(points, {names[plain]: first[names[plain]] for plain in RING_NAMES if plain in names})
     label, labels = _find_labels({names[plain]: first[names[plain]] for plain in LABEL_NAMES if plain in names})

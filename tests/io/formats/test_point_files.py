@@ -154,6 +154,12 @@ def test_damaged_files_are_read_or_refused(
     assert sentence is None or str(path) in sentence
 
 
+def test_a_coordinate_beyond_single_precision_is_infinite_and_nothing_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "far.pcd"
+    path.write_text(pcd() + "1 -3e151 2\n4 5 6\n")
+    assert read_points(path).points.tolist() == [[1, -np.inf, 2], [4, 5, 6]]
+
+
 def pcd(**changes: str) -> str:
     entries = {
         "FIELDS": "x y z", "SIZE": "4 4 4", "TYPE": "F F F", "COUNT": "1 1 1", "WIDTH": "2", "HEIGHT": "1",
