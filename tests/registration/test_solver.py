@@ -124,7 +124,7 @@ def test_covariance_is_the_spread_of_the_results(room_map: GaussianMap) -> None:
 
 
 def test_covariance_is_the_spread_over_maps_whose_scans_err() -> None:
-    """Four scans make each map; their poses err so that points move by what these are said to share. Else the ratio is 1.2 to 2."""
+    """Four scans make each map, and err so that points move by what these are said to share; else the ratio is 1.2 to 2."""
     rng = np.random.default_rng(3)
 
     def erring() -> GaussianMap:
