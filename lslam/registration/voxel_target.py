@@ -46,6 +46,8 @@ class VoxelTarget(MapAlignment, Target):
         make_scans: Callable[[RegistrationConfig], MapScans] = make_map_scans,
     ) -> None:
         residual, scans = residual_named(config.residual or "plane"), make_scans(config)
+        # The poses of several scans err by the floor; residuals multiply a tilt.
+        shared = 0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR
         local_map = LocalMap(
             config.voxel_size * residual.voxel_share,
             coarse_factor=config.coarse_factor,
@@ -53,7 +55,7 @@ class VoxelTarget(MapAlignment, Target):
             planarity=config.planarity,
             count_cap=config.count_cap,
             reach=1.2 * preprocess.range_max,
-            shared=0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR,
+            shared=shared,
         )
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps
