@@ -33,16 +33,16 @@ PROPOSALS = 150  # poses with the most votes; the best `REFINED` of them are ref
 REFINED = 12
 ROUGH = 2.5  # m; a pose of votes is right to about a cell
 SHORT = 4.0  # m; a wall of this length has half the weight of an infinite one
-# m, iteration by iteration. The last gate of the global match admits the errors of single buildings on the map, about a metre;
-# the walls of one building have no such errors among themselves.
-GATES = np.array([2.5, 2.2, 1.9, 1.6, 1.4, 1.2, 1.2])
+# m, iteration by iteration. The last gate of the global match admits the errors of single buildings on the map, about a metre: a
+# smaller one has two optima where some lie a metre from the others. The walls of one building have no such errors.
+GATES = np.array([2.5, 2.2, 1.8])
 FINE_GATES = np.array([2.0, 1.5, 1.0, 0.7, 0.5, 0.4, 0.4])
 LAST_ITERATIONS = 30  # most iterations with the last gate, until convergence
 FIRST_GATES = np.array([6.0, 4.5, 3.0])  # first gates from the prior itself: an error in heading displaces far walls
 FAINT = 1e-3  # factor on the prior's weight in the fit, since the graph has the prior too
 START_WALLS = 4  # least walls of a start: the two of one corner would fit in many places of a town
 REFINED_SLACK = np.array([0.5, 0.5, 0.03])  # m, m, rad; by which refinement may leave the window
-NEAR_SAME, LIKE_SAME = 1.5, np.radians(6.0)  # m and rad; poses that differ less are the same
+NEAR_SAME, LIKE_SAME = GATES[-1], np.radians(6.0)  # m and rad; poses that differ less pair the same walls
 BESIDE = 2.0  # m between the poses that are tried across parallel walls, the width of the first gates
 ALIGNED = np.sin(np.radians(12.0)) ** 2  # least information of an observed direction, as a part of the largest
 VISIBLE_M = 60.0  # m from the walls seen; the map beyond is left out

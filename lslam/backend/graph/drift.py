@@ -49,8 +49,8 @@ def with_drift(graph: PoseGraph, factor: float, config: GraphConfig) -> list[Con
 def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphConfig) -> float:
     """The factor on `drift_covariance`, 0 where none is needed, with which the median residual has its expected size.
 
-    Fixes are so much noisier than odometry that chance among them would give a large drift: they count where the median is
-    significant. At least `tilt_factor`.
+    Fixes and walls of a map are so much noisier than odometry that chance among them would give a large drift: they count where
+    the median is significant. At least `tilt_factor`.
     """
     on_map = _as_fixes(graph)
     if not loops and max(len(graph.fixes), len(on_map)) < 2 and not graph.ups:
@@ -60,7 +60,7 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
     # Where the noise of fixes was estimated, odometry's drift was beside it: `graph.walk`.
     fixes = graph.fixes if graph.fix_noise is None else ()
     by_fixes = _of_fixes(graph.poses, fixes, 3, noise, drift, config.probability)
-    by_map = _of_fixes(graph.poses, on_map, 2, noise, drift)
+    by_map = _of_fixes(graph.poses, on_map, 2, noise, drift, config.probability)
     return max(by_loops, by_fixes, by_map, _of_ups(graph, noise, drift, config))
 
 
@@ -117,7 +117,7 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drif
 
 
 def _of_fixes(
-    poses: Floats, fixes: Sequence[PositionFix], dim: int, white: Floats, drift: Floats, probability: float = 0.0
+    poses: Floats, fixes: Sequence[PositionFix], dim: int, white: Floats, drift: Floats, probability: float
 ) -> float:
     """By pairs of fixes, half the fixes apart: difference between their displacement and odometry's, along `dim` axes.
 

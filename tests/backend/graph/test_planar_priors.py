@@ -127,6 +127,16 @@ def test_errors_of_the_map_are_not_attributed_to_drift(seed: int) -> None:
     assert drift_factor(doubtful, [], GraphConfig()) == 0
 
 
+def test_two_matches_with_the_map_seldom_say_that_odometry_drifts() -> None:
+    graph, rng = held(0), np.random.default_rng(3)
+    factors = []
+    for _ in range(100):
+        ends = [graph.map_priors[0], graph.map_priors[-1]]
+        drawn = [replace(p, pose=np.add(p.pose, [*rng.normal(0, 0.7, 2), 0.0])) for p in ends]
+        factors.append(drift_factor(replace(graph, map_priors=drawn, map_sigma=0.7), [], GraphConfig()))
+    assert np.count_nonzero(factors) < 5
+
+
 def test_it_comes_to_the_same_keyframe_by_keyframe() -> None:
     graph = held(8)
     at_once = optimise(graph, GraphConfig())
