@@ -33,6 +33,7 @@ from lslam.core.errors import UsageError
     metavar="FILE",
     help="CSV of control points, surveyed positions that hold the poses: scan,x,y,z,sigma,crs.",
 )
+@options.refine
 @options.fixes_as_factors
 @options.fixes_at_the_end
 @options.coordinates
@@ -85,6 +86,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
     flags |= {
         "loops.use": "false" if given["only_known"] else None,
         "gnss.mode": given["gnss"],
+        "graph.refine": "true" if given["refine"] else None,
         **options.crs_settings(given["crs"], given["geoid"]),
         "map.write": "false" if given["no_map"] else None,
     }

@@ -51,6 +51,9 @@ metrics = click.option(
 set_in_all_runs = click.option(
     "--set", "settings", multiple=True, metavar="SECTION.KEY=VALUE", help="Set one key in all runs; repeatable."
 )
+refine = click.option(
+    "--refine", is_flag=True, help="Correct all scans at once for the planes they saw, where that makes them thinner."
+)
 fixes_as_factors = click.option(
     "--gnss", "gnss", flag_value="graph", default=None, help="Satellite fixes are factors of the pose graph."
 )

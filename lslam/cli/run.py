@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
 @options.imu
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
+@options.refine
 @options.manual
 @options.fixes_as_factors
 @options.fixes_at_the_end
@@ -197,6 +198,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         "input.rings": given["rings"],
         "map.write_features": "true" if given["save_feature_map"] else None,
         "map.clean": "true" if given["clean"] else None,
+        "graph.refine": "true" if given["refine"] else None,
         "map.occupancy": "true" if given["occupancy"] else None,
         "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),
         "input.strict": "true" if given["strict"] else None,

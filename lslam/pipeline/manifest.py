@@ -43,6 +43,7 @@ class Manifest:
     world : where the coordinates begin and whether z is up
     imu : use of the IMU, empty without `--imu`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
+    refinement : how much thinner planes became by it, empty where none was asked for
     localization : how the drive was found in a map that exists and how many scans that holds, empty without one
     identity : digests that a run and its resumption share; resumed_after : scans that were done when it was resumed
     posed_by : scans by who posed them: the method, what stood in for it, the motion prior
@@ -71,6 +72,7 @@ class Manifest:
         self.imu: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
         self.graph: dict[str, Any] = {}
+        self.refinement: dict[str, Any] = {}
         self.georeference: dict[str, Any] = {}
         self.localization: dict[str, Any] = {}
         self.identity: dict[str, str] = {}
@@ -186,6 +188,7 @@ class Manifest:
             **({"resumed_after_scans": list(self.resumed_after)} if self.resumed_after else {}),
             **({"keyframes": dict(self.keyframes)} if self.keyframes else {}),
             **({"graph": dict(self.graph)} if self.graph else {}),
+            **({"refinement": dict(self.refinement)} if self.refinement else {}),
             **({"georeference": dict(self.georeference)} if self.georeference else {}),
             **({"localization": dict(self.localization)} if self.localization else {}),
             **({"map_points": self.map_points} if self.map_points is not None else {}),

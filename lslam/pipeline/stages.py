@@ -38,6 +38,7 @@ from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import build_map, map_checkpoints
 from lslam.pipeline.odometry_pass import odometry_checkpoints
+from lslam.pipeline.refine_pass import refine_poses
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder, check_place, spool_of, upload
 
@@ -55,6 +56,7 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
             job.manifest.georeference = describe(record.georeference)
         return BackEnd(record.results)
     done = optimise_poses(job, record)
+    refine_poses(job, record)
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, job.store)
     return done

@@ -127,6 +127,9 @@ class GraphConfig(Section):
         "buildings that it drifts",
     )
     max_iterations: int = Field(100, ge=1, description="of the optimiser, per solution")
+    refine: bool = Field(
+        False, description="then correct all scans at once, so that what they saw of a plane lies on one (--refine)"
+    )
     gravity: bool = Field(True, description="with an IMU: hold each keyframe's up direction to what it measured")
     gravity_deg: float = Field(0.3, gt=0, description="deg; one sigma of that direction: 0.05 m/s2 of bias are 0.3 deg")
     imu_orientation: bool = Field(False, description="with an IMU: hold turns between keyframes to the gyroscope's")

@@ -1,0 +1,218 @@
+"""Plane adjustment: all poses of a run are corrected at once, so that what many scans saw of a plane lies on one plane.
+
+The cost is the variance of points about the planes of adaptive voxels, as in BALM2 (Liu, Liu and Zhang, 2022). Planes are
+eliminated, and the reduced system is solved by conjugate gradients, since a plane joins all scans that saw it. Corrections vary
+linearly from one pose to the next, so that the motion within a sweep is corrected as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lslam.backend.kernels import plane_adjustment
+from lslam.core.geometry import se3, so3
+from lslam.core.stopping import checking
+from lslam.core.types.arrays import Bools, Floats, Longs
+
+# m, edges of voxels: what is no plane in one is looked at in the next.
+EDGES_M = (2.0, 1.0, 0.5)
+# Least points of a plane, least scans that see it, and its least breadth as a part of the edge.
+LEAST_POINTS, LEAST_SCANS, LEAST_BREADTH = 20, 4, 0.1
+FLOOR_M = 0.005  # m, no surface is flatter
+LEVER_M = 10.0  # m, at which a rotation counts as much as the translation
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of the adjustment, from coarse to fine.
+
+    scans : between two knots, of which the corrections are unknowns; those between are interpolated
+    flatness : largest variance across a plane as a part of that along its narrower side
+    step_m : sigma of the difference of two successive corrections, which holds what no plane does
+    is_free : of the corrections of one round alone, so that they may add up to any size
+    rounds : at most; settled_m : rms of the corrections after which the next level begins
+    """
+
+    scans: int
+    flatness: float
+    step_m: float
+    is_free: bool
+    rounds: int
+    settled_m: float
+
+
+# Walls that lie apart are brought together first, by knots so few that nothing else is changed; then every pose.
+LEVELS = (Level(10, 0.02, 0.02, True, 8, 5e-3), Level(1, 0.005, 1.5e-3, False, 4, 5e-4))
+# Conjugate gradients: steps at most, and the part of the first residual that ends them.
+STEPS, ACCURACY = 300, 1e-4
+
+
+@dataclass(frozen=True)
+class SweptPoints:
+    """Points of all scans at the instants they were measured.
+
+    points : (N, 3) m, world; poses : (N,) number of the last pose before each, or the first one
+    shares : (N,) 0..1 of the way from that pose to the next
+    """
+
+    points: Floats
+    poses: Longs
+    shares: Floats
+
+    def select(self, mask: Bools) -> SweptPoints:
+        """Those of a mask (N,)."""
+        return SweptPoints(self.points[mask], self.poses[mask], self.shares[mask])
+
+    @classmethod
+    def at_times(cls, points: Floats, times: Floats, stamps: Floats) -> SweptPoints:
+        """Points (N, 3) measured at `times` (N,), s, by a sensor whose poses have the `stamps` (K,), s, which rise."""
+        at = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 1)
+        after = np.minimum(at + 1, len(stamps) - 1)
+        gap = np.where(after > at, stamps[after] - stamps[at], np.inf)
+        return cls(points, at, np.clip((times - stamps[at]) / gap, 0.0, 1.0))
+
+    def on_knots(self, knots: Longs) -> SweptPoints:
+        """The same points between the poses of numbers `knots` (M,) alone, the first and the last of all among them."""
+        place = self.poses + self.shares
+        at = np.searchsorted(knots, place, side="right") - 1
+        after = np.minimum(at + 1, len(knots) - 1)
+        gap = np.maximum(knots[after] - knots[at], 1)
+        return SweptPoints(self.points, at, (place - knots[at]) / gap)
+
+    def moved(self, poses: Floats, corrections: Floats) -> Floats:
+        """The points (N, 3) after `corrections` (K, 6) of the `poses` (K, 4, 4)."""
+        turns = so3.exp(corrections[:, 3:])
+
+        def by(k: Longs) -> Floats:
+            away = self.points - poses[k, :3, 3]
+            return np.asarray(np.einsum("nij,nj->ni", turns[k], away) + poses[k, :3, 3] + corrections[k, :3])
+
+        share = self.shares[:, None]
+        return (1.0 - share) * by(self.poses) + share * by(np.minimum(self.poses + 1, len(poses) - 1))
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """poses : (K, 4, 4); points : (N, 3) m, moved with them; rounds : how often planes were looked for."""
+
+    poses: Floats
+    points: Floats
+    rounds: int
+
+
+def adjust(poses: Floats, swept: SweptPoints, used: Bools) -> Adjusted:
+    """Correct the `poses` (K, 4, 4) for the planes in the `used` (N,) part of the points; the rest moves with them.
+
+    Nothing holds the run as a whole: the mean correction is about zero.
+    """
+    rounds = 0
+    for level in LEVELS:
+        knots = np.unique(np.append(np.arange(0, len(poses), level.scans), len(poses) - 1))
+        places = SweptPoints(poses[:, :3, 3], np.arange(len(poses)), np.zeros(len(poses))).on_knots(knots)
+        total = np.zeros((len(knots), 6))
+        for _ in checking(range(level.rounds)):
+            seen = swept.on_knots(knots)
+            corrections = _corrections(poses[knots], seen.select(used), level, total)
+            if corrections is None:
+                break
+            if not level.is_free:
+                total += corrections
+            swept = replace(swept, points=seen.moved(poses[knots], corrections))
+            poses = _moved(poses, replace(places, points=poses[:, :3, 3]), poses[knots], corrections)
+            rounds += 1
+            if float(np.sqrt(np.mean(np.sum(corrections[:, :3] ** 2, axis=1)))) < level.settled_m:
+                break
+    return Adjusted(poses, swept.points, rounds)
+
+
+def _moved(poses: Floats, places: SweptPoints, knots: Floats, corrections: Floats) -> Floats:
+    """The `poses` (K, 4, 4) at `places` after `corrections` (M, 6) of the poses `knots` (M, 4, 4)."""
+    after, share = np.minimum(places.poses + 1, len(knots) - 1), places.shares[:, None]
+    turns = (1.0 - share) * corrections[places.poses, 3:] + share * corrections[after, 3:]
+    return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], places.moved(knots, corrections)))
+
+
+def _corrections(poses: Floats, swept: SweptPoints, level: Level, total: Floats) -> Floats | None:
+    """(K, 6) corrections of one Gauss-Newton step; None without planes."""
+    planes = find_planes(swept.points, swept.poses, level.flatness)
+    on_plane = planes >= 0
+    if not on_plane.any():
+        return None
+    planes, swept = planes[on_plane], swept.select(on_plane)
+    order = np.lexsort((swept.poses, planes))
+    planes, at = planes[order], swept.poses[order]
+    is_first = np.append(True, (np.diff(planes) != 0) | (np.diff(at) != 0))
+    sighting = np.cumsum(is_first) - 1
+    numbers, means, covariances = plane_adjustment.sums(sighting, int(sighting[-1]) + 1, swept.points[order])
+    shares = np.bincount(sighting, swept.shares[order]) / numbers
+    seen = planes[is_first]
+    starts = np.searchsorted(seen, np.arange(int(seen[-1]) + 2))
+    H, beside, g, coupling, own = plane_adjustment.equations(
+        starts, at[is_first], shares, means, covariances, np.ascontiguousarray(poses[:, :3, 3]), FLOOR_M**2
+    )
+
+    stiffness = np.repeat([level.step_m**-2, (level.step_m / LEVER_M) ** -2], 3)
+
+    def product(x: Floats) -> Floats:
+        out = np.empty_like(x)
+        plane_adjustment.product(x, H, beside, starts, at[is_first], coupling, own, stiffness, out)
+        return out
+
+    preconditioner = plane_adjustment.inverses(H + np.diag(2.0 * stiffness))
+    held = stiffness * np.diff(total, axis=0)
+    pull = np.zeros_like(g)
+    pull[1:] += held
+    pull[:-1] -= held
+    return _conjugate_gradients(product, -g - pull, preconditioner)
+
+
+def _conjugate_gradients(product: Callable[[Floats], Floats], right: Floats, preconditioner: Floats) -> Floats:
+    """x (K, 6) with product(x) = `right` (K, 6); preconditioner : (K, 6, 6) on the diagonal."""
+    x, rest = np.zeros_like(right), right.copy()
+    z = np.einsum("kij,kj->ki", preconditioner, rest)
+    way, size = z.copy(), float(np.sum(rest * z))
+    enough = ACCURACY**2 * size
+    for _ in checking(range(STEPS)):
+        if size <= enough:
+            break
+        pushed = product(way)
+        step = size / float(np.sum(way * pushed))
+        x += step * way
+        rest -= step * pushed
+        z = np.einsum("kij,kj->ki", preconditioner, rest)
+        before, size = size, float(np.sum(rest * z))
+        way = z + size / before * way
+    return x
+
+
+def find_planes(points: Floats, poses: Longs, flatness: float) -> Longs:
+    """(N,) number of the plane that each point (N, 3) lies on, -1 for none; poses : (N,) of the scans that saw them.
+
+    A plane is the largest voxel whose points are flat, seen by several scans, and spread in two directions.
+    """
+    planes, count = np.full(len(points), -1, np.int64), 0
+    left = np.arange(len(points))
+    for edge in EDGES_M:
+        inside, cells = _numbered(np.floor(points[left] / edge).astype(np.int64))
+        numbers, _, covariances = plane_adjustment.sums(cells, inside, np.ascontiguousarray(points[left]))
+        views = np.unique(cells * (int(poses.max()) + 1) + poses[left]) // (int(poses.max()) + 1)
+        scans = np.bincount(views, minlength=inside)
+        thin, narrow, _ = plane_adjustment.spectra(covariances).T
+        is_plane = (numbers >= LEAST_POINTS) & (scans >= LEAST_SCANS)
+        is_plane &= (thin < flatness * narrow) & (narrow > (LEAST_BREADTH * edge) ** 2)
+        planes[left] = np.where(is_plane, count + np.cumsum(is_plane) - 1, -1)[cells]
+        count += int(is_plane.sum())
+        left = left[planes[left] < 0]
+    return planes
+
+
+def _numbered(cells: Longs) -> tuple[int, Longs]:
+    """Number of different rows of `cells` (N, 3), and which one each is, (N,)."""
+    low = cells.min(axis=0, initial=0)
+    wide = cells.max(axis=0, initial=0) - low + 1
+    keys = ((cells[:, 0] - low[0]) * wide[1] + cells[:, 1] - low[1]) * wide[2] + cells[:, 2] - low[2]
+    different, numbers = np.unique(keys, return_inverse=True)
+    return len(different), numbers.astype(np.int64)

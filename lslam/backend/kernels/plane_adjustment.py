@@ -1,0 +1,235 @@
+"""Plane adjustment: normal equations of all poses for planes seen by many scans, whose parameters are eliminated.
+
+A sighting is what one scan saw of one plane between two of the poses: mean and covariance of its points in the world, and the
+share of the way from the first pose to the second at which it was seen. The points move by a like share of both corrections.
+Pose corrections are x = (t, r), 6: t in m, r in rad about the sensor, world axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.jit import inline_with_arrays, kernel
+from lslam.core.kernels.linalg import eigen, inverse
+
+Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+
+
+@kernel
+def sums(cells: Longs, count: int, points: Floats) -> tuple[Longs, Floats, Floats]:
+    """Number (V,), mean (V, 3) and covariance (V, 3, 3) of the points (N, 3) in each of `count` cells; `cells` (N,) numbers."""
+    numbers, means, covariances = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros((count, 3, 3))
+    for i in range(len(cells)):
+        v = cells[i]
+        numbers[v] += 1
+        for a in range(3):
+            means[v, a] += points[i, a]
+    for v in range(count):
+        for a in range(3):
+            means[v, a] /= max(numbers[v], 1)
+    for i in range(len(cells)):
+        v = cells[i]
+        for a in range(3):
+            for b in range(3):
+                covariances[v, a, b] += (points[i, a] - means[v, a]) * (points[i, b] - means[v, b])
+    for v in range(count):
+        for a in range(3):
+            for b in range(3):
+                covariances[v, a, b] /= max(numbers[v], 1)
+    return numbers, means, covariances
+
+
+@kernel
+def spectra(covariances: Floats) -> Floats:
+    """Eigenvalues (V, 3) of symmetric matrices (V, 3, 3), smallest first."""
+    out = np.empty((len(covariances), 3))
+    for v in range(len(covariances)):
+        out[v] = np.sort(eigen(covariances[v])[0])
+    return out
+
+
+@inline_with_arrays
+def across(n: Floats, C: Floats, out: Floats) -> None:
+    """X C into `out` (3, 3), where X e = e x n."""
+    for k in range(3):
+        out[0, k] = n[2] * C[1, k] - n[1] * C[2, k]
+        out[1, k] = n[0] * C[2, k] - n[2] * C[0, k]
+        out[2, k] = n[1] * C[0, k] - n[0] * C[1, k]
+
+
+@inline_with_arrays
+def lever(n: Floats, mean: Floats, origin: Floats, out: Floats) -> None:
+    """Effect (6,) of a pose's correction on the distance of a point `mean` from a plane of normal `n`."""
+    x, y, z = mean[0] - origin[0], mean[1] - origin[1], mean[2] - origin[2]
+    out[0], out[1], out[2] = n[0], n[1], n[2]
+    out[3], out[4], out[5] = y * n[2] - z * n[1], z * n[0] - x * n[2], x * n[1] - y * n[0]
+
+
+@kernel
+def equations(
+    starts: Longs, poses: Longs, shares: Floats, means: Floats, covariances: Floats, origins: Floats, floor: float
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Normal equations of the poses, and what the planes take from them.
+
+    starts : (V + 1,) first sighting of each plane; poses : (C,) the first of both poses of a sighting
+    shares : (C,) 0..1; means : (C, 3), covariances : (C, 3, 3) of the sightings, m and m2, world
+    origins : (K, 3) m, of the sensor; floor : m2, added to the variance about a plane
+
+    Every sighting is one measurement of the variance about its plane: its points have errors in common.
+    Returns blocks (K, 6, 6) on the diagonal and (K, 6, 6) beside it, gradient (K, 6), coupling (C, 2, 6, 3) of the sightings with
+    the planes, and the inverse (V, 3, 3) of the planes' own blocks.
+    """
+    count = len(origins)
+    H, beside, g = np.zeros((count, 6, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6))
+    coupling, planes = np.zeros((len(poses), 2, 6, 3)), np.zeros((len(starts) - 1, 3, 3))
+    A, Q, own = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    d, J = np.empty(3), np.empty((2, 6))
+    K, pull, Cn, turned = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for v in range(len(starts) - 1):
+        first, last = starts[v], starts[v + 1]
+        size = float(last - first)
+        middle = np.zeros(3)
+        for c in range(first, last):
+            for a in range(3):
+                middle[a] += means[c, a] / size
+        A[:] = 0.0
+        for c in range(first, last):
+            for a in range(3):
+                for b in range(3):
+                    spread = (means[c, a] - middle[a]) * (means[c, b] - middle[b])
+                    A[a, b] += (covariances[c, a, b] + spread) / size
+        values, axes = eigen(A)
+        order = np.argsort(values)
+        n, u, w = axes[:, order[0]].copy(), axes[:, order[1]].copy(), axes[:, order[2]].copy()
+        weight = 1.0 / (max(values[order[0]], 0.0) + floor)
+        own[:] = 0.0
+        pull[:] = 0.0
+        for c in range(first, last):
+            C = covariances[c]
+            for a in range(3):
+                d[a] = means[c, a] - middle[a]
+            r = n[0] * d[0] + n[1] * d[1] + n[2] * d[2]
+            K[0], K[1], K[2] = 1.0, u @ d, w @ d
+            for a in range(3):
+                Cn[a] = C[a, 0] * n[0] + C[a, 1] * n[1] + C[a, 2] * n[2]
+            across(n, C, Q)
+            for a in range(3):
+                turned[a] = Q[a, 0] * n[0] + Q[a, 1] * n[1] + Q[a, 2] * n[2]
+            # Errors of the plane: offset, and slopes along u and w.
+            uu = uw = ww = 0.0
+            for a in range(3):
+                for b in range(3):
+                    uu += u[a] * C[a, b] * u[b]
+                    uw += u[a] * C[a, b] * w[b]
+                    ww += w[a] * C[a, b] * w[b]
+            for i in range(3):
+                pull[i] += weight * K[i] * r
+                for j in range(3):
+                    own[i, j] += weight * K[i] * K[j]
+            own[1, 1] += weight * uu
+            own[1, 2] += weight * uw
+            own[2, 1] += weight * uw
+            own[2, 2] += weight * ww
+            pull[1] += weight * (u @ Cn)
+            pull[2] += weight * (w @ Cn)
+            for side in range(2):
+                share = shares[c] if side else 1.0 - shares[c]
+                k = poses[c] + side
+                if share == 0.0:
+                    continue
+                lever(n, means[c], origins[k], J[side])
+                f = weight * share
+                for i in range(6):
+                    g[k, i] += f * J[side, i] * r
+                    for j in range(3):
+                        coupling[c, side, i, j] = f * J[side, i] * K[j]
+                for a in range(3):
+                    g[k, 3 + a] += f * turned[a]
+                    for b in range(3):
+                        coupling[c, side, 3 + a, 1] += f * Q[a, b] * u[b]
+                        coupling[c, side, 3 + a, 2] += f * Q[a, b] * w[b]
+            for side in range(2):
+                for other in range(side, 2):
+                    a_share = shares[c] if side else 1.0 - shares[c]
+                    b_share = shares[c] if other else 1.0 - shares[c]
+                    f = weight * a_share * b_share
+                    if f == 0.0:
+                        continue
+                    block = H[poses[c] + side] if side == other else beside[poses[c]]
+                    for i in range(6):
+                        for j in range(6):
+                            block[i, j] += f * J[side, i] * J[other, j]
+                    # X C X^T is that of the rows of X C once more.
+                    for a in range(3):
+                        block[3 + a, 3] += f * (n[2] * Q[a, 1] - n[1] * Q[a, 2])
+                        block[3 + a, 4] += f * (n[0] * Q[a, 2] - n[2] * Q[a, 0])
+                        block[3 + a, 5] += f * (n[1] * Q[a, 0] - n[0] * Q[a, 1])
+        planes[v] = inverse(own)
+        for i in range(3):
+            Cn[i] = planes[v, i, 0] * pull[0] + planes[v, i, 1] * pull[1] + planes[v, i, 2] * pull[2]
+        for c in range(first, last):
+            for side in range(2):
+                if poses[c] + side < count:
+                    for i in range(6):
+                        for j in range(3):
+                            g[poses[c] + side, i] -= coupling[c, side, i, j] * Cn[j]
+    return H, beside, g, coupling, planes
+
+
+@kernel
+def product(
+    x: Floats,
+    H: Floats,
+    beside: Floats,
+    starts: Longs,
+    poses: Longs,
+    coupling: Floats,
+    planes: Floats,
+    stiffness: Floats,
+    out: Floats,
+) -> None:
+    """Product of the reduced normal matrix with x (K, 6), into `out` (K, 6): the planes are eliminated.
+
+    stiffness : (6,) of the difference of two successive corrections, 1/m2 and 1/rad2
+    """
+    count = len(x)
+    for k in range(count):
+        for i in range(6):
+            total = 0.0
+            for j in range(6):
+                total += H[k, i, j] * x[k, j]
+            out[k, i] = total
+    for k in range(count - 1):
+        for i in range(6):
+            force = stiffness[i] * (x[k + 1, i] - x[k, i])
+            out[k + 1, i] += force
+            out[k, i] -= force
+            for j in range(6):
+                out[k, i] += beside[k, i, j] * x[k + 1, j]
+                out[k + 1, j] += beside[k, i, j] * x[k, i]
+    z, y = np.empty(3), np.empty(3)
+    for v in range(len(starts) - 1):
+        z[:] = 0.0
+        for c in range(starts[v], starts[v + 1]):
+            for side in range(min(2, count - poses[c])):
+                for i in range(6):
+                    for j in range(3):
+                        z[j] += coupling[c, side, i, j] * x[poses[c] + side, i]
+        for i in range(3):
+            y[i] = planes[v, i, 0] * z[0] + planes[v, i, 1] * z[1] + planes[v, i, 2] * z[2]
+        for c in range(starts[v], starts[v + 1]):
+            for side in range(min(2, count - poses[c])):
+                for i in range(6):
+                    for j in range(3):
+                        out[poses[c] + side, i] -= coupling[c, side, i, j] * y[j]
+
+
+@kernel
+def inverses(blocks: Floats) -> Floats:
+    """Inverse (K, 6, 6) of each block."""
+    out = np.empty_like(blocks)
+    for k in range(len(blocks)):
+        out[k] = inverse(blocks[k])
+    return out

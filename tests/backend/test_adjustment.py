@@ -1,0 +1,127 @@
+"""Plane adjustment: its equations against a dense oracle, and poses that come back to where they were."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lslam.backend.adjustment import SweptPoints, adjust, find_planes
+from lslam.backend.kernels import plane_adjustment
+from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Floats, Longs
+
+
+def in_room(poses: Floats, of_a_scan: int, rng: np.random.Generator, noise: float = 0.005) -> tuple[Floats, Longs]:
+    """Points of floor and four walls of a room of 12 x 8 x 3 m in the frame of each pose, and the pose of each."""
+    parts = []
+    for T in poses:
+        u = rng.random((of_a_scan, 3)) * [12.0, 8.0, 3.0]
+        wall = rng.integers(0, 5, of_a_scan)
+        for k, (axis, at) in enumerate([(2, 0.0), (0, 0.0), (0, 12.0), (1, 0.0), (1, 8.0)]):
+            u[wall == k, axis] = at + noise * rng.normal(size=int((wall == k).sum()))
+        parts.append(se3.apply(se3.inverse(T), u))
+    return np.concatenate(parts), np.repeat(np.arange(len(poses)), of_a_scan)
+
+
+def walk(count: int) -> Floats:
+    """Poses (count, 4, 4) along a curve through the room."""
+    s = np.linspace(0.0, 1.0, count)
+    t = np.column_stack([2 + 8 * s, 4 + 2 * np.sin(6 * s), 1.5 + 0.1 * np.sin(20 * s)])
+    return se3.make(so3.exp(np.column_stack([0 * s, 0 * s, 2 * s])), t)
+
+
+def ate(poses: Floats, truth: Floats) -> float:
+    T, _, _ = se3.umeyama(poses[:, :3, 3], truth[:, :3, 3])
+    return float(np.sqrt(np.mean(np.sum((se3.apply(T, poses[:, :3, 3]) - truth[:, :3, 3]) ** 2, axis=1))))
+
+
+def test_the_reduced_equations_are_those_of_all_points_with_the_plane_eliminated() -> None:
+    rng = np.random.default_rng(0)
+    origins = rng.normal(size=(3, 3))
+    sightings, each = [(0, 0.3), (1, 0.0), (1, 0.6), (2, 0.0)], 7
+    points = [np.column_stack([rng.normal(size=(each, 2)), 0.03 * rng.normal(size=each)]) for _ in sightings]
+    cells = np.repeat(np.arange(4), each)
+    numbers, means, covariances = plane_adjustment.sums(cells, 4, np.concatenate(points))
+    assert (numbers == each).all()
+    starts, at = np.array([0, 4]), np.array([k for k, _ in sightings])
+    shares = np.array([share for _, share in sightings])
+    floor = 1e-4
+    H, beside, g, coupling, planes = plane_adjustment.equations(starts, at, shares, means, covariances, origins, floor)
+
+    everything = np.concatenate(points)
+    middle = everything.mean(axis=0)
+    values, axes = np.linalg.eigh(np.cov(everything.T, bias=True))
+    n = axes[:, 0]
+    weight = 1.0 / (values[0] + floor) / each
+    J, K, r = np.zeros((4 * each, 18)), np.zeros((4 * each, 3)), (everything - middle) @ n
+    for i, p in enumerate(everything):
+        k, share = sightings[i // each]
+        for node, part in ((k, 1.0 - share), (k + 1, share)):
+            if part:
+                J[i, 6 * node : 6 * node + 3] += part * n
+                J[i, 6 * node + 3 : 6 * node + 6] += part * np.cross(p - origins[node], n)
+        K[i] = [1.0, (p - middle) @ axes[:, 1], (p - middle) @ axes[:, 2]]
+    project = np.eye(len(r)) - K @ np.linalg.solve(K.T @ K, K.T)
+    whole, right = weight * J.T @ project @ J, weight * J.T @ project @ r
+    stiffness = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    chain = np.kron(np.array([[1, -1, 0], [-1, 2, -1], [0, -1, 1]]), np.diag(stiffness))
+    x, out = rng.normal(size=(3, 6)), np.empty((3, 6))
+    plane_adjustment.product(x, H, beside, starts, at, coupling, planes, stiffness, out)
+    np.testing.assert_allclose(out.ravel(), (whole + chain) @ x.ravel(), rtol=1e-8, atol=1e-6)
+    np.testing.assert_allclose(g.ravel(), right, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_poses_that_drifted_come_back(seed: int) -> None:
+    """A steady drift of 1 % and noise of 3 mm: no scan is registered anew, planes alone say where they are."""
+    rng, truth = np.random.default_rng(seed), walk(60)
+    points, scans = in_room(truth, 400, rng)
+    way = np.arange(60)[:, None]
+    drifted = truth.copy()
+    drifted[:, :3, :3] = so3.exp(0.0006 * way * [0.2, -0.3, 1.0]) @ truth[:, :3, :3]
+    drifted[:, :3, 3] += 0.0015 * way * [1.0, -1.0, 0.5] + 0.003 * rng.normal(size=(60, 3))
+    world = np.einsum("nij,nj->ni", drifted[scans, :3, :3], points) + drifted[scans, :3, 3]
+    swept = SweptPoints(world, scans, np.zeros(len(world)))
+    found = adjust(drifted, swept, np.ones(len(world), bool))
+    assert ate(found.poses, truth) < min(0.005, 0.2 * ate(drifted, truth))
+
+
+def test_points_move_with_the_poses_round_the_instant_they_were_measured() -> None:
+    swept = SweptPoints.at_times(
+        np.array([[1.0, 0, 0]] * 5), np.array([-0.1, 0.0, 0.05, 0.1, 0.3]), np.array([0.0, 0.1])
+    )
+    np.testing.assert_array_equal(swept.poses, [0, 0, 0, 1, 1])
+    np.testing.assert_allclose(swept.shares, [0.0, 0.0, 0.5, 0.0, 0.0])
+    corrections = np.zeros((2, 6))
+    corrections[1] = [0.2, 0, 0, 0, 0, np.pi / 2]
+    moved = swept.moved(np.stack([np.eye(4), np.eye(4)]), corrections)
+    np.testing.assert_allclose(moved[[0, 3]], [[1, 0, 0], [0.2, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(moved[2], [0.6, 0.5, 0], atol=1e-12)
+
+
+def test_knots_keep_the_place_of_every_point() -> None:
+    swept = SweptPoints(np.zeros((4, 3)), np.array([0, 3, 10, 12]), np.array([0.5, 0.0, 0.5, 0.0]))
+    on = swept.on_knots(np.array([0, 10, 12]))
+    np.testing.assert_array_equal(on.poses, [0, 0, 1, 2])
+    np.testing.assert_allclose(on.shares, [0.05, 0.3, 0.25, 0.0])
+
+
+def test_what_is_no_plane_is_none() -> None:
+    """A wall is one plane from many scans; a bush is none, nor what three scans saw, nor a pole."""
+    rng = np.random.default_rng(1)
+    wall = np.column_stack([rng.random((200, 1)) * 0.01, rng.random((200, 2)) * 1.9])
+    bush = rng.random((200, 3)) * 0.4 + [10, 10, 10]
+    pole = np.column_stack([0.01 * rng.normal(size=(200, 2)) + 20.5, rng.random(200)])
+    scans = np.arange(200) % 8
+    planes = find_planes(np.concatenate([wall, bush, pole]), np.tile(scans, 3), 0.005)
+    assert (planes[:200] == 0).all()
+    assert (planes[200:] == -1).all()
+    assert (find_planes(wall, scans % 3, 0.005) == -1).all()
+
+
+def test_without_planes_nothing_moves() -> None:
+    rng, poses = np.random.default_rng(2), walk(12)
+    swept = SweptPoints(rng.random((600, 3)) * 30, np.repeat(np.arange(12), 50), np.zeros(600))
+    found = adjust(poses, swept, np.ones(600, bool))
+    np.testing.assert_array_equal(found.poses, poses)
+    assert found.rounds == 0

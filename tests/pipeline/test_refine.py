@@ -1,0 +1,94 @@
+"""`graph.refine` of whole runs: drift is undone, what is right stays as it is, and points that were kept out decide."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from graph_builders import ate
+
+import lslam
+from lslam.core.config import load_config
+from lslam.core.errors import InterruptedRunError
+from lslam.core.types.sequence import Sequence
+from lslam.pipeline.refine_pass import _taken
+from lslam.pipeline.watch import RunOutcome, Watch
+from lslam.simulation.scenarios import simulate
+
+SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
+DRIFT = ("debug.drift=true", "debug.drift_percent=1", "debug.drift_deg_per_100m=1", "loops.use=false")
+SHORT = ("input.count=60", "report.html=false", "map.write=false")
+
+
+def made(sequence: Sequence | Path, *settings: str, out: Path | None = None, watch: Watch | None = None) -> RunOutcome:
+    return lslam.run(sequence, load_config(None, [*SHORT, *settings], {}), out=out, watch=watch, resume=out is not None)
+
+
+@pytest.fixture(scope="module", params=[31, 32])
+def drive(request: pytest.FixtureRequest) -> Sequence:
+    return simulate("small-eight", seed=request.param, lidar="vlp16", count=60)
+
+
+def test_drift_is_undone_without_a_loop(drive: Sequence) -> None:
+    assert drive.ground_truth is not None
+    truth = drive.ground_truth.poses
+    before, after = (made(drive, *DRIFT, f"graph.refine={refine}").record for refine in ("false", "true"))
+    assert ate(after.trajectory.poses, truth) < 0.2 * ate(before.trajectory.poses, truth)
+    np.testing.assert_allclose(after.trajectory.poses[0], before.trajectory.poses[0], atol=1e-9)
+    facts = after.manifest["refinement"]
+    assert facts["is_taken"]
+    assert facts["thickness_mm"] < facts["thickness_before_mm"]
+    assert facts["moved_most_m"] > 0.1
+
+
+def test_poses_that_no_plane_contradicts_do_not_get_worse(drive: Sequence) -> None:
+    assert drive.ground_truth is not None
+    truth = drive.ground_truth.poses
+    before, after = (made(drive, f"graph.refine={refine}").record for refine in ("false", "true"))
+    if not after.manifest["refinement"]["is_taken"]:
+        np.testing.assert_array_equal(after.trajectory.poses, before.trajectory.poses)
+    assert ate(after.trajectory.poses, truth) < 1.02 * ate(before.trajectory.poses, truth) + 1e-4
+
+
+def test_fixes_hold_the_poses() -> None:
+    """Planes know nothing of them: the run keeps its poses, and says why."""
+    before, after = (made(SAMPLE, "gnss.mode=graph", f"graph.refine={refine}").record for refine in ("false", "true"))
+    np.testing.assert_array_equal(after.trajectory.poses, before.trajectory.poses)
+    assert after.manifest["refinement"]["is_taken"] is False
+    assert "fixes" in after.manifest["refinement"]["why"]
+
+
+def test_only_windows_whose_planes_became_thinner_are_taken() -> None:
+    """The third window gets thinner by a tenth of what its cells differ by: chance."""
+    rng = np.random.default_rng(0)
+    scans, cells = np.repeat(np.arange(200), 20), np.tile(np.arange(20), 200)
+    window = scans // 50
+    differing = rng.normal(size=(4, 20)) * [[0.01], [0.01], [0.5], [0.01]]
+    differing -= differing.mean(axis=1, keepdims=True)
+    gain = np.array([-0.1, 0.1, -0.05, -0.1])[window] + differing[window, cells]
+    gain[[3, 3000]] = np.nan
+    taken = _taken(gain, scans, np.column_stack([cells, 0 * cells, 0 * cells]), 200)
+    np.testing.assert_array_equal(np.flatnonzero(~taken), np.arange(50, 150))
+    assert not _taken(np.full(4, np.nan), np.arange(4), np.zeros((4, 3), np.int64), 4).any()
+
+
+def test_it_goes_on_to_the_same_bytes_with_any_number_of_threads(tmp_path: Path) -> None:
+    settings = (*DRIFT, "graph.refine=true")
+    made(SAMPLE, *settings, "input.threads=1", out=tmp_path / "one")
+
+    def is_refining() -> bool:
+        frame = sys._getframe(1)
+        while frame is not None and frame.f_code.co_name != "refine_poses":
+            frame = frame.f_back  # type: ignore[assignment]
+        return frame is not None
+
+    with pytest.raises(InterruptedRunError, match="while the poses were refined"):
+        made(SAMPLE, *settings, "input.threads=2", out=tmp_path / "two", watch=Watch(should_stop=is_refining))
+    assert json.loads((tmp_path / "two" / "manifest.json").read_text())["status"] == "interrupted"
+    made(SAMPLE, *settings, "input.threads=2", out=tmp_path / "two")
+    for name in ("trajectory.tum", "evaluation.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    assert json.loads((tmp_path / "two" / "manifest.json").read_text())["refinement"]["is_taken"]
