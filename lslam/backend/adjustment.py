@@ -1,6 +1,6 @@
 """Plane adjustment: all poses of a run are corrected at once, so that what many scans saw of a plane lies on one plane.
 
-The cost is the variance of points about the planes of adaptive voxels, as in BALM2 (Liu, Liu and Zhang, 2022). Planes are
+The cost is the variance of points about the planes of adaptive voxels, as in BALM2 (Liu et al. 2023). Planes are
 eliminated, and the reduced system is solved by conjugate gradients, since a plane joins all scans that saw it. Corrections vary
 linearly from one pose to the next, so that the motion within a sweep is corrected as well.
 """
@@ -26,7 +26,7 @@ LEVER_M = 10.0  # m, at which a rotation counts as much as the translation
 
 
 @dataclass(frozen=True)
-class Level:
+class AdjustmentLevel:
     """One level of the adjustment, from coarse to fine.
 
     scans : between two knots, of which the corrections are unknowns; those between are interpolated
@@ -45,7 +45,7 @@ class Level:
 
 
 # Walls that lie apart are brought together first, by knots so few that nothing else is changed; then every pose.
-LEVELS = (Level(10, 0.02, 0.02, True, 8, 5e-3), Level(1, 0.005, 1.5e-3, False, 4, 5e-4))
+LEVELS = (AdjustmentLevel(10, 0.02, 0.02, True, 8, 5e-3), AdjustmentLevel(1, 0.005, 1.5e-3, False, 4, 5e-4))
 # Conjugate gradients: steps at most, and the part of the first residual that ends them.
 STEPS, ACCURACY = 300, 1e-4
 
@@ -135,7 +135,7 @@ def _moved(poses: Floats, places: SweptPoints, knots: Floats, corrections: Float
     return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], places.moved(knots, corrections)))
 
 
-def _corrections(poses: Floats, swept: SweptPoints, level: Level, total: Floats) -> Floats | None:
+def _corrections(poses: Floats, swept: SweptPoints, level: AdjustmentLevel, total: Floats) -> Floats | None:
     """(K, 6) corrections of one Gauss-Newton step; None without planes."""
     planes = find_planes(swept.points, swept.poses, level.flatness)
     on_plane = planes >= 0
