@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -25,11 +24,10 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.map_pass import motion_within, scans_again, without_box
 from lslam.registration.preprocessing.deskew import deskew_points
 
-log = logging.getLogger("lslam")
 # Points of a scan at most, and of all scans: about 300 bytes each while planes are adjusted.
 OF_A_SCAN, OF_ALL = 3000, 6_000_000
 CELL_M = 2.0  # m, edge of the cells of which every second one is kept out of the adjustment
-JUDGES = 100_000  # points, at most, about which the thickness is looked at
+JUDGES = 20_000  # points, at most, about which the thickness is looked at
 # Scans that are judged together, least cells by which they are, and sigmas by which their planes must be thinner.
 WINDOW, LEAST_CELLS, SIGMAS = 50, 10, 3.0
 INTERRUPTED = "interrupted while the poses were refined"
@@ -45,8 +43,7 @@ def refine_poses(job: PreparedRun, record: RunRecord) -> None:
         return
     held = record.osm is not None or bool(job.manual.points)
     if held or (record.georeference is not None and record.georeference.is_in_graph):
-        log.info("not refined: fixes, control points or buildings hold the poses, of which the planes know nothing")
-        manifest.refinement = {"is_taken": False, "why": "poses are held by fixes, control points or buildings"}
+        manifest.refinement = {"is_taken": False, "why": "fixes, control points or buildings hold the poses"}
         return
     results = [result.at_stamp for result in record.results]
     nodes = np.array([k for k, r in enumerate(results) if r.status == "ok" and not r.frame], np.int64)
@@ -65,7 +62,6 @@ def refine_poses(job: PreparedRun, record: RunRecord) -> None:
             return
     facts, refined_results = refined
     manifest.refinement = facts
-    log.info("%s", _sentence(facts))
     if refined_results is not None:
         record.results = refined_results
         record.trajectory = to_trajectory(record.results, record.method)
@@ -128,7 +124,7 @@ def _refined(
     is_judge = np.isfinite(gain) & is_taken[kept_out.poses[queries]]
     facts: dict[str, Any] = {"is_taken": bool(is_taken.any()), "scans": int(is_taken.sum()), "rounds": found.rounds}
     if not is_taken.any():
-        return {**facts, "why": "planes do not become thinner"}, None
+        return {**facts, "why": "planes of the points kept out do not get thinner"}, None
     # The first pose stays: the world begins there.
     T = before[0] @ se3.inverse(found.poses[0])
     after = se3.normalise(T @ found.poses)
@@ -167,13 +163,3 @@ def _taken(gain: Floats, scans: Longs, cells: Longs, count: int) -> Bools:
 def _thickness_mm(variances: Floats) -> float:
     """The geometric mean of the thickness."""
     return round(1e3 * float(np.exp(0.5 * np.log(np.maximum(variances, 1e-12)).mean())), 1)
-
-
-def _sentence(facts: dict[str, Any]) -> str:
-    if not facts["is_taken"]:
-        return "not refined: planes of the points that were kept out do not become thinner"
-    return (
-        f"refined {facts['scans']} scans: planes of the points that were kept out are {facts['thinner_percent']} % thinner, "
-        f"{facts['thickness_mm']} mm in place of {facts['thickness_before_mm']}; poses moved by {facts['moved_rms_m']} m rms, "
-        f"{facts['moved_most_m']} m at most"
-    )

@@ -63,6 +63,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
     rows += imu_rows(record)
     rows += localization_rows(record, evaluation) + back_end_rows(record, evaluation)
+    rows += _refined_rows(record)
     rows += _score_rows(record, evaluation)
     rows += _map_rows(record)
     rows += _time_rows(record, facts)
@@ -150,6 +151,18 @@ def _score_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tuple[
         why = "ground truth could not be compared" if record.ground_truth is not None else "no ground truth is known"
         return [("errors", f"not stated: {why}")]
     return [row for metric in shown_metrics(evaluation) for row in metric.summary(evaluation)]
+
+
+def _refined_rows(record: RunRecord) -> list[tuple[str, str]]:
+    """Name and value on what `--refine` did; empty without it."""
+    facts = record.manifest.get("refinement")
+    if not facts:
+        return []
+    if not facts["is_taken"]:
+        return [("refined", f"no scan: {facts['why']}")]
+    thickness = f"planes of the points kept out {facts['thickness_mm']} mm thick, {facts['thickness_before_mm']} before"
+    moved = f"poses moved {facts['moved_rms_m']} m rms, {facts['moved_most_m']} m at most"
+    return [("refined", f"{counted(facts['scans'], 'scan')}: {thickness}; {moved}")]
 
 
 def _map_rows(record: RunRecord) -> list[tuple[str, str]]:

@@ -16,6 +16,7 @@ from lslam.core.errors import InterruptedRunError
 from lslam.core.types.sequence import Sequence
 from lslam.pipeline.refine_pass import _taken
 from lslam.pipeline.watch import RunOutcome, Watch
+from lslam.reports.text import summary
 from lslam.simulation.scenarios import simulate
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
@@ -42,6 +43,7 @@ def test_drift_is_undone_without_a_loop(drive: Sequence) -> None:
     assert facts["is_taken"]
     assert facts["thickness_mm"] < facts["thickness_before_mm"]
     assert facts["moved_most_m"] > 0.1
+    assert f"60 scans: planes of the points kept out {facts['thickness_mm']} mm thick" in summary(after, None)
 
 
 def test_poses_that_no_plane_contradicts_do_not_get_worse(drive: Sequence) -> None:
@@ -58,7 +60,7 @@ def test_fixes_hold_the_poses() -> None:
     before, after = (made(SAMPLE, "gnss.mode=graph", f"graph.refine={refine}").record for refine in ("false", "true"))
     np.testing.assert_array_equal(after.trajectory.poses, before.trajectory.poses)
     assert after.manifest["refinement"]["is_taken"] is False
-    assert "fixes" in after.manifest["refinement"]["why"]
+    assert "refined      no scan: fixes, control points or buildings hold the poses" in summary(after, None)
 
 
 def test_only_windows_whose_planes_became_thinner_are_taken() -> None:
