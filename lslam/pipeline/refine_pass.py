@@ -24,8 +24,9 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.map_pass import motion_within, scans_again, without_box
 from lslam.registration.preprocessing.deskew import deskew_points
 
-# Points of a scan at most, and of all scans: about 300 bytes each while planes are adjusted.
-OF_A_SCAN, OF_ALL = 3000, 6_000_000
+# Points of a scan at most, and of all scans: about 300 bytes each while planes are adjusted. Odometry averages over all points,
+# which fewer single ones do not beat.
+OF_A_SCAN, OF_ALL = 10_000, 6_000_000
 CELL_M = 2.0  # m, edge of the cells of which every second one is kept out of the adjustment
 JUDGES = 20_000  # points, at most, about which the thickness is looked at
 # Scans that are judged together, least cells by which they are, and sigmas by which their planes must be thinner.
