@@ -49,26 +49,26 @@ def refine_poses(job: PreparedRun, record: RunRecord) -> None:
     results = [result.at_stamp for result in record.results]
     nodes = np.array([k for k, r in enumerate(results) if r.status == "ok" and not r.frame], np.int64)
     if len(nodes) < 2:
+        manifest.refinement = {"is_taken": False, "why": "fewer than two scans are registered"}
         return
     watch.on_start("refinement", len(results))
     with manifest.timed("refine_s"):
         try:
-            swept = _gathered(job, results, nodes)
+            swept = read_points(job, results, nodes)
             if not len(swept.points):
+                manifest.refinement = {"is_taken": False, "why": "no point lies within the range of the map"}
                 return
             with asking(watch.should_stop, INTERRUPTED):
-                refined = _refined(results, nodes, swept)
+                manifest.refinement, adjustment = _adjustment(results, nodes, swept)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return
-    facts, refined_results = refined
-    manifest.refinement = facts
-    if refined_results is not None:
-        record.results = refined_results
+    if adjustment is not None:
+        record.results = adjustment
         record.trajectory = to_trajectory(record.results, record.method)
 
 
-def _gathered(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> SweptPoints:
+def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> SweptPoints:
     """Points of the scans `nodes` (K,) in the world, each between the two poses round the instant it was measured."""
     config, watch = job.config, job.watch
     stamps, poses = (np.array([getattr(r, name) for r in results]) for name in ("stamp_ns", "T_world_lidar"))
@@ -108,7 +108,7 @@ def _poser(
     return posed
 
 
-def _refined(
+def _adjustment(
     results: list[ScanResult], nodes: Longs, swept: SweptPoints
 ) -> tuple[dict[str, Any], list[ScanResult] | None]:
     """What the manifest says, and the results with refined poses; None where these are not better."""
@@ -121,7 +121,7 @@ def _refined(
     thick = [plane_variances(np.ascontiguousarray(p), queries) for p in (kept_out.points, found.points[~is_used])]
     gain = 0.5 * np.log(np.maximum(thick[1], 1e-12) / np.maximum(thick[0], 1e-12))
     cells = np.floor(kept_out.points[queries] / CELL_M).astype(np.int64)
-    is_taken = _taken(gain, kept_out.poses[queries], cells, len(nodes))
+    is_taken = thinner_windows(gain, kept_out.poses[queries], cells, len(nodes))
     is_judge = np.isfinite(gain) & is_taken[kept_out.poses[queries]]
     facts: dict[str, Any] = {"is_taken": bool(is_taken.any()), "scans": int(is_taken.sum()), "rounds": found.rounds}
     if not is_taken.any():
@@ -133,7 +133,8 @@ def _refined(
         Keyframe(number, int(k), results[k].stamp_ns, before[i])
         for number, (i, k) in enumerate((i, nodes[i]) for i in np.flatnonzero(is_taken).tolist())
     ]
-    moved = bent(results, anchors, after[is_taken])
+    # Poses in frames of their own know nothing of these.
+    moved = [b if not a.frame else a for a, b in zip(results, bent(results, anchors, after[is_taken]), strict=True)]
     away = np.linalg.norm(after[is_taken, :3, 3] - before[is_taken, :3, 3], axis=1)
     facts |= {
         "thickness_before_mm": _thickness_mm(thick[0][is_judge]),
@@ -145,7 +146,7 @@ def _refined(
     return facts, moved
 
 
-def _taken(gain: Floats, scans: Longs, cells: Longs, count: int) -> Bools:
+def thinner_windows(gain: Floats, scans: Longs, cells: Longs, count: int) -> Bools:
     """(K,) whether each of `count` scans lies in a window whose planes became significantly thinner.
 
     gain : (N,) of the logarithm of the thickness about points of `scans` (N,) in `cells` (N, 3), which are one measurement each

@@ -14,7 +14,7 @@ import lslam
 from lslam.core.config import load_config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.types.sequence import Sequence
-from lslam.pipeline.refine_pass import _taken
+from lslam.pipeline.refine_pass import thinner_windows
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.reports.text import summary
 from lslam.simulation.scenarios import simulate
@@ -63,6 +63,13 @@ def test_fixes_hold_the_poses() -> None:
     assert "refined      no scan: fixes, control points or buildings hold the poses" in summary(after, None)
 
 
+def test_without_points_in_range_the_run_says_so(drive: Sequence) -> None:
+    beyond = ("map.range_min=500", "map.range_max=600", "map.occupancy_range=600")
+    before, after = (made(drive, *beyond, f"graph.refine={refine}").record for refine in ("false", "true"))
+    np.testing.assert_array_equal(after.trajectory.poses, before.trajectory.poses)
+    assert "refined      no scan: no point lies within the range of the map" in summary(after, None)
+
+
 def test_only_windows_whose_planes_became_thinner_are_taken() -> None:
     """The third window gets thinner by a tenth of what its cells differ by: chance."""
     rng = np.random.default_rng(0)
@@ -72,9 +79,9 @@ def test_only_windows_whose_planes_became_thinner_are_taken() -> None:
     differing -= differing.mean(axis=1, keepdims=True)
     gain = np.array([-0.1, 0.1, -0.05, -0.1])[window] + differing[window, cells]
     gain[[3, 3000]] = np.nan
-    taken = _taken(gain, scans, np.column_stack([cells, 0 * cells, 0 * cells]), 200)
+    taken = thinner_windows(gain, scans, np.column_stack([cells, 0 * cells, 0 * cells]), 200)
     np.testing.assert_array_equal(np.flatnonzero(~taken), np.arange(50, 150))
-    assert not _taken(np.full(4, np.nan), np.arange(4), np.zeros((4, 3), np.int64), 4).any()
+    assert not thinner_windows(np.full(4, np.nan), np.arange(4), np.zeros((4, 3), np.int64), 4).any()
 
 
 def test_it_goes_on_to_the_same_bytes_with_any_number_of_threads(tmp_path: Path) -> None:
