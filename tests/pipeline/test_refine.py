@@ -11,9 +11,12 @@ import pytest
 from graph_builders import ate
 
 import lslam
+from lslam.backend.adjustment import Adjusted, SweptPoints
 from lslam.core.config import load_config
 from lslam.core.errors import InterruptedRunError
+from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
+from lslam.pipeline import refine_pass
 from lslam.pipeline.refine_pass import thinner_windows
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.reports.text import summary
@@ -82,6 +85,25 @@ def test_only_windows_whose_planes_became_thinner_are_taken() -> None:
     taken = thinner_windows(gain, scans, np.column_stack([cells, 0 * cells, 0 * cells]), 200)
     np.testing.assert_array_equal(np.flatnonzero(~taken), np.arange(50, 150))
     assert not thinner_windows(np.full(4, np.nan), np.arange(4), np.zeros((4, 3), np.int64), 4).any()
+
+
+def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The correction is that of another frame; the scan that was bridged beside it follows."""
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = np.arange(6)
+    results = [
+        ScanResult(k, 10**8 * k, poses[k], frame=int(k == 2), status="bridged" if k == 3 else "ok") for k in range(6)
+    ]
+    nodes, better = np.array([0, 1, 4, 5]), poses.copy()
+    better[:, 1, 3] = 0.1 * np.arange(6)
+    monkeypatch.setattr(refine_pass, "adjust", lambda before, swept, used: Adjusted(better[nodes], swept.points, 1))
+    monkeypatch.setattr(refine_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
+    swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
+    facts, moved = refine_pass._adjustment(results, nodes, swept)
+    assert moved is not None
+    assert facts["scans"] == 4
+    np.testing.assert_array_equal(moved[2].T_world_lidar, poses[2])
+    np.testing.assert_allclose([moved[k].T_world_lidar for k in (0, 1, 3, 4, 5)], better[[0, 1, 3, 4, 5]], atol=1e-9)
 
 
 def test_it_goes_on_to_the_same_bytes_with_any_number_of_threads(tmp_path: Path) -> None:
