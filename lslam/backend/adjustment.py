@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lslam.backend.graph.held_poses import HeldPoses
 from lslam.backend.kernels import plane_adjustment
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import noise, se3, so3
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Bools, Floats, Longs
 
@@ -46,6 +47,7 @@ class AdjustmentLevel:
 
 # Walls that lie apart are brought together first, by knots so few that nothing else is changed; then every pose.
 LEVELS = (AdjustmentLevel(10, 0.02, 0.02, True, 8, 5e-3), AdjustmentLevel(1, 0.005, 1.5e-3, False, 4, 5e-4))
+NO_NUMBERS: Longs = np.zeros(0, np.int64)
 # Conjugate gradients: steps at most, and the part of the first residual that ends them.
 STEPS, ACCURACY = 300, 1e-4
 
@@ -103,10 +105,13 @@ class Adjusted:
     rounds: int
 
 
-def adjust(poses: Floats, swept: SweptPoints, used: Bools) -> Adjusted:
+def adjust(
+    poses: Floats, swept: SweptPoints, used: Bools, held: HeldPoses | None = None, numbers: Longs = NO_NUMBERS
+) -> Adjusted:
     """Correct the `poses` (K, 4, 4) for the planes in the `used` (N,) part of the points; the rest moves with them.
 
-    Nothing holds the run as a whole: the mean correction is about zero.
+    held : what else is known of some poses, of which these are the `numbers`, -1 for none
+    Where nothing holds the run as a whole, the mean correction is about zero.
     """
     rounds = 0
     for level in LEVELS:
@@ -115,13 +120,15 @@ def adjust(poses: Floats, swept: SweptPoints, used: Bools) -> Adjusted:
         total = np.zeros((len(knots), 6))
         for _ in checking(range(level.rounds)):
             seen = swept.on_knots(knots)
-            corrections = _corrections(poses[knots], seen.select(used), level, total)
+            prior = None if held is None else _knot_prior(held, numbers, poses, places, poses[knots])
+            corrections = _corrections(poses[knots], seen.select(used), level, total, prior)
             if corrections is None:
                 break
             if not level.is_free:
                 total += corrections
             swept = replace(swept, points=seen.moved(poses[knots], corrections))
-            poses = _moved(poses, replace(places, points=poses[:, :3, 3]), poses[knots], corrections)
+            poses = _moved(poses, places, poses[knots], corrections)
+            places = replace(places, points=poses[:, :3, 3])
             rounds += 1
             if float(np.sqrt(np.mean(np.sum(corrections[:, :3] ** 2, axis=1)))) < level.settled_m:
                 break
@@ -135,7 +142,58 @@ def _moved(poses: Floats, places: SweptPoints, knots: Floats, corrections: Float
     return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], places.moved(knots, corrections)))
 
 
-def _corrections(poses: Floats, swept: SweptPoints, level: AdjustmentLevel, total: Floats) -> Floats | None:
+@dataclass(frozen=True)
+class _KnotPrior:
+    """What is known of some poses, in terms of the corrections of the two knots round each.
+
+    knots : (2, K) their numbers, J : (2, K, 6, 6) effect of their corrections; changes : (K, 6) of the poses so far
+    which : (K,) numbers of these poses among those of `held`
+    """
+
+    held: HeldPoses
+    which: Longs
+    knots: Longs
+    J: Floats
+    changes: Floats
+
+    def product(self, x: Floats) -> Floats:
+        """(M, 6) of the information with corrections x (M, 6) of all knots."""
+        return self._back(np.einsum("skij,skj->ki", self.J, x[self.knots]), len(x))
+
+    def gradient(self, count: int) -> Floats:
+        """(count, 6) by the changes so far."""
+        return self._back(self.changes, count)
+
+    def blocks(self, count: int) -> Floats:
+        """(count, 6, 6) on the diagonal, but for what eliminated unknowns take from it."""
+        out = np.zeros((count, 6, 6))
+        np.add.at(out, self.knots, np.swapaxes(self.J, -1, -2) @ self.held.blocks[self.which] @ self.J)
+        return out
+
+    def _back(self, changes: Floats, count: int) -> Floats:
+        everywhere = np.zeros((len(self.held.poses), 6))
+        everywhere[self.which] = changes
+        force = self.held.product(everywhere)[self.which]
+        out = np.zeros((count, 6))
+        np.add.at(out, self.knots, np.einsum("skji,kj->ski", self.J, force))
+        return out
+
+
+def _knot_prior(held: HeldPoses, numbers: Longs, poses: Floats, places: SweptPoints, knots: Floats) -> _KnotPrior:
+    """The prior by what is known of the poses with `numbers` (-1 for none), which now lie at `places` between the `knots`."""
+    which = np.flatnonzero(numbers >= 0)
+    own = numbers[which]
+    at = np.stack([places.poses[own], np.minimum(places.poses[own] + 1, len(knots) - 1)])
+    shares = np.stack([1.0 - places.shares[own], places.shares[own]])
+    J = np.zeros((2, len(own), 6, 6))
+    J[:] = np.eye(6)
+    J[..., :3, 3:] = -so3.hat(poses[own, :3, 3] - knots[at, :3, 3])
+    return _KnotPrior(held, which, at, shares[..., None, None] * J, noise.changes(held.poses[which], poses[own]))
+
+
+def _corrections(
+    poses: Floats, swept: SweptPoints, level: AdjustmentLevel, total: Floats, prior: _KnotPrior | None
+) -> Floats | None:
     """(K, 6) corrections of one Gauss-Newton step; None without planes."""
     planes = find_planes(swept.points, swept.poses, level.flatness)
     on_plane = planes >= 0
@@ -159,13 +217,16 @@ def _corrections(poses: Floats, swept: SweptPoints, level: AdjustmentLevel, tota
     def product(x: Floats) -> Floats:
         out = np.empty_like(x)
         plane_adjustment.product(x, H, beside, starts, at[is_first], coupling, own, stiffness, out)
-        return out
+        return out if prior is None else out + prior.product(x)
 
-    preconditioner = plane_adjustment.inverses(H + np.diag(2.0 * stiffness))
+    diagonal = H + np.diag(2.0 * stiffness) + (0.0 if prior is None else prior.blocks(len(H)))
+    preconditioner = plane_adjustment.inverses(diagonal)
     held = stiffness * np.diff(total, axis=0)
     pull = np.zeros_like(g)
     pull[1:] += held
     pull[:-1] -= held
+    if prior is not None:
+        pull += prior.gradient(len(g))
     return _conjugate_gradients(product, -g - pull, preconditioner)
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from lslam.backend.adjustment import SweptPoints, adjust
+from lslam.backend.control_points import control_facts, control_residuals
+from lslam.backend.graph.held_poses import HeldPoses
 from lslam.backend.graph.odometry_constraints import bent
+from lslam.backend.outcome import BackEnd
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import se3
@@ -34,38 +38,43 @@ WINDOW, LEAST_CELLS, SIGMAS = 50, 10, 3.0
 INTERRUPTED = "interrupted while the poses were refined"
 
 
-def refine_poses(job: PreparedRun, record: RunRecord) -> None:
+def refine_poses(job: PreparedRun, record: RunRecord, done: BackEnd) -> BackEnd:
     """Refine the poses of `record` where planes of the points that were kept out become thinner; the manifest says by how much.
 
-    Fixes, control points and buildings hold the poses of a run that has them, which the planes do not know: it keeps them.
+    Where fixes, control points or buildings hold the run, its graph says how firmly. Returns the back end with what is left of
+    the control points.
     """
     config, manifest, watch = job.config, job.manifest, job.watch
     if not config.graph.refine or manifest.outcome in ("interrupted", "diverged"):
-        return
-    held = record.osm is not None or bool(job.manual.points)
-    if held or (record.georeference is not None and record.georeference.is_in_graph):
-        manifest.refinement = {"is_taken": False, "why": "fixes, control points or buildings hold the poses"}
-        return
+        return done
     results = [result.at_stamp for result in record.results]
     nodes = np.array([k for k, r in enumerate(results) if r.status == "ok" and not r.frame], np.int64)
     if len(nodes) < 2:
         manifest.refinement = {"is_taken": False, "why": "fewer than two scans are registered"}
-        return
+        return done
     watch.on_start("refinement", len(results))
     with manifest.timed("refine_s"):
         try:
             swept = read_points(job, results, nodes)
             if not len(swept.points):
                 manifest.refinement = {"is_taken": False, "why": "no point lies within the range of the map"}
-                return
+                return done
+            held = None if done.solution is None else done.solution.held
             with asking(watch.should_stop, INTERRUPTED):
-                manifest.refinement, adjustment = _adjustment(results, nodes, swept)
+                manifest.refinement, adjustment = _adjustment(results, nodes, swept, held, record.keyframe_scans)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
-            return
-    if adjustment is not None:
-        record.results = adjustment
-        record.trajectory = to_trajectory(record.results, record.method)
+            return done
+    if adjustment is None:
+        return done
+    record.results = adjustment
+    record.trajectory = to_trajectory(record.results, record.method)
+    if not done.control or record.georeference is None:
+        return done
+    points = [residual.point for residual in done.control]
+    control = control_residuals(points, record.results, record.georeference, config.gnss.geoid)
+    manifest.graph["control_points"] |= control_facts(control)
+    return replace(done, control=control)
 
 
 def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> SweptPoints:
@@ -109,12 +118,17 @@ def _poser(
 
 
 def _adjustment(
-    results: list[ScanResult], nodes: Longs, swept: SweptPoints
+    results: list[ScanResult], nodes: Longs, swept: SweptPoints, held: HeldPoses | None, keyframes: Longs
 ) -> tuple[dict[str, Any], list[ScanResult] | None]:
-    """What the manifest says, and the results with refined poses; None where these are not better."""
+    """What the manifest says, and the results with refined poses; None where these are not better.
+
+    keyframes : numbers of the scans of which `held` tells
+    """
     before = np.stack([results[k].T_world_lidar for k in nodes])
     is_used = np.floor(swept.points / CELL_M).astype(np.int64).sum(axis=1) % 2 == 0
-    found = adjust(before, swept, is_used)
+    places = np.full(len(results), -1, np.int64)
+    places[nodes] = np.arange(len(nodes))
+    found = adjust(before, swept, is_used, held, places[keyframes])
     kept_out = swept.select(~is_used)
     step = max(1, -(-len(kept_out.points) // JUDGES))
     queries = slice(0, None, step)
@@ -126,9 +140,8 @@ def _adjustment(
     facts: dict[str, Any] = {"is_taken": bool(is_taken.any()), "scans": int(is_taken.sum()), "rounds": found.rounds}
     if not is_taken.any():
         return {**facts, "why": "planes of the points kept out do not get thinner"}, None
-    # The first pose stays: the world begins there.
-    T = before[0] @ se3.inverse(found.poses[0])
-    after = se3.normalise(T @ found.poses)
+    # The world begins at the first pose, unless it is the Earth's.
+    after = found.poses if held is not None else se3.normalise(before[0] @ se3.inverse(found.poses[0]) @ found.poses)
     anchors = [
         Keyframe(number, int(k), results[k].stamp_ns, before[i])
         for number, (i, k) in enumerate((i, nodes[i]) for i in np.flatnonzero(is_taken).tolist())

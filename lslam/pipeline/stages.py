@@ -56,7 +56,7 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
             job.manifest.georeference = describe(record.georeference)
         return BackEnd(record.results)
     done = optimise_poses(job, record)
-    refine_poses(job, record)
+    done = refine_poses(job, record, done)
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, job.store)
     return done

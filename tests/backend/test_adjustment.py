@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.adjustment import SweptPoints, adjust, find_planes
+from lslam.backend.graph.held_poses import HeldPoses
 from lslam.backend.kernels import plane_adjustment
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
@@ -84,6 +85,25 @@ def test_poses_that_drifted_come_back(seed: int) -> None:
     swept = SweptPoints(world, scans, np.zeros(len(world)))
     found = adjust(drifted, swept, np.ones(len(world), bool))
     assert ate(found.poses, truth) < min(0.005, 0.2 * ate(drifted, truth))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_known_of_some_poses_gives_the_place(seed: int) -> None:
+    """Of every sixth pose the position is known to 5 mm: the run drifts, and comes back to its place without alignment."""
+    rng, truth = np.random.default_rng(seed), walk(60)
+    points, scans = in_room(truth, 400, rng)
+    way = np.arange(60)[:, None]
+    drifted = truth.copy()
+    drifted[:, :3, 3] += 0.2 * np.array([1.0, -1.0, 0.5]) + 0.0015 * way * [1.0, -1.0, 0.5]
+    world = np.einsum("nij,nj->ni", drifted[scans, :3, :3], points) + drifted[scans, :3, 3]
+    swept, known = SweptPoints(world, scans, np.zeros(len(world))), np.arange(0, 60, 6)
+    information = np.diag([0.005**-2] * 3 + [0.0] * 3)
+    surveyed = truth[known].copy()
+    surveyed[:, :3, 3] += 0.005 * rng.normal(size=(len(known), 3))
+    held = HeldPoses(surveyed, lambda x: x @ information, np.tile(information, (len(known), 1, 1)))
+    found = adjust(drifted, swept, np.ones(len(world), bool), held, known)
+    away = np.linalg.norm(found.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert away.max() < 0.015
 
 
 def test_points_move_with_the_poses_round_the_instant_they_were_measured() -> None:

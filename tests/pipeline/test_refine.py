@@ -14,13 +14,15 @@ import lslam
 from lslam.backend.adjustment import Adjusted, SweptPoints
 from lslam.core.config import load_config
 from lslam.core.errors import InterruptedRunError
+from lslam.core.geometry import geodesy, se3
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.pipeline import refine_pass
 from lslam.pipeline.refine_pass import thinner_windows
 from lslam.pipeline.watch import RunOutcome, Watch
 from lslam.reports.text import summary
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import ORIGIN, simulate
+from lslam.simulation.sensors import GnssModel
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
 DRIFT = ("debug.drift=true", "debug.drift_percent=1", "debug.drift_deg_per_100m=1", "loops.use=false")
@@ -58,12 +60,23 @@ def test_poses_that_no_plane_contradicts_do_not_get_worse(drive: Sequence) -> No
     assert ate(after.trajectory.poses, truth) < 1.02 * ate(before.trajectory.poses, truth) + 1e-4
 
 
-def test_fixes_hold_the_poses() -> None:
-    """Planes know nothing of them: the run keeps its poses, and says why."""
-    before, after = (made(SAMPLE, "gnss.mode=graph", f"graph.refine={refine}").record for refine in ("false", "true"))
-    np.testing.assert_array_equal(after.trajectory.poses, before.trajectory.poses)
-    assert after.manifest["refinement"]["is_taken"] is False
-    assert "refined      no scan: fixes, control points or buildings hold the poses" in summary(after, None)
+def test_fixes_hold_the_place_while_planes_undo_the_drift() -> None:
+    model = GnssModel()
+    drive = simulate("small-eight", seed=33, lidar="vlp16", count=120, gnss=model)
+    assert drive.ground_truth is not None
+    truth = drive.ground_truth.poses[:, :3, 3]
+    found = []
+    for refine in ("false", "true"):
+        record = made(drive, "input.count=120", "gnss.mode=graph", *DRIFT, f"graph.refine={refine}").record
+        assert record.georeference is not None
+        places = geodesy.from_local(record.trajectory.poses[:, :3, 3], record.georeference.origin)
+        T, _, _ = se3.umeyama(record.trajectory.poses[:, :3, 3], truth)
+        off = se3.apply(T, record.trajectory.poses[:, :3, 3]) - truth
+        found.append((float(np.sqrt(np.mean(off**2))), geodesy.to_local(places, ORIGIN).mean(axis=0)))
+    assert record.manifest["refinement"]["is_taken"]
+    assert found[1][0] < 0.3 * found[0][0]
+    moved = np.abs(found[1][1] - found[0][1])
+    assert (moved < 0.2 * model.sigma * np.array([1.0, 1.0, model.vertical])).all()
 
 
 def test_without_points_in_range_the_run_says_so(drive: Sequence) -> None:
@@ -96,10 +109,10 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     nodes, better = np.array([0, 1, 4, 5]), poses.copy()
     better[:, 1, 3] = 0.1 * np.arange(6)
-    monkeypatch.setattr(refine_pass, "adjust", lambda before, swept, used: Adjusted(better[nodes], swept.points, 1))
+    monkeypatch.setattr(refine_pass, "adjust", lambda before, swept, used, held, numbers: Adjusted(better[nodes], swept.points, 1))
     monkeypatch.setattr(refine_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
-    facts, moved = refine_pass._adjustment(results, nodes, swept)
+    facts, moved = refine_pass._adjustment(results, nodes, swept, None, np.zeros(0, np.int64))
     assert moved is not None
     assert facts["scans"] == 4
     np.testing.assert_array_equal(moved[2].T_world_lidar, poses[2])

@@ -139,13 +139,16 @@ def map_key(graph: PoseGraph) -> int:
     return len(graph) + 1
 
 
-def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
-    """The factors that are no outlier candidates, held ones too; with `may_tilt` the first pose may tilt."""
+def fixed_part(graph: PoseGraph, may_tilt: bool = False, with_lidar: bool = True) -> Any:
+    """The factors that are no outlier candidates, held ones too; with `may_tilt` the first pose may tilt.
+
+    with_lidar : odometry and held loop closures are among them
+    """
     import gtsam
 
     factors = gtsam.NonlinearFactorGraph()
     factors.add(_start(graph, may_tilt))
-    for factor in _relative(graph):
+    for factor in _relative(graph, with_lidar):
         factors.add(factor)
     for fix in graph.fixes:
         if fix.is_held:
@@ -167,11 +170,11 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False) -> Any:
     return factors
 
 
-def _relative(graph: PoseGraph) -> list[Any]:
+def _relative(graph: PoseGraph, with_lidar: bool) -> list[Any]:
     """Odometry, held loop closures and the IMU between keyframes."""
-    manual = [loop for loop in graph.loops if loop.is_held]
+    by_lidar = [*graph.odometry, *(loop for loop in graph.loops if loop.is_held)] if with_lidar else []
     imu = [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up)
-    return [*between_all([*graph.odometry, *manual]), *imu]
+    return [*between_all(by_lidar), *imu]
 
 
 def _start(graph: PoseGraph, may_tilt: bool) -> Any:

@@ -11,6 +11,7 @@ import numpy as np
 from lslam.backend.graph import factors
 from lslam.backend.graph.consistency import judge_loops
 from lslam.backend.graph.drift import drift_factor, with_drift
+from lslam.backend.graph.held_poses import held_poses
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.graph.solve import (
     GncResult,
@@ -82,6 +83,13 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     ]
     for i, rejection in zip(accepted, rejections, strict=False):
         reasons[i] = reasons[i] or rejection
+    held = None
+    if config.refine and is_placed:
+        known = zip(candidates[len(loops) :], solved.weights[len(loops) :], strict=True)
+        inliers = [candidate.make(1.0, None) for candidate, weight in known if weight >= 0.5]
+        held = held_poses(
+            joined(factors.fixed_part(graph, may_tilt, with_lidar=False), inliers), solved.values, len(graph)
+        )
     rest = len(loops) + len(fixes)
     fix_inliers = np.ones(len(graph.fixes), np.bool_)
     fix_inliers[[not fix.is_held for fix in graph.fixes]] = solved.weights[len(loops) : rest] >= 0.5
@@ -98,6 +106,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         drift=drift,
         rounds=solved.rounds,
         error=float(solved.factors.error(solved.values)),
+        held=held,
     )
 
 

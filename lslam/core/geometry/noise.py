@@ -16,6 +16,12 @@ from lslam.core.geometry import so3
 Floats = NDArray[np.float64]
 
 
+def changes(T: NDArray[Any], changed: NDArray[Any]) -> Floats:
+    """(..., 6) d that lead from poses `T` to `changed` (..., 4, 4)."""
+    turns = so3.log(changed[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2))
+    return np.concatenate([changed[..., :3, 3] - T[..., :3, 3], turns], axis=-1)
+
+
 def to_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
     """(..., 6, 6) covariances of poses `T` (..., 4, 4) as gtsam wants them: rotation first, body axes."""
     J = into_body(T)
