@@ -54,7 +54,7 @@ STEPS, ACCURACY = 300, 1e-4
 
 @dataclass(frozen=True)
 class SweptPoints:
-    """Points of all scans at the instants they were measured.
+    """Points of all scans in the order in which they were measured.
 
     points : (N, 3) m, world; poses : (N,) number of the last pose before each, or the first one
     shares : (N,) 0..1 of the way from that pose to the next
@@ -71,6 +71,8 @@ class SweptPoints:
     @classmethod
     def at_times(cls, points: Floats, times: Floats, stamps: Floats) -> SweptPoints:
         """Points (N, 3) measured at `times` (N,), s, by a sensor whose poses have the `stamps` (K,), s, which rise."""
+        order = np.argsort(times, kind="stable")
+        points, times = points[order], times[order]
         at = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 1)
         after = np.minimum(at + 1, len(stamps) - 1)
         gap = np.where(after > at, stamps[after] - stamps[at], np.inf)
@@ -86,14 +88,9 @@ class SweptPoints:
 
     def moved(self, poses: Floats, corrections: Floats) -> Floats:
         """The points (N, 3) after `corrections` (K, 6) of the `poses` (K, 4, 4)."""
-        turns = so3.exp(corrections[:, 3:])
-
-        def by(k: Longs) -> Floats:
-            away = self.points - poses[k, :3, 3]
-            return np.asarray(np.einsum("nij,nj->ni", turns[k], away) + poses[k, :3, 3] + corrections[k, :3])
-
-        share = self.shares[:, None]
-        return (1.0 - share) * by(self.poses) + share * by(np.minimum(self.poses + 1, len(poses) - 1))
+        origins, turns = np.ascontiguousarray(poses[:, :3, 3]), so3.exp(corrections[:, 3:])
+        points = np.ascontiguousarray(self.points)
+        return plane_adjustment.move(points, self.poses, self.shares, origins, turns, corrections[:, :3].copy())
 
 
 @dataclass(frozen=True)
@@ -200,7 +197,7 @@ def _corrections(
     if not on_plane.any():
         return None
     planes, swept = planes[on_plane], swept.select(on_plane)
-    order = np.lexsort((swept.poses, planes))
+    order = np.argsort(planes, kind="stable")
     planes, at = planes[order], swept.poses[order]
     is_first = np.append(True, (np.diff(planes) != 0) | (np.diff(at) != 0))
     sighting = np.cumsum(is_first) - 1
@@ -250,17 +247,16 @@ def _conjugate_gradients(product: Callable[[Floats], Floats], right: Floats, pre
 
 
 def find_planes(points: Floats, poses: Longs, flatness: float) -> Longs:
-    """(N,) number of the plane that each point (N, 3) lies on, -1 for none; poses : (N,) of the scans that saw them.
+    """(N,) number of the plane that each point (N, 3) lies on, -1 for none; poses : (N,) of the scans that saw them, rising.
 
     A plane is the largest voxel whose points are flat, seen by several scans, and spread in two directions.
     """
     planes, count = np.full(len(points), -1, np.int64), 0
     left = np.arange(len(points))
     for edge in EDGES_M:
-        inside, cells = _numbered(np.floor(points[left] / edge).astype(np.int64))
-        numbers, _, covariances = plane_adjustment.sums(cells, inside, np.ascontiguousarray(points[left]))
-        views = np.unique(cells * (int(poses.max()) + 1) + poses[left]) // (int(poses.max()) + 1)
-        scans = np.bincount(views, minlength=inside)
+        some = points[left]
+        cells, scans = plane_adjustment.number_cells(some, poses[left], edge)
+        numbers, _, covariances = plane_adjustment.sums(cells, len(scans), some)
         thin, narrow, _ = plane_adjustment.spectra(covariances).T
         is_plane = (numbers >= LEAST_POINTS) & (scans >= LEAST_SCANS)
         is_plane &= (thin < flatness * narrow) & (narrow > (LEAST_BREADTH * edge) ** 2)
@@ -268,12 +264,3 @@ def find_planes(points: Floats, poses: Longs, flatness: float) -> Longs:
         count += int(is_plane.sum())
         left = left[planes[left] < 0]
     return planes
-
-
-def _numbered(cells: Longs) -> tuple[int, Longs]:
-    """Number of different rows of `cells` (N, 3), and which one each is, (N,)."""
-    low = cells.min(axis=0, initial=0)
-    wide = cells.max(axis=0, initial=0) - low + 1
-    keys = ((cells[:, 0] - low[0]) * wide[1] + cells[:, 1] - low[1]) * wide[2] + cells[:, 2] - low[2]
-    different, numbers = np.unique(keys, return_inverse=True)
-    return len(different), numbers.astype(np.int64)

@@ -132,11 +132,12 @@ def test_what_is_no_plane_is_none() -> None:
     wall = np.column_stack([rng.random((200, 1)) * 0.01, rng.random((200, 2)) * 1.9])
     bush = rng.random((200, 3)) * 0.4 + [10, 10, 10]
     pole = np.column_stack([0.01 * rng.normal(size=(200, 2)) + 20.5, rng.random(200)])
-    scans = np.arange(200) % 8
-    planes = find_planes(np.concatenate([wall, bush, pole]), np.tile(scans, 3), 0.005)
-    assert (planes[:200] == 0).all()
-    assert (planes[200:] == -1).all()
-    assert (find_planes(wall, scans % 3, 0.005) == -1).all()
+    scans = np.arange(200) // 25
+    order = np.argsort(np.tile(scans, 3), kind="stable")
+    planes = find_planes(np.concatenate([wall, bush, pole])[order], np.tile(scans, 3)[order], 0.005)
+    assert (planes[order < 200] == 0).all()
+    assert (planes[order >= 200] == -1).all()
+    assert (find_planes(wall, scans // 3, 0.005) == -1).all()
 
 
 def test_without_planes_nothing_moves() -> None:

@@ -12,9 +12,55 @@ from numpy.typing import NDArray
 
 from lslam.core.kernels.jit import inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, inverse
+from lslam.core.kernels.voxel import index_of, pack, place_of, table_size
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
+
+
+@kernel
+def number_cells(points: Floats, poses: Longs, edge: float) -> tuple[Longs, Longs]:
+    """Number (N,) of the cell of each point (N, 3), first come, first numbered; and how many of the `poses` saw each cell, (V,).
+
+    poses : (N,) number of the pose of each point, rising
+    """
+    numbers, count = np.empty(len(points), np.int64), 0
+    table = np.empty(table_size(len(points)), np.int32)
+    table[:] = -1
+    keys, views, latest = np.empty(len(points), np.int64), np.zeros(len(points), np.int64), np.empty(len(points), np.int64)
+    inverse_edge = 1.0 / edge
+    for i in range(len(points)):
+        x, y, z = points[i]
+        key = pack(index_of(x, inverse_edge), index_of(y, inverse_edge), index_of(z, inverse_edge))
+        h = place_of(key, keys, table)
+        if table[h] < 0:
+            table[h], keys[count], latest[count] = count, key, -1
+            count += 1
+        cell = table[h]
+        if latest[cell] != poses[i]:
+            views[cell], latest[cell] = views[cell] + 1, poses[i]
+        numbers[i] = cell
+    return numbers, views[:count].copy()
+
+
+@kernel
+def move(points: Floats, poses: Longs, shares: Floats, origins: Floats, turns: Floats, shifts: Floats) -> Floats:
+    """Points (N, 3) after corrections of the two poses round each.
+
+    poses : (N,) number of the first of both; shares : (N,) 0..1 of the way to the second
+    origins : (K, 3) m, of the sensor; turns : (K, 3, 3) about these; shifts : (K, 3) m
+    """
+    out = np.zeros_like(points)
+    last = len(origins) - 1
+    for i in range(len(points)):
+        for side in range(2):
+            k = min(poses[i] + side, last)
+            share = shares[i] if side else 1.0 - shares[i]
+            x, y, z = points[i, 0] - origins[k, 0], points[i, 1] - origins[k, 1], points[i, 2] - origins[k, 2]
+            for a in range(3):
+                turned = turns[k, a, 0] * x + turns[k, a, 1] * y + turns[k, a, 2] * z
+                out[i, a] += share * (turned + origins[k, a] + shifts[k, a])
+    return out
 
 
 @kernel
