@@ -21,7 +21,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.core.types.state import State
 from lslam.maps.merge import MapMerger
 from lslam.odometry.base import FeatureSource
-from lslam.pipeline.map_pass import MapCheckpoints, motion_within, scans_again
+from lslam.pipeline.map_pass import MapCheckpoints, course_of, motion_within, scans_again
 from lslam.registration.preprocessing.features import Features
 
 EDGE, PLANE = 1, 0
@@ -87,20 +87,21 @@ def build_feature_map(
 
     Raises InterruptedRunError when `should_stop` says so; `checkpoints` then allow to continue.
     """
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
-    poses = np.stack([r.T_world_lidar for r in results])
+    course = course_of(results)
 
     def make() -> FeatureMaker:
         keep = None if checkpoints is None else checkpoints.folder
         return FeatureMaker(config.loam.feature_map_voxel, config.preprocess.range_max, keep)
 
-    maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
+    maker, done = (
+        (make(), 0) if checkpoints is None else checkpoints.begin(make, np.stack([r.T_world_lidar for r in results]))
+    )
     numbers, offer = range(done, len(results)), None if checkpoints is None else partial(checkpoints.offer, maker)
     for k, loaded in scans_again(
         sequence, odometry.prepare, numbers, config, on_step, should_stop, FEATURES_INTERRUPTED, done, offer
     ):
         if loaded.scan is not None and results[k].status == "ok":
-            motion = motion_within(loaded.scan, stamps, poses)
+            motion = motion_within(loaded.scan, course)
             maker.add(odometry.features_of(loaded.prepared, motion), results[k].T_world_lidar)
     with asking(should_stop, FEATURES_INTERRUPTED):
         return maker.finish()
@@ -113,13 +114,13 @@ def view_features(sequence: Sequence, odometry: FeatureSource, results: list[Sca
     """
     registered = [k for k, result in enumerate(results) if result.status == "ok"]
     chosen = [registered[i] for i in np.linspace(0, len(registered) - 1, min(MOST_SCANS, len(registered))).astype(int)]
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
-    poses = np.stack([r.T_world_lidar for r in results]) if results else np.zeros((0, 4, 4))
-    seen = []
+    if not registered:
+        return None
+    course, seen = course_of(results), []
     for k in chosen:
         try:
             scan = sequence.scan(k)
-            found = odometry.features_of(odometry.prepare(scan), motion_within(scan, stamps, poses))
+            found = odometry.features_of(odometry.prepare(scan), motion_within(scan, course))
         except LslamError:
             continue
         seen.append((k, found))
@@ -132,8 +133,8 @@ def view_features(sequence: Sequence, odometry: FeatureSource, results: list[Sca
         edges=shown.edges.points[:, :2],
         planes=shown.planes.points[:, :2],
         around=np.concatenate([part.points for part in others]),
-        map_edges=np.concatenate([se3.apply(poses[k], f.less_edges.points) for k, f in seen]),
-        map_planes=np.concatenate([se3.apply(poses[k], f.less_planes.points) for k, f in seen]),
+        map_edges=np.concatenate([se3.apply(results[k].T_world_lidar, f.less_edges.points) for k, f in seen]),
+        map_planes=np.concatenate([se3.apply(results[k].T_world_lidar, f.less_planes.points) for k, f in seen]),
         scans=np.array([results[k].index for k, _ in seen], np.int64),
         edge_counts=np.array([len(f.edges) for _, f in seen], np.int64),
         plane_counts=np.array([len(f.planes) for _, f in seen], np.int64),

@@ -31,6 +31,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import Records
 from lslam.odometry.frontend.register_scans import read_ahead, to_trajectory
+from lslam.odometry.inertial.course import Course
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import motion_within
@@ -95,12 +96,12 @@ def _followed(
         fixes, about = known["fixes"], known["start"]
         log.info("localisation: going on after %d scans", len(fixes))
     watch.on_start("localise", len(results) - len(fixes))
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
+    course = Course(np.array([r.stamp_ns for r in results], np.int64), poses)
 
     def prepare(scan: Scan) -> PreparedPoints:
         times = scan.times if config.preprocess.deskew else None
         prepared = prepare_points(scan.points, config.preprocess, scan.index, times)
-        return deskew(prepared, motion_within(scan, stamps, poses))
+        return deskew(prepared, motion_within(scan, course))
 
     first = len(fixes)
     for k, loaded in enumerate(read_ahead(sequence, prepare, config.input.workers, first=first), first):

@@ -17,7 +17,7 @@ from lslam.core.config.outputs import MapConfig
 from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.stopping import asking
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory, thinned
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
@@ -32,6 +32,7 @@ from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import Loaded
+from lslam.odometry.inertial.course import Course
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
 from lslam.registration.preprocessing.ground import Z, world_up_of
@@ -127,16 +128,16 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
     """
     ego_box = config.map.ego_box or config.preprocess.ego_box
     results = [result.at_stamp for result in results]
-    stamps = np.array([r.stamp_ns for r in results], np.int64)
-    poses = np.stack([r.T_world_lidar for r in results])
-    registered = {result.index: result for result in results if result.status == "ok" and not result.frame}
+    # Poses in frames of their own tell nothing of the motion in this one.
+    here = [result for result in results if not result.frame]
+    course, registered = course_of(here), {result.index: result for result in here if result.status == "ok"}
 
     def pose_scan(scan: Scan) -> PosedScan | None:
         result = registered.get(scan.index)
         if result is None:
             return None
         scan = scan if ego_box is None else without_box(scan, ego_box)
-        points = deskew_points(scan.points, scan.times, motion_within(scan, stamps, poses))
+        points = deskew_points(scan.points, scan.times, motion_within(scan, course))
         return PosedScan(points, result.T_world_lidar, scan.intensity)
 
     return pose_scan
@@ -237,12 +238,21 @@ def without_box(scan: Scan, box: tuple[float, ...]) -> Scan:
     return scan.select(np.flatnonzero(~inside))
 
 
-def motion_within(scan: Scan, stamps_ns: Longs, poses: Floats) -> MotionPrior:
-    """Motion of the sensor during a sweep, from the final poses (N, 4, 4) of all scans; one pose if they do not tell."""
-    times = knots_over(scan.span)
-    if len(times) < 2 or len(stamps_ns) < 2:
+def course_of(results: list[ScanResult]) -> Course:
+    """Course of the sensor through the poses of scans at their stamps."""
+    return Course(np.array([r.stamp_ns for r in results], np.int64), np.stack([r.T_world_lidar for r in results]))
+
+
+def motion_within(scan: Scan, course: Course) -> MotionPrior:
+    """Motion of the sensor during a sweep, from the final poses of the scans round it; one pose if they do not tell."""
+    times, known = knots_over(scan.span), len(course.instants_ns)
+    if len(times) < 2 or known < 2:
         return MotionPrior.at_once(np.eye(4))
-    return MotionPrior(times, poses_at(stamps_ns, poses, scan.stamp_ns + np.round(1e9 * times).astype(np.int64)))
+    poses = course.at(scan.stamp_ns, times)
+    if poses is None:
+        instants_ns = scan.stamp_ns + np.round(1e9 * times).astype(np.int64)
+        poses = poses_at(course.instants_ns, course.poses, instants_ns)
+    return MotionPrior(times, poses)
 
 
 class Maker(Protocol):

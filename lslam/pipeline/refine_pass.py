@@ -25,7 +25,7 @@ from lslam.core.types.trajectory import Keyframe
 from lslam.maps.crispness import plane_variances
 from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.pipeline.job import PreparedRun
-from lslam.pipeline.map_pass import motion_within, scans_again, without_box
+from lslam.pipeline.map_pass import course_of, motion_within, scans_again, without_box
 from lslam.registration.preprocessing.deskew import deskew_points
 
 # Points of a scan at most, and of all scans: about 300 bytes each while planes are adjusted. Odometry averages over all points,
@@ -79,10 +79,8 @@ def refine_poses(job: PreparedRun, record: RunRecord, done: BackEnd) -> BackEnd:
 
 def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> SweptPoints:
     """Points of the scans `nodes` (K,) in the world, each between the two poses round the instant it was measured."""
-    config, watch = job.config, job.watch
-    stamps, poses = (np.array([getattr(r, name) for r in results]) for name in ("stamp_ns", "T_world_lidar"))
-    count = max(1, min(OF_A_SCAN, OF_ALL // len(nodes)))
-    prepare = _poser(config, stamps, poses, set(nodes.tolist()), {r.index: k for k, r in enumerate(results)}, count)
+    config, watch, registered = job.config, job.watch, [results[k] for k in nodes]
+    prepare = _poser(config, registered, max(1, min(OF_A_SCAN, OF_ALL // len(nodes))))
     parts: list[tuple[Floats, Floats]] = []
     numbers = range(len(results))
     for _, loaded in scans_again(job.sequence, prepare, numbers, config, watch.on_step, watch.should_stop, INTERRUPTED):
@@ -91,28 +89,28 @@ def read_points(job: PreparedRun, results: list[ScanResult], nodes: Longs) -> Sw
     if not parts:
         return SweptPoints(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0))
     points, times = (np.concatenate(of) for of in zip(*parts, strict=True))
-    return SweptPoints.at_times(points, times, 1e-9 * (stamps[nodes] - stamps[nodes[0]]))
+    stamps = np.array([result.stamp_ns for result in registered], np.int64)
+    return SweptPoints.at_times(points, times, 1e-9 * (stamps - stamps[0]))
 
 
-def _poser(
-    config: Config, stamps: Longs, poses: Floats, nodes: set[int], numbers: dict[int, int], count: int
-) -> Callable[[Scan], tuple[Floats, Floats] | None]:
+def _poser(config: Config, registered: list[ScanResult], count: int) -> Callable[[Scan], tuple[Floats, Floats] | None]:
     """Function of a scan: `count` of its points (N, 3) in the world, and s from the first registered scan (N,)."""
     box = config.map.ego_box or config.preprocess.ego_box
-    begin = stamps[min(nodes)]
+    course, by_index = course_of(registered), {result.index: result for result in registered}
 
     def posed(scan: Scan) -> tuple[Floats, Floats] | None:
-        number = numbers.get(scan.index)
-        if number is None or number not in nodes:
+        result = by_index.get(scan.index)
+        if result is None:
             return None
         scan = scan if box is None else without_box(scan, box)
         away = np.linalg.norm(scan.points, axis=1)
         near = np.flatnonzero((away >= config.map.range_min) & (away <= config.map.range_max))
         # Points in a fixed step would be of the same rings in each scan.
-        scan = scan.select(np.sort(np.random.default_rng(number).permutation(near)[:count]))
-        points = deskew_points(scan.points, scan.times, motion_within(scan, stamps, poses))
+        scan = scan.select(np.sort(np.random.default_rng(scan.index).permutation(near)[:count]))
+        points = deskew_points(scan.points, scan.times, motion_within(scan, course))
         times = np.zeros(len(points)) if scan.times is None else np.asarray(scan.times, np.float64)
-        return se3.apply(poses[number], points.astype(np.float64)), times + 1e-9 * (scan.stamp_ns - begin)
+        seconds = 1e-9 * (scan.stamp_ns - registered[0].stamp_ns)
+        return se3.apply(result.T_world_lidar, points.astype(np.float64)), times + seconds
 
     return posed
 

@@ -16,6 +16,7 @@ from lslam.core.errors import UsageError
 from lslam.core.geometry.se3 import poses_at
 from lslam.io.readers import open_sequence
 from lslam.maps import merge
+from lslam.odometry.inertial.course import Course
 from lslam.pipeline.map_pass import motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
 
@@ -41,7 +42,7 @@ def main() -> None:
         marks = [time.perf_counter()]
         scan = sequence.scan(i)
         marks.append(time.perf_counter())
-        moved = deskew_points(scan.points, scan.times, motion_within(scan, stamps, poses))
+        moved = deskew_points(scan.points, scan.times, motion_within(scan, Course(stamps, poses)))
         marks.append(time.perf_counter())
         merger.add(moved, poses[i], scan.intensity)
         marks.append(time.perf_counter())

@@ -13,6 +13,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.maps import clean
 from lslam.maps.clean import CUBE, OFFSETS, SHARE, Cleaner, PosedScan, spread
 from lslam.maps.kernels.see_through import nearest_ranges, vote
+from lslam.odometry.inertial.course import Course
 from lslam.pipeline.map_pass import build_map, motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.simulation.scenarios import simulate
@@ -40,7 +41,7 @@ def test_moving_points_go_and_static_ones_stay(
     moving = static = 0
     for k in range(count):
         scan, moves = truth.scan(k)
-        points = deskew_points(scan.points, scan.times, motion_within(scan, gt.stamps_ns, gt.poses))
+        points = deskew_points(scan.points, scan.times, motion_within(scan, Course(gt.stamps_ns, gt.poses)))
         T = se3.exp(rng.normal(0, [0.01] * 3 + [0.0002] * 3)) @ gt.poses[k]
         back += cleaner.add(PosedScan(points, T, moves.astype(np.float32)))
         moving, static = moving + int(moves.sum()), static + int((~moves).sum())

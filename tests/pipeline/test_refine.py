@@ -109,7 +109,9 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     ]
     nodes, better = np.array([0, 1, 4, 5]), poses.copy()
     better[:, 1, 3] = 0.1 * np.arange(6)
-    monkeypatch.setattr(refine_pass, "adjust", lambda before, swept, used, held, numbers: Adjusted(better[nodes], swept.points, 1))
+    monkeypatch.setattr(
+        refine_pass, "adjust", lambda before, swept, used, held, numbers: Adjusted(better[nodes], swept.points, 1)
+    )
     monkeypatch.setattr(refine_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))
     facts, moved = refine_pass._adjustment(results, nodes, swept, None, np.zeros(0, np.int64))

@@ -27,7 +27,11 @@ def number_cells(points: Floats, poses: Longs, edge: float) -> tuple[Longs, Long
     numbers, count = np.empty(len(points), np.int64), 0
     table = np.empty(table_size(len(points)), np.int32)
     table[:] = -1
-    keys, views, latest = np.empty(len(points), np.int64), np.zeros(len(points), np.int64), np.empty(len(points), np.int64)
+    keys, views, latest = (
+        np.empty(len(points), np.int64),
+        np.zeros(len(points), np.int64),
+        np.empty(len(points), np.int64),
+    )
     inverse_edge = 1.0 / edge
     for i in range(len(points)):
         x, y, z = points[i]

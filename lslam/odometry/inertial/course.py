@@ -1,4 +1,4 @@
-"""The course of the sensor through the middles of sweeps: the motion within a sweep by the scans before and after it."""
+"""The course of the sensor through poses at known instants: the motion within a sweep by the scans before and after it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import numpy as np
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Longs
 
-# Middles on each side of a sweep. From one to the next its influence on a natural spline falls by 3.7.
+# Poses on each side of those within a sweep. From one to the next its influence on a natural spline falls by 3.7.
 NEIGHBOUR_SWEEPS = 3
 # Of the motion from begin to end of a sweep.
 MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
 
 
 class Course:
-    """Natural cubic splines through the poses of middles around each sweep.
+    """Natural cubic splines through the poses within and around each sweep.
 
-    instants_ns : (N,); poses : (N, 4, 4). A middle no later than one before it, as of a sliver of a sweep, is left out.
+    instants_ns : (N,); poses : (N, 4, 4). A pose no later than one before it, as of a sliver of a sweep, is left out.
     """
 
     def __init__(self, instants_ns: Longs, poses: Floats) -> None:
@@ -24,12 +24,13 @@ class Course:
         self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
 
     def at(self, stamp_ns: int, times: Floats) -> Floats | None:
-        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no middle lies within, or there are few."""
+        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no pose lies within, or there are few."""
         begin, end = stamp_ns + 1e9 * times[0], stamp_ns + 1e9 * times[-1]
-        k = int(np.argmin(np.abs(self.instants_ns - (begin + end) / 2)))
-        if len(times) < 2 or len(self.instants_ns) < NEIGHBOUR_SWEEPS or not begin <= self.instants_ns[k] <= end:
+        first, last = np.searchsorted(self.instants_ns, begin), np.searchsorted(self.instants_ns, end, side="right")
+        if len(times) < 2 or len(self.instants_ns) < NEIGHBOUR_SWEEPS or first == last:
             return None
-        around = slice(max(k - NEIGHBOUR_SWEEPS, 0), k + NEIGHBOUR_SWEEPS + 1)
+        k = int(first + np.argmin(np.abs(self.instants_ns[first:last] - (begin + end) / 2)))
+        around = slice(max(first - NEIGHBOUR_SWEEPS, 0), last + NEIGHBOUR_SWEEPS)
         nodes = 1e-9 * (self.instants_ns[around] - stamp_ns)
         twists = se3.log(se3.relative(self.poses[k], self.poses[around]))
         return se3.normalise(self.poses[k] @ se3.exp(natural_spline(np.asarray(nodes), twists, times)))

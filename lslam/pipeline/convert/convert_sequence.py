@@ -25,6 +25,7 @@ from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv
 from lslam.io.formats.trajectory_files import write_kitti, write_tum
 from lslam.io.readers.labels import labelled
 from lslam.odometry.frontend.register_scans import sweep_of
+from lslam.odometry.inertial.course import Course
 from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.convert.convert_trajectory import change_frame
@@ -161,7 +162,7 @@ class _Source:
             raise InputError(
                 f"scan {scan.index} at {scan.stamp_ns} ns lies outside the trajectory it is deskewed along"
             )
-        motion = motion_within(scan, self.trajectory.stamps_ns, self.trajectory.poses)
+        motion = motion_within(scan, Course(self.trajectory.stamps_ns, self.trajectory.poses))
         return replace(scan, points=deskew_points(scan.points, scan.times, motion), times=None)
 
     @property
