@@ -34,7 +34,9 @@ def write_points(path: Path, points: NDArray[Any], intensity: NDArray[Any] | Non
 def write_pcd(path: Path, points: NDArray[Any], intensity: NDArray[Any], encoding: str = "binary") -> None:
     """Points (N, 3), m, and intensity (N,) as float32 in one of `ENCODINGS`."""
     table = float_table(points, intensity)
-    header = pcd_header(len(table), ["x", "y", "z", "intensity"]).replace(b"DATA binary", f"DATA {encoding}".encode())
+    header = pcd_header(len(table), np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])).replace(
+        b"DATA binary", f"DATA {encoding}".encode()
+    )
     with path.open("wb") as stream:
         stream.write(header)
         if encoding == "binary":

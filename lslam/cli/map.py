@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 # What a map is made with, and how clouds are scored: no part of a comparison of drives.
 _OTHERS = (
     "file_format",
+    "attributes",
     "crop",
     "clean",
     "occupancy",
@@ -127,6 +128,7 @@ Examples:
   lslam map runs/first --voxel 0.1 --format laz
   lslam map runs/first --clean --crop -50,50,-50,50 --out square.ply
   lslam map runs/first --tiles 50 --format laz
+  lslam map runs/first --voxel 0 --tiles 50 --format laz --attributes time,scan,ring
   lslam map runs/first --against survey.laz --threshold 0.1
   lslam map somebody-elses.ply --score
   lslam map runs/tuesday --against runs/monday --changes changed
@@ -135,8 +137,11 @@ Examples:
 
 @click.command(epilog=EPILOG)
 @click.argument("target", metavar="RUN|FILE", type=click.Path(path_type=Path))
-@click.option("--voxel", type=float, metavar="M", help="Edge of a voxel  [as the run].")
+@click.option("--voxel", type=float, metavar="M", help="Edge of a voxel, 0 for every point  [as the run].")
 @click.option("--format", "file_format", metavar="NAME", help="ply, pcd, las or laz  [--out's suffix, or as the run].")
+@click.option(
+    "--attributes", metavar="NAMES", help="Of each point: time,scan,ring,range,observations,class  [as the run]."
+)
 @click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
 @click.option("--clean", is_flag=True, help="Remove moving objects, such as cars and people.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells too, and a floor plan.")
@@ -255,8 +260,10 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
         stop.is_gentle = True
         built = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, on_step=advance, should_stop=stop)
     rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans"), *crispness_rows(built.crispness)]
-    document = {"file": str(built.path), "points": built.points, "scans": built.scans}
-    _print(rows, {**document, "crispness": crispness_document(built.crispness)}, given["as_json"])
+    document: dict[str, Any] = {"file": str(built.path), "points": built.points, "scans": built.scans}
+    if built.crispness is not None:
+        document["crispness"] = crispness_document(built.crispness)
+    _print(rows, document, given["as_json"])
 
 
 def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: dict[str, Any]) -> None:
@@ -290,6 +297,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
         raise UsageError(f"--format {file_format} contradicts --out {out}: leave one out")
     flags = {
         "voxel": given["voxel"],
+        "attributes": given["attributes"],
         "format": file_format
         if file_format is not None
         else suffix
@@ -304,8 +312,10 @@ def _settings(given: dict[str, Any]) -> list[str]:
     ]
 
 
-def crispness_rows(score: Crispness) -> list[tuple[str, str]]:
+def crispness_rows(score: Crispness | None) -> list[tuple[str, str]]:
     """Table rows of a map's entropy scores."""
+    if score is None:
+        return [("crispness", "n/a: the map has every point; those of voxels are scored")]
     if score.entropy is None or score.plane_variance is None:
         return [("crispness", f"n/a: {score.recipe}")]
     return [

@@ -46,6 +46,14 @@ CLASSES = {
     "moving-other-vehicle": 259,
 }
 MOVING = "moving"  # every class whose name begins so
+# Classes of LAS by the ASPRS, and what they hold of SemanticKITTI's; 64 is the first that users define. Others are 1, unlabelled
+# points 0.
+ASPRS = {
+    2: ("road", "parking", "sidewalk", "other-ground", "lane-marking", "terrain"),
+    6: ("building", "fence", "other-structure"),
+    5: ("vegetation", "trunk"),
+    64: (MOVING,),
+}
 _VALUES = 1 << 16
 
 
@@ -84,4 +92,15 @@ def table_of(names: Iterable[str]) -> NDArray[np.bool_]:
 
     table = np.zeros(_VALUES, np.bool_)
     table[sorted(numbers_of(names))] = True
+    return table
+
+
+def asprs_table() -> NDArray[np.uint8]:
+    """(65536,) class of LAS of each label."""
+    import numpy as np
+
+    table = np.ones(_VALUES, np.uint8)
+    table[CLASSES["unlabeled"]] = 0
+    for number, names in ASPRS.items():
+        table[sorted(numbers_of(names))] = number
     return table

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import astuple, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import State
+from lslam.maps.observations import Observations
 from lslam.registration.preprocessing.ground import Z
 
 # The ground is the lowest of some scans around a place, by squares of so many m; what is higher stands on it. On slopes
@@ -133,11 +135,22 @@ class PosedScan:
     """A deskewed scan and where it was taken.
 
     points : (N, 3) float32, m, LiDAR frame at the scan's stamp; T_world_lidar : (4, 4); intensity : (N,) float32 or None
+    observations : of the same points, None where a map needs none
     """
 
     points: NDArray[np.float32]
     T_world_lidar: Floats
     intensity: NDArray[np.float32] | None = None
+    observations: Observations | None = None
+
+    def select(self, mask: NDArray[Any]) -> PosedScan:
+        """The points that `mask` (bool or indices) keeps, with all that is known of them."""
+        return replace(
+            self,
+            points=self.points[mask],
+            intensity=None if self.intensity is None else self.intensity[mask],
+            observations=None if self.observations is None else self.observations.select(mask),
+        )
 
 
 @dataclass(frozen=True)
@@ -233,9 +246,7 @@ class Cleaner:
             return []
         self.seen += len(moves)
         self.removed += int(moves.sum())
-        kept = ~moves
-        intensity = None if scan.intensity is None else scan.intensity[kept]
-        return [replace(scan, points=scan.points[kept], intensity=intensity)]
+        return [scan.select(~moves)]
 
     def _moves(self, scan: PosedScan, number: int) -> Bools:
         around = (number + sign * offset for offset in OFFSETS for sign in (-1, 1))

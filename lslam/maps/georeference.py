@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -149,13 +149,18 @@ class ProjectedCloud:
         """Whether the cloud has intensities."""
         return self.cloud.has_intensity
 
+    @property
+    def column_types(self) -> Mapping[str, np.dtype[Any]]:
+        """Types of the further columns of the cloud."""
+        return self.cloud.column_types
+
     def __len__(self) -> int:
         return len(self.cloud)
 
     def blocks(self) -> Iterator[CloudBlock]:
         """The blocks of the cloud, projected."""
         for block in self.cloud.blocks():
-            yield CloudBlock(self.projection.apply(block.points), block.intensity)
+            yield replace(block, points=self.projection.apply(block.points))
 
 
 def to_lat_lon(points: NDArray[Any], georeference: Georeference) -> Floats:

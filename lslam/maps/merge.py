@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import BLOCK, CloudBlock, in_memory
 from lslam.core.types.state import State
+from lslam.maps.observations import TAGS, Observations, column_types, columns_of, tags_of
 from lslam.maps.sorted_runs import SortedRuns, StoredRows
 
 log = logging.getLogger("lslam")
@@ -33,11 +35,19 @@ class MergedMap:
     ----------
     points : (M, 3) float64, m; intensity : (M,) float32 mean of the voxel's points, or None; counts : (M,) int64 points
         averaged
+    column_types : further columns, of the observation nearest to the sensor in each voxel, the earlier of two
     """
 
-    def __init__(self, rows: Longs | StoredRows, origin: Longs, voxel: float, has_intensity: bool) -> None:
+    def __init__(
+        self,
+        rows: Longs | StoredRows,
+        origin: Longs,
+        voxel: float,
+        has_intensity: bool,
+        types: Mapping[str, np.dtype[Any]],
+    ) -> None:
         self._rows, self._origin, self.voxel = rows, origin, voxel
-        self._has_intensity = has_intensity
+        self._has_intensity, self.column_types = has_intensity, types
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -64,13 +74,14 @@ class MergedMap:
 
     def blocks(self) -> Iterator[CloudBlock]:
         """The points, `BLOCK` at a time."""
-        from lslam.maps.kernels.voxel_average import INTENSITY_UNITS, unpack
+        from lslam.maps.kernels.voxel_average import INTENSITY_UNITS, SUMS, unpack
 
         for rows in self._pieces():
             intensity = (
-                (rows[:, 5] / (rows[:, 4] * INTENSITY_UNITS)).astype(np.float32) if self._has_intensity else None
+                (rows[:, -1] / (rows[:, 4] * INTENSITY_UNITS)).astype(np.float32) if self._has_intensity else None
             )
-            yield CloudBlock(unpack(rows, self._origin, self.voxel), intensity)
+            columns = columns_of(rows[:, SUMS : SUMS + TAGS], rows[:, 4], self.column_types)
+            yield CloudBlock(unpack(rows, self._origin, self.voxel), intensity, columns)
 
     def _pieces(self) -> Iterator[Longs]:
         for start in checking(range(0, len(self), BLOCK)):
@@ -92,6 +103,7 @@ class MapMerger:
     crop : x_min, x_max, y_min, y_max, z_min, z_max of the world, m; points outside are left out
     spool : folder beside which large maps are kept meanwhile; None: the system's temporary one
     keep : folder in which they stay instead, so that `state` and `restore` work
+    attributes : further columns of the map, as `map.attributes`; with some, every scan needs observations
 
     Attributes
     ----------
@@ -119,6 +131,7 @@ class MapMerger:
         crop: Any = None,
         spool: Path | None = None,
         keep: Path | None = None,
+        attributes: tuple[str, ...] = (),
         most: int = _MOST_ROWS,
     ) -> None:
         if not (np.isfinite(voxel) and voxel > 0):
@@ -132,15 +145,23 @@ class MapMerger:
         self._range_max = min(float(range_max), 1e150)  # squared it must stay finite, or Inf would pass the gate
         self._origin: Longs | None = None
         self._most, self._used = most, 0
-        self._start(columns=5)
+        self._attributes, self._last_scan = attributes, 0
+        self._base = 5 + (TAGS if attributes else 0)  # columns without that of the intensity
+        self._start(columns=self._base)
         self._crop = _EVERYWHERE if crop is None else np.asarray(crop, np.float64).reshape(6)
         self._spool, self._keep = spool, keep
         self._runs: SortedRuns | None = None
         self._with_intensity: bool | None = None
         self.scans = self.gated = self.outside = self.refused = 0
 
-    def add(self, points: NDArray[Any], T_world_lidar: Floats, intensity: NDArray[Any] | None = None) -> None:
-        """Add one scan: points (N, 3) m in the LiDAR frame, its pose (4, 4), intensity (N,) or None.
+    def add(
+        self,
+        points: NDArray[Any],
+        T_world_lidar: Floats,
+        intensity: NDArray[Any] | None = None,
+        observations: Observations | None = None,
+    ) -> None:
+        """Add one scan: points (N, 3) m in the LiDAR frame, its pose (4, 4), intensity (N,) or None, observations for attributes.
 
         The map has intensity only when every scan has; an intensity that is not finite counts as 0. A scan whose pose
         is not finite is refused, counted and logged. Raises InputError when points and intensities differ in number.
@@ -169,6 +190,7 @@ class MapMerger:
         self._used, gated, outside = accumulate(
             cloud,
             values if self._with_intensity else _NO_INTENSITY,
+            tags_of(observations if self._attributes else None),
             T,
             self._range_min,
             self._range_max,
@@ -180,6 +202,7 @@ class MapMerger:
             self._used,
         )
         self.scans += 1
+        self._last_scan = max(self._last_scan, 0 if observations is None else observations.scan)
         self.gated += int(gated)
         self.outside += int(outside)
 
@@ -197,15 +220,16 @@ class MapMerger:
             rows = self._take()
         else:
             self._spill()
-            rows = self._runs.combined(_add_up)
+            rows = self._runs.combined(partial(_add_up, has_tags=bool(self._attributes)))
             self._runs = None
-        return MergedMap(rows, origin, self._voxel, bool(self._with_intensity))
+        types = column_types(self._attributes, self._last_scan)
+        return MergedMap(rows, origin, self._voxel, bool(self._with_intensity), types)
 
     def state(self) -> State:
         """State for `restore`; voxels that changed since the last time are written to `keep`."""
         if self._used:
             self._spill()
-        counts = (self.scans, self.gated, self.outside, self.refused)
+        counts = (self.scans, self.gated, self.outside, self.refused, self._last_scan)
         runs = None if self._runs is None else self._runs.state()
         return {"origin": self._origin, "with_intensity": self._with_intensity, "counts": counts, "runs": runs}
 
@@ -216,10 +240,10 @@ class MapMerger:
             runs.restore(state["runs"])
             self._runs = runs
         self._origin = state["origin"]
-        self.scans, self.gated, self.outside, self.refused = state["counts"]
+        self.scans, self.gated, self.outside, self.refused, self._last_scan = state["counts"]
         if state["with_intensity"] is not None:
             self._with_intensity = bool(state["with_intensity"])
-            self._start(columns=6 if self._with_intensity else 5)
+            self._start(columns=self._base + self._with_intensity)
 
     def _take(self) -> Longs:
         """Sorted rows in memory, which is emptied."""
@@ -242,10 +266,10 @@ class MapMerger:
     def _settle_intensity(self, given: bool) -> None:
         if self._with_intensity is None:
             self._with_intensity = given
-            self._rows = np.empty((len(self._rows), 6 if given else 5), np.int64)
+            self._rows = np.empty((len(self._rows), self._base + given), np.int64)
         elif self._with_intensity and not given:
             log.warning("merged map: a scan has no intensity, so the map has none")
-            self._with_intensity, self._rows = False, np.ascontiguousarray(self._rows[:, :5])
+            self._with_intensity, self._rows = False, np.ascontiguousarray(self._rows[:, : self._base])
 
     def _reserve(self, rows: int) -> None:
         """Ensure room for `rows` rows, even for one scan with more than `most` of them."""
@@ -263,11 +287,15 @@ def _slots_for(rows: int) -> int:
     return 1 << int(np.ceil(np.log2(max(rows, 1) * 2)))
 
 
-def _add_up(rows: Longs) -> Longs:
-    """Sum of the rows of each key, from sorted rows."""
+def _add_up(rows: Longs, has_tags: bool = False) -> Longs:
+    """Sum of the rows of each key, from sorted rows, with the tags of the one that comes first by them."""
+    if has_tags:
+        rows = rows[np.lexsort((rows[:, 5], rows[:, 0]))]
     first = np.flatnonzero(np.diff(rows[:, 0], prepend=rows[0, 0] - 1))
     summed = np.add.reduceat(rows, first, axis=0)
     summed[:, 0] = rows[first, 0]
+    if has_tags:
+        summed[:, 5 : 5 + TAGS] = rows[first, 5 : 5 + TAGS]
     return summed
 
 

@@ -45,7 +45,7 @@ def denoise(cloud: ArrayCloud, neighbours: int = NEIGHBOURS, deviations: float =
         return cloud
     _, kept = _points(package, cloud).remove_statistical_outlier(neighbours, deviations)
     index = np.sort(np.asarray(kept, np.int64))
-    return ArrayCloud(cloud.points[index], None if cloud.intensity is None else cloud.intensity[index])
+    return cloud.select(index)
 
 
 def surface(cloud: ArrayCloud, voxel: float, viewpoints: NDArray[Any]) -> Mesh:

@@ -23,6 +23,22 @@ PART = 1 << 18
 _SAMPLE = 4096
 
 
+def rows_folder(beside: Path | None, folder: Path | None) -> tuple[Path, tempfile.TemporaryDirectory[str] | None]:
+    """Folder for rows: `folder`, which stays, or a temporary one in `beside`, with its owner, at whose end it goes.
+
+    Raises OutputError when it cannot be written.
+    """
+    try:
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            return folder, None
+        owner = tempfile.TemporaryDirectory(prefix=".lslam-map-", dir=beside, ignore_cleanup_errors=True)
+    except OSError as error:
+        place = folder or beside or tempfile.gettempdir()
+        raise OutputError(f"{place} cannot be written: {cause(error)}") from None
+    return Path(owner.name), owner
+
+
 class SortedRuns:
     """Runs of rows (n, k), int64, each sorted by its first column, in files of a temporary folder.
 
@@ -37,18 +53,7 @@ class SortedRuns:
     """
 
     def __init__(self, beside: Path | None = None, folder: Path | None = None) -> None:
-        self._owner: tempfile.TemporaryDirectory[str] | None = None
-        try:
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-                self._folder = folder
-            else:
-                # Its finaliser removes it when nobody needs the rows any more.
-                self._owner = tempfile.TemporaryDirectory(prefix=".lslam-map-", dir=beside, ignore_cleanup_errors=True)
-                self._folder = Path(self._owner.name)
-        except OSError as error:
-            place = folder or beside or tempfile.gettempdir()
-            raise OutputError(f"{place} cannot be written: {cause(error)}") from None
+        self._folder, self._owner = rows_folder(beside, folder)
         self._runs: list[StoredRows] = []
 
     def __len__(self) -> int:

@@ -39,6 +39,7 @@ from lslam.pipeline.check import check_config
 from lslam.pipeline.doctor.examine_positions import examine_jumps
 from lslam.pipeline.doctor.examine_units import examine_units
 from lslam.pipeline.manifest import Manifest, describe_deskew
+from lslam.pipeline.map_attributes import KEY, needs_labels, with_attributes
 from lslam.pipeline.prior_map_files import require_map
 from lslam.pipeline.run_folder import RunFolder
 from lslam.pipeline.watch import Watch
@@ -97,6 +98,8 @@ def prepare(
     if config.localize.map:
         require_map(Path(config.localize.map), config.gnss.mode != "off")
     chosen = choose_scans(sequence, odometry, config)
+    if config.map.write:
+        with_attributes(chosen, config)  # before the odometry and not after it
     osm = open_osm(sequence, config)
     manual = read_manual(config, chosen)
     manifest, store = Manifest(command, chosen, config), KeyframeStore(deflate=config.keyframes.deflate)
@@ -144,8 +147,13 @@ def choose_scans(sequence: Sequence, odometry: Odometry, config: Config) -> Sequ
     times do not fit, and when labels are needed and there are none.
     """
     dropped = config.preprocess.drop_labels
-    if dropped or (config.osm.extract and config.osm.needs_labels):
-        sequence = with_labels(sequence, "preprocess.drop_labels" if dropped else "osm.labels")
+    needs = {
+        "preprocess.drop_labels": dropped,
+        "osm.labels": config.osm.extract and config.osm.needs_labels,
+        KEY: config.map.write and needs_labels(config.map),
+    }
+    if any(needs.values()):
+        sequence = with_labels(sequence, next(key for key, is_needed in needs.items() if is_needed))
     sequence = with_point_times(sequence, config.preprocess)
     if odometry.needs_rings:
         sequence = with_rings(sequence, config.input.rings)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,18 +109,24 @@ def _join(notes: dict[str, Note]) -> Note:
 class MapNote:
     """Facts that a map file cannot hold: source sequence, voxel edge, m, and processing steps.
 
-    world : its coordinates in words, where they are those of the trajectory
+    world : its coordinates in words, where they are those of the trajectory; attributes : meaning of each, by name
     """
 
     sequence: str
     voxel: float
     done: tuple[str, ...] = ()
     world: str = LOCAL
+    attributes: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, sequence: str, config: MapConfig, built: BuiltMap, world: str) -> MapNote:
         """Note for the map of a run, by its configuration, in its `world`."""
-        return cls(sequence, config.voxel, built.done, f"{LOCAL}: {world}")
+        return cls(sequence, config.voxel, built.done, f"{LOCAL}: {world}", built.attributes)
+
+    @property
+    def attributes_note(self) -> dict[str, Any]:
+        """The attributes, for JSON; empty without any."""
+        return {"attributes": dict(self.attributes)} if self.attributes else {}
 
 
 def write_built(
@@ -173,6 +180,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
         "georeference": None if georeference is None else georeference_note(georeference),
         "voxel": note.voxel,
         "done": list(note.done),
+        **note.attributes_note,
         "sequence": note.sequence,
         "lslam": __version__,
     }

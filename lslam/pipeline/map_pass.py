@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -25,14 +25,17 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.state import State
 from lslam.maps.clean import Cleaner, PosedScan
+from lslam.maps.every_point import PointCollector
 from lslam.maps.floor_plan import TopView, top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
+from lslam.maps.observations import Observations
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import Loaded
 from lslam.odometry.inertial.course import Course
+from lslam.pipeline.map_attributes import attribute_notes, with_attributes
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
 from lslam.registration.preprocessing.ground import Z, world_up_of
@@ -47,7 +50,7 @@ INTERRUPTED = "interrupted while the map was built: nothing of it is written"
 class BuiltMap:
     """Result of building a map: the merged map, its top view, and a sample of its points for pages.
 
-    Also the processing steps, in words, and the occupancy if requested.
+    Also the processing steps, in words, the occupancy if requested, and the meaning of each attribute of its points.
     """
 
     merged: Cloud
@@ -55,6 +58,7 @@ class BuiltMap:
     sample: ArrayCloud
     done: tuple[str, ...] = ()
     occupancy: OccupancyGrid | None = None
+    attributes: Mapping[str, str] = field(default_factory=dict)
 
 
 def build_map(
@@ -81,12 +85,13 @@ def build_map(
 
     maker, done = (make(), 0) if checkpoints is None else checkpoints.begin(make, poses)
     numbers = range(maker.first_again(done), len(results))
+    sequence = with_attributes(sequence, config)
     poser, offer = scan_poser(results, config), None if checkpoints is None else partial(checkpoints.offer, maker)
     for k, loaded in scans_again(sequence, poser, numbers, config, on_step, should_stop, INTERRUPTED, done, offer):
         if loaded.prepared is not None:
             maker.add(k, loaded.prepared)
     with asking(should_stop, INTERRUPTED):
-        built = maker.finish()
+        built = replace(maker.finish(), attributes=attribute_notes(section, results[0].stamp_ns))
     dropped = ", ".join(config.preprocess.drop_labels)
     return replace(built, done=(*built.done, f"without points of {dropped}")) if dropped else built
 
@@ -126,7 +131,7 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
 
     For the thread that reads, since merging takes as long as reading and deskewing together.
     """
-    ego_box = config.map.ego_box or config.preprocess.ego_box
+    ego_box, names = config.map.ego_box or config.preprocess.ego_box, config.map.attributes
     results = [result.at_stamp for result in results]
     # Poses in frames of their own tell nothing of the motion in this one.
     here = [result for result in results if not result.frame]
@@ -138,7 +143,7 @@ def scan_poser(results: list[ScanResult], config: Config) -> Callable[[Scan], Po
             return None
         scan = scan if ego_box is None else without_box(scan, ego_box)
         points = deskew_points(scan.points, scan.times, motion_within(scan, course))
-        return PosedScan(points, result.T_world_lidar, scan.intensity)
+        return PosedScan(points, result.T_world_lidar, scan.intensity, Observations.of(scan) if names else None)
 
     return pose_scan
 
@@ -152,13 +157,14 @@ class MapMaker:
 
     def __init__(self, section: MapConfig, spool: Path | None = None, keep: Path | None = None, up: Floats = Z) -> None:
         self._section = section
-        self._merger = MapMerger(
-            section.voxel,
+        make = partial(MapMerger, section.voxel) if section.voxel else PointCollector
+        self._merger: MapMerger | PointCollector = make(
             section.range_min,
             section.range_max,
             crop=section.crop_box,
             spool=spool,
             keep=None if keep is None else keep / "map",
+            attributes=section.attributes,
         )
         self._cleaner = Cleaner(up) if section.clean else None
         self._occupancy = None
@@ -215,7 +221,7 @@ class MapMaker:
 
     def _merge(self, scans: Iterable[PosedScan]) -> None:
         for posed in scans:
-            self._merger.add(posed.points, posed.T_world_lidar, posed.intensity)
+            self._merger.add(posed.points, posed.T_world_lidar, posed.intensity, posed.observations)
             if self._occupancy is not None:
                 self._occupancy.add(posed.points, posed.T_world_lidar)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.core.errors import (
     InputError,
@@ -19,7 +20,6 @@ from lslam.core.errors import (
     UsageError,
     output_errors,
 )
-from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.sequence import Sequence
@@ -92,6 +92,7 @@ def write_tiles(
         "georeference": None if georeference is None else georeference_note(georeference),
         "voxel": note.voxel,
         "done": list(note.done),
+        **note.attributes_note,
         "sequence": note.sequence,
         "lslam": __version__,
     }
@@ -112,12 +113,17 @@ def _publish(stage: Path, folder: Path, names: set[str]) -> None:
 
 def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple[int, int], ArrayCloud]]:
     """Points of each tile, tiles in order."""
-    waiting: dict[tuple[int, int], list[Floats]] = {}
+    record = np.dtype(
+        [("points", np.float64, (3,)), ("intensity", np.float32), ("columns", list(cloud.column_types.items()))]
+    )
+    waiting: dict[tuple[int, int], list[NDArray[Any]]] = {}
     held, keys = 0, set[tuple[int, int]]()
     with output_errors(f"the tiles in {spool.parent}"):
         for block in cloud.blocks():
-            table = np.empty((len(block), 4))
-            table[:, :3], table[:, 3] = block.points, 0.0 if block.intensity is None else block.intensity
+            table = np.empty(len(block), record)
+            table["points"], table["intensity"] = block.points, 0.0 if block.intensity is None else block.intensity
+            for name, values in block.columns.items():
+                table["columns"][name] = values
             cells = np.floor(block.points[:, :2] / size).astype(np.int64)
             found, of = np.unique(cells, axis=0, return_inverse=True)
             for n, (x, y) in enumerate(found.tolist()):
@@ -129,25 +135,26 @@ def _sorted_into(cloud: Cloud, size: float, spool: Path) -> Iterator[tuple[tuple
         keys |= _spill(waiting, spool)
         for key in sorted(keys):
             path = _part(spool, key)
-            table = np.fromfile(path, np.float64).reshape(-1, 4)
+            table = np.fromfile(path, record)
             path.unlink()
-            yield key, ArrayCloud(table[:, :3], table[:, 3].astype(np.float32) if cloud.has_intensity else None)
+            columns = {name: table["columns"][name] for name in cloud.column_types}
+            yield key, ArrayCloud(table["points"], table["intensity"] if cloud.has_intensity else None, columns)
 
 
-def _spill(waiting: dict[tuple[int, int], list[Floats]], spool: Path) -> set[tuple[int, int]]:
+def _spill(waiting: dict[tuple[int, int], list[NDArray[Any]]], spool: Path) -> set[tuple[int, int]]:
     """Append the buffered points to the files of their tiles."""
     for key, parts in waiting.items():
         with ExitStack() as stack:
             stream = stack.enter_context(_part(spool, key).open("ab"))
             for part in parts:
-                stream.write(np.ascontiguousarray(part).data)
+                stream.write(part.data)
     keys = set(waiting)
     waiting.clear()
     return keys
 
 
 def _part(spool: Path, key: tuple[int, int]) -> Path:
-    return spool / f"{key[0]}_{key[1]}.f64"
+    return spool / f"{key[0]}_{key[1]}.points"
 
 
 def is_tiles(folder: Path) -> bool:

@@ -27,6 +27,7 @@ from lslam.io.formats.trajectory_files import write_tum
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import to_trajectory
 from lslam.pipeline.back_end_pass import describe
+from lslam.pipeline.map_attributes import attribute_notes, with_attributes
 from lslam.pipeline.map_files import MapNote, write_map
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, MapMaker, scan_poser, scans_again
 from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
@@ -94,7 +95,7 @@ def merge_into(
 def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> dict[str, Any]:
     """Write everything but the manifest, and return the manifest's content."""
     problems = [f"{one.name} is left out: {one.why}" for one in merged.left_out]
-    recordings = [_recording(run, problems) for run in merged.runs]
+    recordings = [_recording(run, config, problems) for run in merged.runs]
     trajectories = [to_trajectory(results, "merge") for results in merged.results]
     (folder.path / SESSIONS).mkdir(exist_ok=True)
     world = f"that of {merged.sessions[0].name}"
@@ -113,7 +114,9 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
     built = None
     if config.map.write:
         built = _map(recordings, merged.results, config, watch, folder.path, merged.sessions[0].up)
-        note = MapNote(", ".join(s.name for s in merged.sessions), config.map.voxel, built.done, world)
+        note = MapNote(
+            ", ".join(s.name for s in merged.sessions), config.map.voxel, built.done, world, built.attributes
+        )
         write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
         about["map_points"] = len(built.merged)
     views, shown = _views(merged, trajectories), (None, None) if built is None else (built.view, built.sample)
@@ -136,15 +139,13 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
     }
 
 
-def _recording(run: EarlierRun, problems: list[str]) -> Recording | None:
-    """Raw scans of a run; None, with a problem, where they are missing."""
+def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recording | None:
+    """Raw scans of a run with what the map needs; None, with a problem, where they are missing."""
     try:
-        return open_scans(run)
+        scans = open_scans(replace(run, config=run.config.model_copy(update={"map": config.map})))
+        return with_attributes(scans, config) if config.map.write else scans
     except InputError as error:
-        log.debug("%s", error)
-        problems.append(
-            f"the raw scans of {run.folder.name} cannot be read at {run.sequence_path}: they are missing in the map"
-        )
+        problems.append(f"the raw scans of {run.folder.name} are missing in the map: {error}")
         return None
 
 
@@ -233,7 +234,8 @@ def _map(
             if loaded.prepared is not None:
                 maker.add(number + k, loaded.prepared)
         number += len(poses)
-    return maker.finish()
+    first_ns = min((poses[0].stamp_ns for poses in results if poses), default=0)
+    return replace(maker.finish(), attributes=attribute_notes(config.map, first_ns))
 
 
 def _views(merged: Merged, trajectories: Sequence[Trajectory]) -> list[SessionView]:

@@ -42,6 +42,7 @@ from lslam.io.remote import as_path
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import Projection
 from lslam.maps.mesh import require_open3d
+from lslam.pipeline.map_attributes import KEY, needs_labels
 from lslam.pipeline.map_files import (
     drop_note,
     georeference_of,
@@ -97,12 +98,12 @@ class EarlierRun:
 
 @dataclass(frozen=True)
 class RebuiltMap:
-    """Result of `rebuild`."""
+    """Result of `rebuild`; only maps of voxels are scored."""
 
     path: Path
     points: int
     scans: int
-    crispness: Crispness
+    crispness: Crispness | None
 
 
 def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
@@ -156,7 +157,9 @@ def open_scans(run: EarlierRun, sequence: Path | None = None, *, flag: str = "--
     given = {name: value for name, value in reading.items() if value is not None}
     opened = open_sequence(path, vertical_correction_deg=section.vertical_correction_deg, **(known | given))
     dropped = run.config.preprocess.drop_labels
-    opened = _with_clock(run, with_labels(opened, "preprocess.drop_labels") if dropped else opened)
+    if dropped or needs_labels(run.config.map):
+        opened = with_labels(opened, "preprocess.drop_labels" if dropped else KEY)
+    opened = _with_clock(run, opened)
     opened = WithoutClasses(opened, dropped) if dropped else opened
     chosen = select(opened, section.start, section.count, section.skip_frames)
     count = len(run.trajectory)
@@ -213,7 +216,7 @@ def rebuild(
         built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
         if should_stop():
             raise InterruptedRunError(INTERRUPTED)
-        score = crispness(built.merged)
+        score = crispness(built.merged) if run.config.map.voxel else None
         with _stage(path.parent) as stage:
             write_built(
                 stage / path.name, built, run.config.map, sequence.name, run.trajectory, run.world, georeference
@@ -253,7 +256,7 @@ def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
     return georeference
 
 
-def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness) -> RunRecord:
+def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness | None) -> RunRecord:
     """Record for the run's report about its map, and the manifest with the new map."""
     points, section = len(built.merged), run.config.map
     about = {"file": name, "points": points, "voxel": section.voxel, "done": list(built.done)}

@@ -104,7 +104,7 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
             folder.path,
             map_checkpoints(folder, config),
         )
-        score = crispness(built.merged)
+        score = crispness(built.merged) if config.map.voxel else None
         outputs.write_map(folder, built, config.map, record)
         record.map_file, record.map_sample = f"map.{config.map.format}", built.sample
         record.map_image, record.map_heights = built.view.image, built.view.heights

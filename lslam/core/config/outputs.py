@@ -3,11 +3,28 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from lslam.core.config.section import Section
+
+ATTRIBUTES = ("time", "scan", "ring", "range", "observations", "class")
+FINEST_M = 0.01
+
+
+def parse_attributes(value: Any) -> tuple[str, ...]:
+    """Attributes of points from a list, or from text with commas between. Raises ValueError for one that is unknown.
+
+    >>> parse_attributes("time, ring")
+    ('time', 'ring')
+    """
+    words = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
+    names = tuple(dict.fromkeys(str(word).strip() for word in words if word != ""))
+    for name in names:
+        if name not in ATTRIBUTES:
+            raise ValueError(f"{name!r} is no attribute of points: {', '.join(ATTRIBUTES)} are")
+    return names
 
 
 class MapConfig(Section):
@@ -17,7 +34,12 @@ class MapConfig(Section):
     write_features: bool = Field(
         False, description="write feature_map.ply, edges and planar points, of methods that have features"
     )
-    voxel: float = Field(0.2, ge=0.01, description="m; one averaged point per voxel")
+    voxel: float = Field(0.2, ge=0, description="m; one averaged point per voxel; 0 keeps every point")
+    attributes: Annotated[tuple[str, ...], BeforeValidator(parse_attributes)] = Field(
+        (),
+        description="of each point: time, scan, ring, range, observations, class; in a voxel those of the observation nearest to "
+        "the sensor",
+    )
     format: Literal["ply", "pcd", "las", "laz"] = Field(
         "ply", description="file format; las and laz are in map coordinates when the run is georeferenced"
     )
@@ -46,6 +68,10 @@ class MapConfig(Section):
     def _check(self) -> MapConfig:
         self.require_order("range_min", "range_max")
         self.require_order("range_min", "occupancy_range")
+        if 0 < self.voxel < FINEST_M:
+            raise ValueError(f"voxel = {self.voxel:g} must be {FINEST_M:g} m or more, or 0 for every point")
+        if self.voxel == 0 and (self.mesh or self.denoise):
+            raise ValueError("voxel = 0 keeps every point, and mesh and denoise need voxels: set one")
         require_box("ego_box", self.ego_box)
         if self.crop is not None and len(self.crop) not in (4, 6):
             raise ValueError(f"crop = {list(self.crop)} must be x_min, x_max, y_min, y_max and perhaps z_min, z_max")

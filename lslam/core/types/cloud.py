@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,14 +12,19 @@ from numpy.typing import NDArray
 from lslam.core.types.arrays import Floats
 
 BLOCK = 1 << 18
+# Columns beside the points, (N,) each, by name. Those that lslam knows: `time_ns` int64, clock of the recording; `scan` uint16 or
+# uint32; `ring` and `class` uint16; `range` float32, m; `observations` uint32; `red`, `green`, `blue` uint8.
+TIME_NS = "time_ns"
+Columns = Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class CloudBlock:
-    """Some points of a cloud: points (N, 3) float64, m; intensity (N,) float32 or None."""
+    """Some points of a cloud: points (N, 3) float64, m; intensity (N,) float32 or None; further columns (N,) by name."""
 
     points: Floats
     intensity: NDArray[np.float32] | None = None
+    columns: Columns = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -33,6 +38,11 @@ class Cloud(Protocol):
         """Whether every block has intensities."""
         ...
 
+    @property
+    def column_types(self) -> Mapping[str, np.dtype[Any]]:
+        """Types of the further columns of every block, by name."""
+        ...
+
     def __len__(self) -> int:
         """Number of points."""
         ...
@@ -44,7 +54,7 @@ class Cloud(Protocol):
 
 @dataclass(frozen=True)
 class ArrayCloud:
-    """A cloud in memory: points (N, 3) float64, m; intensity (N,) float32 or None.
+    """A cloud in memory: points (N, 3) float64, m; intensity (N,) float32 or None; further columns (N,) by name.
 
     >>> ArrayCloud.of([[1, 2, 3]]).points.tolist()
     [[1.0, 2.0, 3.0]]
@@ -52,6 +62,7 @@ class ArrayCloud:
 
     points: Floats
     intensity: NDArray[np.float32] | None = None
+    columns: Columns = field(default_factory=dict)
 
     @classmethod
     def of(cls, points: Any, intensity: Any = None) -> ArrayCloud:
@@ -64,14 +75,24 @@ class ArrayCloud:
         """Whether there are intensities."""
         return self.intensity is not None
 
+    @property
+    def column_types(self) -> Mapping[str, np.dtype[Any]]:
+        """Types of the further columns."""
+        return {name: values.dtype for name, values in self.columns.items()}
+
+    def select(self, index: NDArray[Any] | slice) -> ArrayCloud:
+        """The points at `index`, with all that is known of them."""
+        intensity = None if self.intensity is None else self.intensity[index]
+        return ArrayCloud(self.points[index], intensity, {name: v[index] for name, v in self.columns.items()})
+
     def __len__(self) -> int:
         return len(self.points)
 
     def blocks(self) -> Iterator[CloudBlock]:
         """Slices of the arrays."""
         for start in range(0, len(self), BLOCK):
-            some = slice(start, start + BLOCK)
-            yield CloudBlock(self.points[some], None if self.intensity is None else self.intensity[some])
+            some = self.select(slice(start, start + BLOCK))
+            yield CloudBlock(some.points, some.intensity, some.columns)
 
 
 def in_memory(cloud: Cloud) -> ArrayCloud:
@@ -80,10 +101,14 @@ def in_memory(cloud: Cloud) -> ArrayCloud:
         return cloud
     parts = list(cloud.blocks())
     points = np.concatenate([part.points for part in parts]) if parts else np.zeros((0, 3))
+    columns = {
+        name: np.concatenate([np.zeros(0, kind), *(part.columns[name] for part in parts)])
+        for name, kind in cloud.column_types.items()
+    }
     if not cloud.has_intensity:
-        return ArrayCloud(points)
+        return ArrayCloud(points, columns=columns)
     values = [part.intensity for part in parts if part.intensity is not None]
-    return ArrayCloud(points, np.concatenate(values) if values else np.zeros(0, np.float32))
+    return ArrayCloud(points, np.concatenate(values) if values else np.zeros(0, np.float32), columns)
 
 
 def bounds(cloud: Cloud) -> tuple[Floats, Floats]:
@@ -97,7 +122,7 @@ def bounds(cloud: Cloud) -> tuple[Floats, Floats]:
 
 
 def thinned(cloud: Cloud, most: int) -> ArrayCloud:
-    """At most `most` points of a cloud, evenly spaced in its order, so the same ones every time.
+    """At most `most` points of a cloud, evenly spaced in its order, so the same ones every time; without further columns.
 
     >>> thinned(ArrayCloud.of([[x, 0, 0] for x in range(5)]), 3).points[:, 0].tolist()
     [0.0, 2.0, 4.0]

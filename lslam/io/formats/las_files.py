@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Mapping
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
+from lslam.core.labels import asprs_table
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import ArrayCloud, Cloud
+from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, Columns
 from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.gps_time import gps_time_s
+from lslam.io.formats.text_tables import is_unix_time
 
 if TYPE_CHECKING:
     import lazrs
@@ -35,6 +40,16 @@ _SIZES = {2: 227, 3: 235, 4: 375, 5: 393}  # bytes of the header by minor versio
 SCALE = 0.001  # m
 _WAY_OUT = "install it with: pip install laspy lazrs"
 _REACH = 2**31 - 1
+_REACH_NS = 2**63 - 1
+_LAST_SOURCE = 2**16 - 1
+_COLOURS = ("red", "green", "blue")
+_ABOUT = {  # 32 characters at most
+    "scan": "number of the scan",
+    "ring": "number of the beam",
+    "range": "m from the sensor",
+    "observations": "number of points averaged",
+    "class": "class of the recording",
+}
 _BLOCK = 1 << 26  # bytes of points decompressed at a time
 
 
@@ -133,10 +148,14 @@ def _check_layers(stream: BinaryIO, layers: int, begin: int, length: int, record
 
 
 def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
-    """Write a cloud, m, as LAS 1.4 (point format 6); `.laz` compresses it.
+    """Write a cloud, m, as LAS 1.4 (point format 6, with colours 7); `.laz` compresses it.
 
     Coordinates are millimetres about an offset, the floor of the smallest ones. Intensities are 16 bits: 0..1 and 0..255
     are spread over them, larger values are kept. The file is dated 1970, so the same cloud gives the same bytes.
+
+    Columns that LAS has take its fields: times `gps_time`, adjusted standard GPS time where the clock tells Unix time, else its
+    own seconds, marked as week time; scans `point_source_id`; classes, in groups of `lslam.core.labels.ASPRS`,
+    `classification`; colours. Classes as they are, scans of more than 16 bits (0 there), and the rest are extra dimensions.
 
     wkt : coordinate reference system of the points; empty: none
 
@@ -145,11 +164,12 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
     with importing("laspy", _WAY_OUT):
         import laspy
         import lazrs  # noqa: F401
-    low, high, largest = _survey(cloud)
+    low, high, largest, first_ns = _survey(cloud)
     offset = np.floor(low)
     if np.any(high - offset > SCALE * _REACH):
         raise OutputError(f"{path}: the map is wider than LAS can hold in millimetres: crop it with --crop")
-    header = _header(laspy, offset, wkt)
+    is_unix = is_unix_time(first_ns)
+    header = _header(laspy, offset, wkt, cloud.column_types, is_unix)
     factor = 65535.0 if largest <= 1.0 else 257.0 if largest <= 255.0 else 1.0
     with atomic_write(path) as stream:
         compressed = path.suffix.lower() == ".laz"
@@ -160,6 +180,8 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
                 record["X"], record["Y"], record["Z"] = steps.astype(np.int32).T
                 if block.intensity is not None:
                     record["intensity"] = np.clip(np.rint(block.intensity * factor), 0, 65535).astype(np.uint16)
+                for name, values in _fields(block.columns, is_unix).items():
+                    record[name] = values
                 record["return_number"] = record["number_of_returns"] = np.ones(len(block), np.uint8)
                 writer.write_points(record)
 
@@ -193,8 +215,32 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
     return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
 
 
-def _header(laspy: Any, offset: Floats, wkt: str) -> Any:
-    header = laspy.LasHeader(version="1.4", point_format=6)
+def _fields(columns: Columns, is_unix: bool) -> dict[str, NDArray[Any]]:
+    """Values of LAS fields and extra dimensions, by name."""
+    fields: dict[str, NDArray[Any]] = {name: v for name, v in columns.items() if name not in (*_COLOURS, TIME_NS)}
+    if TIME_NS in columns:
+        fields["gps_time"] = gps_time_s(columns[TIME_NS], is_unix)
+    for name in set(_COLOURS).intersection(columns):
+        fields[name] = columns[name].astype(np.uint16) * 257
+    if "class" in columns:
+        fields["classification"] = asprs_table()[columns["class"]]
+    if "scan" in columns:
+        scans = columns["scan"]
+        fields["point_source_id"] = np.where(scans <= _LAST_SOURCE, scans, 0).astype(np.uint16)
+        if scans.dtype == np.uint16:
+            del fields["scan"]
+    return fields
+
+
+def _header(laspy: Any, offset: Floats, wkt: str, types: Mapping[str, np.dtype[Any]], is_unix: bool) -> Any:
+    header = laspy.LasHeader(version="1.4", point_format=7 if set(_COLOURS) & set(types) else 6)
+    own = _fields({name: np.zeros(0, kind) for name, kind in types.items()}, is_unix)
+    known = set(header.point_format.dimension_names)
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(n, v.dtype.name, _ABOUT.get(n, "")) for n, v in own.items() if n not in known]
+    )
+    if TIME_NS in types and is_unix:
+        header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
     header.scales, header.offsets = np.full(3, SCALE), offset
     header.creation_date = date(1970, 1, 1)  # laspy would put today's
     header.system_identifier = "lslam"
@@ -206,11 +252,12 @@ def _header(laspy: Any, offset: Floats, wkt: str) -> Any:
     return header
 
 
-def _survey(cloud: Cloud) -> tuple[Floats, Floats, float]:
-    """Smallest and largest coordinates (3,), m, and the largest intensity; zeros for nothing."""
-    low, high, largest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+def _survey(cloud: Cloud) -> tuple[Floats, Floats, float, int]:
+    """Smallest and largest coordinates (3,), m, the largest intensity and the earliest time, ns; zeros for nothing."""
+    low, high, largest, first_ns = np.full(3, np.inf), np.full(3, -np.inf), 0.0, _REACH_NS
     for block in cloud.blocks():
         low, high = np.minimum(low, block.points.min(0)), np.maximum(high, block.points.max(0))
         if block.intensity is not None:
             largest = max(largest, float(block.intensity.max()))
-    return (low, high, largest) if np.isfinite(low).all() else (np.zeros(3), np.zeros(3), 0.0)
+        first_ns = min(first_ns, int(block.columns[TIME_NS].min()) if TIME_NS in block.columns else 0)
+    return (low, high, largest, first_ns) if np.isfinite(low).all() else (np.zeros(3), np.zeros(3), 0.0, 0)

@@ -6,7 +6,6 @@ import io
 import math
 import re
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -58,13 +57,15 @@ def pcd_columns(path: Path) -> dict[str, NDArray[Any]]:
     return columns | (organised(height, width) if height * width == header.points else {})
 
 
-def pcd_header(count: int, names: Sequence[str]) -> bytes:
-    """Header of `count` binary points of float32 fields."""
-    k = len(names)
+def pcd_header(count: int, kind: np.dtype[Any]) -> bytes:
+    """Header of `count` binary little-endian points, records of `kind`, packed."""
+    names = kind.names or ()
+    sizes = " ".join(str(kind[name].itemsize) for name in names)
+    types = " ".join(kind[name].kind.upper() for name in names)
     return (
         "# .PCD v0.7 - Point Cloud Data file format\n"
-        f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {' '.join(['4'] * k)}\nTYPE {' '.join(['F'] * k)}\n"
-        f"COUNT {' '.join(['1'] * k)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
+        f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {sizes}\nTYPE {types}\n"
+        f"COUNT {' '.join('1' for _ in names)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
     ).encode()
 
 

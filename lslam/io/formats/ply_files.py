@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ _TYPES = {
     "double": "f8",
     "float64": "f8",
 }
+_NAMES = {code: name for name, code in _TYPES.items() if not name[-1].isdigit()}
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -82,12 +83,13 @@ def write_ply(
     """
     columns = {**({} if intensity is None else {"intensity": intensity}), **(scalars or {})}
     shades = {} if colours is None else dict(zip(("red", "green", "blue"), np.transpose(colours), strict=True))
-    names = ["x", "y", "z", *columns]
-    table = np.empty(len(points), [*((name, "<f4") for name in names), *((name, "u1") for name in shades)])
+    table = np.empty(
+        len(points), [*((name, "<f4") for name in ("x", "y", "z", *columns)), *((name, "u1") for name in shades)]
+    )
     for name, values in {**dict(zip("xyz", np.transpose(points), strict=True)), **columns, **shades}.items():
         table[name] = values
     with atomic_write(path) as stream:
-        stream.write(ply_header(len(table), names, comment, list(shades)))
+        stream.write(ply_header(len(table), table.dtype, comment))
         stream.write(table.tobytes())
 
 
@@ -96,18 +98,18 @@ def write_ply_mesh(path: Path, vertices: NDArray[Any], triangles: NDArray[Any], 
     faces = np.empty(len(triangles), np.dtype([("n", "u1"), ("v", "<i4", 3)]))
     faces["n"], faces["v"] = 3, triangles
     element = f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n".encode()
-    header = ply_header(len(vertices), ["x", "y", "z"], comment).replace(b"end_header\n", element)
+    kind = np.dtype([(axis, "<f4") for axis in "xyz"])
+    header = ply_header(len(vertices), kind, comment).replace(b"end_header\n", element)
     with atomic_write(path) as stream:
         stream.write(header)
         stream.write(np.ascontiguousarray(vertices, "<f4").data)
         stream.write(faces.tobytes())
 
 
-def ply_header(count: int, names: Sequence[str], comment: str = "", byte_names: Sequence[str] = ()) -> bytes:
-    """Header of `count` binary little-endian vertices of float32 properties, then of bytes."""
+def ply_header(count: int, kind: np.dtype[Any], comment: str = "") -> bytes:
+    """Header of `count` binary little-endian vertices, records of `kind`, packed."""
     comments = "".join(f"comment {line}\n" for line in comment.splitlines())
-    properties = "".join(f"property float {name}\n" for name in names)
-    properties += "".join(f"property uchar {name}\n" for name in byte_names)
+    properties = "".join(f"property {_NAMES[kind[name].str[1:]]} {name}\n" for name in kind.names or ())
     return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n".encode(
         "utf-8", "backslashreplace"
     )

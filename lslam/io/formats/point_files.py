@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError, input_errors
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import ArrayCloud, Cloud
+from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.las_files import read_las, write_las
@@ -183,6 +183,8 @@ _COLUMNS = {".pcd": pcd_columns, ".ply": ply_columns, ".txt": _text_columns}
 def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -> None:
     """Write a cloud, m, atomically and without holding it in memory: .ply and .pcd hold float32, .las and .laz millimetres.
 
+    Further columns follow, `time` in s.
+
     comment : for PLY headers; wkt : coordinate reference system, for LAS. Raises UsageError on another suffix, OutputError.
     """
     suffix = path.suffix.lower()
@@ -191,11 +193,31 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
         return
     if suffix not in MAP_SUFFIXES:
         raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
-    names = ["x", "y", "z", "intensity"] if cloud.has_intensity else ["x", "y", "z"]
+    kind = _record_type(cloud)
     with atomic_write(path) as stream:
-        stream.write(ply_header(len(cloud), names, comment) if suffix == ".ply" else pcd_header(len(cloud), names))
+        stream.write(ply_header(len(cloud), kind, comment) if suffix == ".ply" else pcd_header(len(cloud), kind))
         for block in cloud.blocks():
-            stream.write(float_table(block.points, block.intensity).data)
+            stream.write(_records(block, kind).tobytes())
+
+
+def _record_type(cloud: Cloud) -> np.dtype[Any]:
+    """Record of a point in PLY and PCD, packed; times are seconds, since neither has integers of 64 bits."""
+    names = [*AXES, "intensity"] if cloud.has_intensity else AXES
+    columns = [
+        ("time", "<f8") if name == TIME_NS else (name, kind.newbyteorder("<"))
+        for name, kind in cloud.column_types.items()
+    ]
+    return np.dtype([*((name, "<f4") for name in names), *columns])
+
+
+def _records(block: CloudBlock, kind: np.dtype[Any]) -> NDArray[Any]:
+    values = {**dict(zip(AXES, block.points.T, strict=True)), "intensity": block.intensity, **block.columns}
+    if TIME_NS in values:
+        values["time"] = 1e-9 * block.columns[TIME_NS]
+    table = np.empty(len(block), kind)
+    for name in kind.names or ():
+        table[name] = values[name]
+    return table
 
 
 def read_cloud(path: Path) -> ArrayCloud:

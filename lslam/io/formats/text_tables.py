@@ -272,8 +272,13 @@ def date_to_ns(text: str) -> int | None:
     return ns
 
 
+def is_unix_time(first_ns: int) -> bool:
+    """Whether a clock whose earliest stamp is `first_ns` tells Unix time."""
+    return first_ns >= _FIRST_NS
+
+
 def utc_of(stamps_ns: Longs) -> list[datetime] | None:
     """UTC times of stamps (N,), ns, to the microsecond; None when they are no Unix time."""
-    if not len(stamps_ns) or int(np.min(stamps_ns)) < _FIRST_NS:
+    if not len(stamps_ns) or not is_unix_time(int(np.min(stamps_ns))):
         return None
     return [_EPOCH + timedelta(microseconds=int(stamp) // 1000) for stamp in stamps_ns]

@@ -1,8 +1,9 @@
 """Voxel averages of transformed scans: an open-addressing hash of packed voxel indices over rows of integer sums.
 
-A row is (key, sum x, sum y, sum z, count) and perhaps (sum of intensities), int64. The sums are offsets from the voxel's
-centre in units of voxel / 2**24, and intensities in units of 2**-20. So they are exact for all coordinates and equal for any
-order of the points, and rows of one voxel that were summed separately can be added.
+A row is (key, sum x, sum y, sum z, count), perhaps (three tags) and perhaps (sum of intensities), int64. The sums are offsets
+from the voxel's centre in units of voxel / 2**24, and intensities in units of 2**-20. So they are exact for all coordinates and
+equal for any order of the points, and rows of one voxel that were summed separately can be added. The tags are those of the
+observation whose first tag is the smallest (`lslam.maps.observations`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ _MIX = -7046029254386353131  # 0x9E3779B97F4A7C15 as int64: Fibonacci hashing
 UNITS = float(2**24)  # 2**39 points fit into one voxel's sum
 INTENSITY_UNITS = float(2**20)
 _BRIGHTEST = float(2**24)  # of such points a voxel's sum holds 2**19
+SUMS = 5  # columns before the tags
+_NO_TAG = np.iinfo(np.int64).max
 
 
 @inline
@@ -83,6 +86,7 @@ def unpack_cells(keys: NDArray[np.int64], origin: NDArray[np.int64]) -> NDArray[
 def accumulate(
     points: NDArray[np.float32],
     intensity: NDArray[np.float32],
+    tags: NDArray[np.int64],
     T: NDArray[np.float64],
     range_min: float,
     range_max: float,
@@ -95,18 +99,19 @@ def accumulate(
 ) -> tuple[int, int, int]:
     """Add one scan's points to the voxel sums.
 
-    points : (N, 3) sensor frame, m; intensity : (N,) or (0,); T : (4, 4) world from sensor
+    points : (N, 3) sensor frame, m; intensity : (N,) or (0,); tags : (N, 3) or (0, 3); T : (4, 4) world from sensor
     crop : (6,) x_min, x_max, y_min, y_max, z_min, z_max of the world, m: points outside count as gated
     origin : (3,) voxel index in the middle of the key range, which reaches 2**20 voxels to each side
     slots : (S,) row of each hash slot or -1, S a power of two above used + N
-    rows : (R, 5), or (R, 6) when `intensity` is given, with R >= used + N
+    rows : (R, 5), three columns more for `tags` and one more for `intensity` when they are given, with R >= used + N
 
     Returns the rows used now, the points refused by the range gate (NaN, Inf and zero points included) and the points
     outside the key range.
     """
     inverse = 1.0 / voxel
     near, far = range_min * range_min, range_max * range_max
-    with_intensity = intensity.shape[0] > 0
+    with_intensity, with_tags = intensity.shape[0] > 0, tags.shape[0] > 0
+    brightnesses = rows.shape[1] - 1
     mask = slots.shape[0] - 1
     gated = 0
     outside = 0
@@ -154,6 +159,8 @@ def accumulate(
                     if row == used:
                         used += 1
                         rows[row, 1:] = 0
+                        if with_tags:
+                            rows[row, SUMS] = _NO_TAG
                 last_key = keys[k]
             rows[row, 1] += offsets[k, 0]
             rows[row, 2] += offsets[k, 1]
@@ -161,12 +168,15 @@ def accumulate(
             rows[row, 4] += 1
             if with_intensity and np.isfinite(intensity[numbers[k]]):
                 brightness = min(max(np.float64(intensity[numbers[k]]), -_BRIGHTEST), _BRIGHTEST)
-                rows[row, 5] += np.int64(np.rint(brightness * INTENSITY_UNITS))
+                rows[row, brightnesses] += np.int64(np.rint(brightness * INTENSITY_UNITS))
+            if with_tags and tags[numbers[k], 0] < rows[row, SUMS]:
+                for n in range(tags.shape[1]):
+                    rows[row, SUMS + n] = tags[numbers[k], n]
     return used, gated, outside
 
 
 def unpack(rows: NDArray[np.int64], origin: NDArray[np.int64], voxel: float) -> NDArray[Any]:
-    """(M, 3) float64 mean positions, m, of finished rows (M, 5 or 6)."""
+    """(M, 3) float64 mean positions, m, of finished rows (M, 5 or more)."""
     cells = unpack_cells(rows[:, 0], origin)
     points = (cells + 0.5 + rows[:, 1:4] / (rows[:, 4:5] * UNITS)) * voxel
     return np.asarray(points)

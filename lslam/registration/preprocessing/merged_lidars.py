@@ -91,10 +91,10 @@ class MergedLidars(SequenceView):
             parts += self._parts(source, index, scan.stamp_ns, number)
         return _joined(scan, parts, self._is_timed)
 
-    def ringed(self, wanted: str) -> Sequence:
-        """The same with the rings of each LiDAR found by itself."""
-        others = [replace(other, scans=with_rings(other.scans, wanted)) for other in self.further_lidars]
-        return MergedLidars(with_rings(self.whole, wanted), others)
+    def ringed(self, wanted: str, is_required: bool = True) -> Sequence:
+        """The same with the rings of each LiDAR found by itself; is_required : as of `Ringed`."""
+        others = [replace(other, scans=with_rings(other.scans, wanted, is_required)) for other in self.further_lidars]
+        return MergedLidars(with_rings(self.whole, wanted, is_required), others)
 
     def _parts(self, source: _Reading, index: int, stamp_ns: int, number: int) -> Iterator[Scan]:
         """The points of the `number`-th further LiDAR during sweep `index`, a part of each of its scans that overlaps."""

@@ -50,16 +50,19 @@ class Clocked(SequenceView):
 
 
 class Ringed(SequenceView):
-    """A sequence with the rings of its scans filled in; all else is the sequence's own."""
+    """A sequence with the rings of its scans filled in; all else is the sequence's own.
 
-    def __init__(self, whole: Sequence, rule: RingRule) -> None:
+    is_required : points without a ring are left out, and scans without rings are an error
+    """
+
+    def __init__(self, whole: Sequence, rule: RingRule, is_required: bool = True) -> None:
         super().__init__(whole, notes=[*whole.notes, str(rule)])
-        self.rule = rule
+        self.rule, self._is_required = rule, is_required
 
     def scan(self, index: int) -> Scan:
-        """Read scan `index` and find its rings, by itself where it does not obey the rule; points that have none are left out.
+        """Read scan `index` and find its rings, by itself where it does not obey the rule.
 
-        Raises InputError when either fails.
+        Raises InputError when it cannot be read, or when rings are required and cannot be found.
         """
         scan = self.whole.scan(index)
         if not len(scan):
@@ -70,13 +73,16 @@ class Ringed(SequenceView):
             try:
                 rule = decide_rings([scan])
             except InputError:
-                raise error from None
+                if self._is_required:
+                    raise error from None
+                log.warning("scan %d: its points get no ring: %s", scan.index, error)
+                return scan
             rings = rule.rings_of(scan)
             why = f"{error}: {rule}"
             scan = replace(scan, fault="; ".join(filter(None, (scan.fault, why))))
         scan = replace(scan, rings=rings)
         has_ring = rings != NO_RING
-        return scan if has_ring.all() else scan.select(has_ring)
+        return scan if has_ring.all() or not self._is_required else scan.select(has_ring)
 
 
 class WithoutClasses(SequenceView):
@@ -97,18 +103,20 @@ class WithoutClasses(SequenceView):
         return scan.select(~dropped) if dropped.any() else scan
 
 
-def with_rings(sequence: Sequence, wanted: str = "auto") -> Sequence:
+def with_rings(sequence: Sequence, wanted: str = "auto", is_required: bool = True) -> Sequence:
     """`sequence` with rings in every scan, found as `input.rings` says; the rule is among its notes.
+
+    is_required : as of `Ringed`
 
     The first scans of the recording decide, whatever part of it is used, so that a run that is resumed decides alike.
     Raises InputError naming --rings when there are no rings to be found.
     """
     # Several LiDARs do it each by itself.
-    ring: Callable[[Sequence, str], Sequence] = getattr(type(sequence), "ringed", _ringed)
-    return ring(sequence, wanted)
+    ring: Callable[[Sequence, str, bool], Sequence] = getattr(type(sequence), "ringed", _ringed)
+    return ring(sequence, wanted, is_required)
 
 
-def _ringed(sequence: Sequence, choice: str) -> Sequence:
+def _ringed(sequence: Sequence, choice: str, is_required: bool) -> Sequence:
     scans = [scan for _, scan in islice(readable(range(len(sequence)), sequence.scan), _LOOKED_AT)]
     if not scans:
         return sequence  # nothing can be read, which is said in its turn
@@ -120,4 +128,4 @@ def _ringed(sequence: Sequence, choice: str) -> Sequence:
             rule = decide_rings(scans, choice, rows or getattr(sequence, "rings", None))
     except InputError as error:
         raise InputError(f"{sequence.path}: {error}") from None
-    return Ringed(sequence, rule)
+    return Ringed(sequence, rule, is_required)
