@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Iterator
 from datetime import date
 from pathlib import Path
+from typing import Any, ClassVar
 
 import laspy
 import numpy as np
@@ -121,6 +122,7 @@ def test_what_cannot_be_written(tmp_path: Path) -> None:
 def test_clouds_of_blocks() -> None:
     class Two:
         has_intensity = False
+        column_types: ClassVar[dict[str, np.dtype[Any]]] = {}
 
         def __len__(self) -> int:
             return 3
