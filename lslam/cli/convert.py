@@ -10,18 +10,22 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.io.formats.trajectory_formats import WRITTEN
+from lslam.io.formats.trajectory_formats import FORMATS
 
 if TYPE_CHECKING:
     from lslam.core.types.sequence import Calibration, Sequence
     from lslam.core.types.trajectory import Trajectory
+    from lslam.maps.georeference import Projection
 
 SEQUENCES = ("bag", "mcap", "sqlite", "kitti")
 EARTH = ("kml", "gpx")
+IN_CRS = ("csv", "gpkg")
 BAGS = {"bag": ".bag", "mcap": ".mcap", "sqlite": ".db3"}
 OF_RUNS = ("no_clouds", "voxel", "sequence")
 NOT_OF_RUNS = ("deskewed", "lidars", "start", "count", "skip_frames", "frame", "from_frame", "calib", "times")
-BY_SUFFIX = {suffix: kind for kind, suffix in BAGS.items()} | {f".{kind}": kind for kind in (*EARTH, "gpkg", "tum")}
+BY_SUFFIX = {suffix: kind for kind, suffix in BAGS.items()} | {
+    f".{kind}": kind for kind in (*EARTH, "gpkg", "tum", "csv")
+}
 EPILOG = """\b
 Examples:
   lslam convert seq07 --data-root ~/kitti --to mcap --zstd --out seq07.mcap
@@ -29,6 +33,7 @@ Examples:
   lslam convert runs/first --to euroc --frame lidar --out first.csv
   lslam convert runs/town --to kml --out town.kml
   lslam convert runs/town --out town.gpkg
+  lslam convert runs/town --to csv --crs EPSG:25832 --out town.csv
   lslam convert runs/first --to mcap --voxel 0.3 --zstd
   lslam convert drive.bag --deskewed runs/drive --to kitti --out drive_deskewed
 """
@@ -39,9 +44,9 @@ Examples:
 @click.option(
     "--to",
     "kind",
-    type=click.Choice(list(dict.fromkeys((*SEQUENCES, *WRITTEN, *EARTH, "gpkg")))),
-    help="bag is ROS 1, mcap and sqlite are ROS 2; tum and euroc are for trajectories, kitti for both; kml, gpx and gpkg for "
-    "georeferenced runs  [--out's suffix].",
+    type=click.Choice(list(dict.fromkeys((*SEQUENCES, *FORMATS, *EARTH, "gpkg")))),
+    help="bag is ROS 1, mcap and sqlite are ROS 2; tum, euroc and csv are for trajectories, kitti for both; kml, gpx and gpkg "
+    "for georeferenced runs  [--out's suffix].",
 )
 @click.option(
     "--out",
@@ -74,6 +79,10 @@ Examples:
 @click.option(
     "--from-frame", metavar="BODY", help="Trajectory: body of SOURCE's poses, where the file does not name it."
 )
+@click.option(
+    "--crs", metavar="EPSG:N[+M]", help="csv and gpkg of a georeferenced run: coordinates  [those of its map]."
+)
+@click.option("--geoid", metavar="GRID", help="csv and gpkg: heights above this geoid (.gtx, .tif).")
 @click.option("--calib", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: KITTI calibration with Tr.")
 @click.option("--times", type=click.Path(path_type=Path), metavar="FILE", help="Trajectory: stamps of a KITTI file.")
 @options.reading
@@ -94,10 +103,16 @@ def command(source: str, kind: str | None, out: Path | None, **given: Any) -> No
         raise click.UsageError(f"--to says what to write; an --out whose name ends in {', '.join(BY_SUFFIX)} does too")
     is_run = kind in BAGS and (Path(source).expanduser() / "trajectory.tum").is_file()
     if is_run:
-        _refuse(given, NOT_OF_RUNS, f"is not for the folder of a run to {kind}: all its scans are written as they lie")
+        _refuse(
+            given,
+            (*NOT_OF_RUNS, "crs", "geoid"),
+            f"is not for the folder of a run to {kind}: all its scans are written as they lie",
+        )
         _convert_run(Path(source).expanduser(), kind, out, given)
         return
     _refuse(given, OF_RUNS, "is for the folder of a run to bag, mcap or sqlite")
+    if kind not in IN_CRS:
+        _refuse(given, ("crs", "geoid"), "is for --to csv and gpkg")
     if out is None:
         raise click.UsageError("--out names the file or folder to write")
     if kind == "gpkg":
@@ -217,7 +232,7 @@ def _convert_to_gpkg(folder: Path, out: Path, given: dict[str, Any]) -> None:
     from lslam.pipeline.convert.to_gpkg import convert_to_gpkg
 
     options.require_there(folder)
-    done = convert_to_gpkg(folder, out, overwrite=given["overwrite"])
+    done = convert_to_gpkg(folder, out, crs=options.output_crs(given), overwrite=given["overwrite"])
     text = f"{out}: {', '.join(f'{len(layer.features)} in {layer.name}' for layer in done)}"
     _print(text, out, "gpkg", {"features": {layer.name: len(layer.features) for layer in done}}, given)
 
@@ -228,19 +243,40 @@ def _convert_trajectory(source: str, kind: str, out: Path, given: dict[str, Any]
             raise click.UsageError(f"{flag} is for sequences, and {source} to {kind} is a trajectory")
     from lslam.pipeline.convert.convert_trajectory import convert_trajectory
 
+    where = ""
     how = {"frame": given["frame"], "overwrite": given["overwrite"]}
     if kind in EARTH:
         from lslam.pipeline.convert.convert_trajectory import convert_to_earth, georeference_beside
 
         options.require_there(Path(source))
-        georeference = georeference_beside(Path(source).expanduser(), kind)
+        georeference = georeference_beside(Path(source).expanduser(), f"--to {kind}")
         trajectory, calibration = _read_trajectory(source, kind, given)
         moved = convert_to_earth(trajectory, kind, out, georeference, calibration, **how)
+    elif (projection := _projection(Path(source).expanduser(), given) if kind == "csv" else None) is not None:
+        from lslam.pipeline.convert.convert_trajectory import convert_to_crs
+
+        trajectory, calibration = _read_trajectory(source, kind, given)
+        moved = convert_to_crs(trajectory, out, projection, calibration, **how)
+        where = f" in {projection.name}"
     else:
         trajectory, calibration = _read_trajectory(source, kind, given)
         moved = convert_trajectory(trajectory, kind, out, calibration, **how)
-    text = f"{out}: {len(moved)} poses of {moved.frame}"
+    text = f"{out}: {len(moved)} poses of {moved.frame}{where}"
     _print(text, out, kind, {"poses": len(moved), "frame": moved.frame}, given)
+
+
+def _projection(source: Path, given: dict[str, Any]) -> Projection | None:
+    """Coordinates of the map of a georeferenced run, or those that are asked for; None of a trajectory that lies nowhere."""
+    from lslam.maps.georeference import Projection, in_crs
+    from lslam.pipeline.convert.convert_trajectory import georeference_beside, known_georeference
+
+    crs = options.output_crs(given)
+    if crs is None:
+        georeference = known_georeference(source)
+    else:
+        options.require_there(source)
+        georeference = in_crs(georeference_beside(source, "--geoid" if crs.epsg is None else "--crs"), crs)
+    return None if georeference is None else Projection(georeference)
 
 
 def _read_trajectory(source: str, kind: str, given: dict[str, Any]) -> tuple[Trajectory, Calibration]:

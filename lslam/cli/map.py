@@ -241,15 +241,11 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
             raise UsageError(f"--{flag} belongs to {'--against' if flag == 'threshold' else '--score'}")
     settings = _settings(given if given["tiles"] is None else {**given, "out": None})
     require_run(target)
-    from lslam.core.geometry.crs_names import parse_crs
-    from lslam.core.types.gnss import OutputCrs
     from lslam.pipeline.rebuild import check_output, open_scans, read_run, rebuild
     from lslam.reports.evaluations import crispness_document
 
     out: Path | None = given["out"]
-    epsg, height_epsg = (None, None) if given["crs"] is None else parse_crs(given["crs"])
-    geoid = "" if given["geoid"] is None else options.grid_file(given["geoid"])
-    crs = OutputCrs(epsg, height_epsg, geoid) if epsg or geoid else None
+    crs = options.output_crs(given)
     run = read_run(target, settings)
     if given["tiles"] is not None:
         _rebuild_tiles(run, out or target / "tiles", crs, given)

@@ -19,6 +19,7 @@ from lslam.io.remote import RemotePath, as_path
 
 if TYPE_CHECKING:
     from lslam.core.config.input import ScanRange
+    from lslam.core.types.gnss import OutputCrs
     from lslam.studies.jobs import Engine
     from lslam.studies.output import OutputOptions
 
@@ -248,6 +249,16 @@ def grid_file(geoid: str) -> str:
     """Absolute path of an existing grid file; other names are those of PROJ's own grids."""
     path = Path(geoid).expanduser()
     return str(path.absolute()) if path.exists() else geoid
+
+
+def output_crs(given: dict[str, Any]) -> OutputCrs | None:
+    """Coordinates that --crs and --geoid ask for; None without them. Raises UsageError for what is no code."""
+    from lslam.core.geometry.crs_names import parse_crs
+    from lslam.core.types.gnss import OutputCrs
+
+    epsg, height_epsg = (None, None) if given["crs"] is None else parse_crs(given["crs"])
+    geoid = "" if given["geoid"] is None else grid_file(given["geoid"])
+    return OutputCrs(epsg, height_epsg, geoid) if epsg or geoid else None
 
 
 def studied(function: F) -> F:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import UsageError
-from lslam.core.geometry import se3
+from lslam.core.geometry import se3, so3
 from lslam.core.geometry.crs_names import crs_name
 from lslam.core.geometry.geodesy import (
     crs_of,
@@ -25,7 +25,7 @@ from lslam.core.geometry.geodesy import (
 )
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import Cloud, CloudBlock
-from lslam.core.types.gnss import Georeference
+from lslam.core.types.gnss import Georeference, OutputCrs
 
 
 def utm_epsg(lat: float, lon: float) -> int:
@@ -69,6 +69,16 @@ class Projection:
         return f"{self.name}, heights above the WGS84 ellipsoid"
 
     @property
+    def plane(self) -> str:
+        """Name of the horizontal coordinate reference system, as `WGS 84 / UTM zone 32N`."""
+        return str(self._plane.name)
+
+    @property
+    def plane_wkt(self) -> str:
+        """Its definition as WKT 1."""
+        return str(self._plane.to_wkt("WKT1_GDAL") or self._plane.to_wkt())
+
+    @property
     def wkt(self) -> str:
         """Definition of the coordinate reference system as WKT 1, which LAS needs."""
         return str(self._crs.to_wkt("WKT1_GDAL") or self._crs.to_wkt())
@@ -106,6 +116,14 @@ class Projection:
             enu[:, 2] += geoid_heights(self.georeference.geoid, from_local(enu, self.georeference.origin))
         return se3.apply(T_world_enu, enu)
 
+    def carry(self, poses: NDArray[Any]) -> Floats:
+        """Transform poses (N, 4, 4) of the run's world to the projected coordinates, m; rotations are those in its grid."""
+        poses = np.asarray(poses, np.float64).reshape(-1, 4, 4)
+        at = poses[:, :3, 3]
+        # Derivatives by the axes of the world; the scale of the plane is no part of a rotation.
+        steps = np.stack([(self.apply(at + axis) - self.apply(at - axis)) / 2 for axis in np.eye(3)], axis=-1)
+        return se3.make(so3.normalise(steps) @ poses[:, :3, :3], self.apply(at))
+
     def check(self) -> None:
         """Raise UsageError unless the coordinate reference system is known, in metres and reached without loss of accuracy."""
         units = {axis.unit_name for axis in self._crs.axis_info}
@@ -125,6 +143,10 @@ class Projection:
         return crs_of(self.epsg, self.georeference.height_epsg)
 
     @property
+    def _plane(self) -> Any:
+        return self._crs.sub_crs_list[0] if has_heights(self._crs) else self._crs
+
+    @property
     def _is_vertical(self) -> bool:
         """Whether PROJ's own operation gives the heights."""
         return has_heights(self._crs) and not self.georeference.geoid
@@ -133,8 +155,9 @@ class Projection:
     def _transformer(self) -> Any:
         if self._is_vertical:
             return exact_transformer("EPSG:4979", self._crs, self.georeference.origin[:2], self.name)
-        plane = self._crs.sub_crs_list[0] if has_heights(self._crs) else self._crs
-        return exact_transformer(local_crs(self.georeference.origin), plane, self.georeference.origin[:2], self.name)
+        return exact_transformer(
+            local_crs(self.georeference.origin), self._plane, self.georeference.origin[:2], self.name
+        )
 
 
 @dataclass(frozen=True)
@@ -161,6 +184,17 @@ class ProjectedCloud:
         """The blocks of the cloud, projected."""
         for block in self.cloud.blocks():
             yield replace(block, points=self.projection.apply(block.points))
+
+
+def in_crs(georeference: Georeference, crs: OutputCrs | None) -> Georeference:
+    """Georeference whose outputs are in `crs`, None for its own. Raises UsageError for one that nothing can be written in."""
+    if crs is None:
+        return georeference
+    if crs.epsg is not None:
+        georeference = replace(georeference, epsg=crs.epsg, height_epsg=crs.height_epsg)
+    georeference = replace(georeference, geoid=crs.geoid or georeference.geoid)
+    Projection(georeference).check()
+    return georeference
 
 
 def to_lat_lon(points: NDArray[Any], georeference: Georeference) -> Floats:

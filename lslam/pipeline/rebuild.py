@@ -8,7 +8,7 @@ import os
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from lslam.io.readers import open_sequence
 from lslam.io.readers.labels import with_labels
 from lslam.io.remote import as_path
 from lslam.maps.crispness import crispness
-from lslam.maps.georeference import Projection
+from lslam.maps.georeference import in_crs
 from lslam.maps.mesh import require_open3d
 from lslam.pipeline.map_attributes import KEY, needs_labels
 from lslam.pipeline.map_files import (
@@ -249,11 +249,7 @@ def place_of(run: EarlierRun, crs: OutputCrs | None) -> Georeference | None:
     if georeference is None:
         flag = "--geoid" if crs.epsg is None else "--crs"
         raise UsageError(f"{flag}: {run.folder} is not georeferenced; run the sequence with --georeference or --gnss")
-    if crs.epsg is not None:
-        georeference = replace(georeference, epsg=crs.epsg, height_epsg=crs.height_epsg)
-    georeference = replace(georeference, geoid=crs.geoid or georeference.geoid)
-    Projection(georeference).check()
-    return georeference
+    return in_crs(georeference, crs)
 
 
 def _record(run: EarlierRun, built: BuiltMap, name: str, score: Crispness | None) -> RunRecord:

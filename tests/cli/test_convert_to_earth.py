@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,8 +14,9 @@ from calling import SAMPLE, assert_one_sentence, lslam, manifest
 from defusedxml import ElementTree
 from fastkml import KML
 from fastkml.utils import find_all
+from pyproj import Proj, Transformer
 
-from lslam.core.geometry import se3
+from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.text_tables import utc_of
@@ -102,6 +104,51 @@ def test_gpx_reads_back(run: Path, tmp_path: Path) -> None:
         again = tmp_path / "again.gpx"
         assert lslam("convert", source, "--to", "gpx", "--out", again, "--overwrite").returncode == 0
         assert again.read_text().replace("again", source.name) == out.read_text()
+
+
+def test_a_table_is_in_the_coordinates_of_the_map_and_turned_with_its_grid(run: Path, tmp_path: Path) -> None:
+    folder, told = dated(run, tmp_path / "dated"), manifest(run)["georeference"]
+    for words, epsg in (((), 32632), (("--crs", "EPSG:25833"), 25833)):
+        out = tmp_path / f"{epsg}.csv"
+        done = lslam("convert", folder, "--to", "csv", "--out", out, *words)
+        assert (done.returncode, done.stdout) == (0, f"{out}: 95 poses of lidar in EPSG:{epsg}\n"), done.stderr
+        with out.open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        there = np.array([[float(row[name]) for name in ("x_m", "y_m", "z_m")] for row in rows])
+        lat, lon, height = expected(run).T
+        to_plane = Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
+        np.testing.assert_allclose(there, np.column_stack([*to_plane.transform(lon, lat), height]), atol=1e-3, rtol=0)
+        assert {row["crs"] for row in rows} == {f"EPSG:{epsg}"}
+        assert rows[0]["utc"] == "2023-11-14T22:13:20.123456Z"
+        assert [int(row["stamp_ns"]) for row in rows] == read_trajectory(folder).stamps_ns.tolist()
+        # True north against grid north, as PROJ has it.
+        convergence = np.radians(Proj(f"EPSG:{epsg}").get_factors(lon[0], lat[0]).meridian_convergence)
+        T_enu_body = np.array(told["T_enu_world"]) @ read_trajectory(folder).poses
+        again = read_trajectory(out)
+        turned = so3.exp(np.array([0.0, 0.0, convergence])) @ T_enu_body[:, :3, :3]
+        apart = so3.angle(np.swapaxes(turned, 1, 2) @ again.poses[:, :3, :3])
+        assert apart.max() < 2e-6
+        assert abs(convergence) > 1e-3
+
+
+def test_a_table_of_a_run_that_lies_nowhere_has_its_world(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.csv"
+    assert lslam("convert", run / "trajectory_odometry.tum", "--out", out).returncode == 0
+    np.testing.assert_allclose(
+        read_trajectory(out).poses, read_trajectory(run / "trajectory_odometry.tum").poses, atol=1e-9, rtol=0
+    )
+    assert "crs" not in out.read_text()
+    for source, words, sentence in (
+        (run / "trajectory_odometry.tum", ("--crs", "EPSG:25832"), "neither the folder of a run"),
+        (run, ("--crs", "EPSG:4326"), "does not count in metres"),
+        (run, ("--crs", "32632"), "is no EPSG code"),
+        (run, ("--to", "kml", "--crs", "EPSG:25832"), "--crs is for --to csv and gpkg"),
+    ):
+        done = lslam("convert", source, "--out", tmp_path / "b.csv", *words)
+        assert done.returncode == 2, done.stderr
+        assert sentence in done.stderr
+        assert_one_sentence(done.stderr)
+    assert not (tmp_path / "b.csv").exists()
 
 
 def test_what_has_no_place_is_refused_with_the_way_out(run: Path, tmp_path: Path) -> None:

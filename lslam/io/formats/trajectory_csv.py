@@ -16,7 +16,7 @@ from lslam.core.printable import shown
 from lslam.core.types.arrays import Floats
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.text_tables import TextTable, looks_like_header
+from lslam.io.formats.text_tables import TextTable, looks_like_header, utc_of
 from lslam.io.formats.time_columns import SECOND_NS, find_clock, is_index, tokens_of, unit_of_fraction, unread_columns
 
 # A path that strays so far from a line, in parts of its length, has bends, in which a body turns.
@@ -98,6 +98,20 @@ def write_euroc(path: str | Path, trajectory: Trajectory) -> None:
     ]
     for stamp, pose in zip(trajectory.stamps_ns.tolist(), pose_texts(trajectory, "wxyz"), strict=True):
         lines.append(",".join([str(stamp), *pose]))
+    write_text(Path(path), "".join(f"{line}\n" for line in lines))
+
+
+def write_csv(path: str | Path, trajectory: Trajectory, crs: str = "") -> None:
+    """Write a table for spreadsheets and GIS, atomically: stamp, UTC if the stamps are Unix time, position, m, quaternion.
+
+    crs : name of the coordinate reference system, a column of its own; empty: none
+    """
+    utc = utc_of(trajectory.stamps_ns)
+    names = ["stamp_ns", *(["utc"] if utc else []), "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw", "body"]
+    lines = [",".join([*names, *(["crs"] if crs else [])])]
+    for k, (stamp, pose) in enumerate(zip(trajectory.stamps_ns.tolist(), pose_texts(trajectory, "xyzw"), strict=True)):
+        when = [f"{utc[k]:%Y-%m-%dT%H:%M:%S.%f}Z"] if utc else []
+        lines.append(",".join([str(stamp), *when, *pose, trajectory.frame, *([crs] if crs else [])]))
     write_text(Path(path), "".join(f"{line}\n" for line in lines))
 
 

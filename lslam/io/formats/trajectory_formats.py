@@ -19,14 +19,13 @@ class TrajectoryFormat:
 
     module : with `fits_NAME(first line)`, `read_NAME(table, times)` and `write_NAME(path, trajectory)`
     frame : the body whose poses it holds by convention, empty where the file says
-    has_stamps : whether a file holds them; is_written : whether there is `write_NAME`
+    has_stamps : whether a file holds them
     """
 
     name: str
     module: str
     frame: str = ""
     has_stamps: bool = True
-    is_written: bool = True
 
     @property
     def fits(self) -> Callable[[str], bool]:
@@ -55,7 +54,6 @@ FORMATS = {
         TrajectoryFormat("kitti", "lslam.io.formats.trajectory_lines", frame="cam0", has_stamps=False),
         TrajectoryFormat("tum", "lslam.io.formats.trajectory_lines"),
         TrajectoryFormat("euroc", "lslam.io.formats.trajectory_csv", frame="imu"),
-        TrajectoryFormat("csv", "lslam.io.formats.trajectory_csv", is_written=False),
+        TrajectoryFormat("csv", "lslam.io.formats.trajectory_csv"),
     )
 }
-WRITTEN = tuple(name for name, one in FORMATS.items() if one.is_written)

@@ -21,8 +21,9 @@ from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.sequence_toml import FRAMES
 from lslam.io.formats.text_tables import utc_of
-from lslam.io.formats.trajectory_formats import FORMATS, WRITTEN
-from lslam.maps.georeference import to_lat_lon
+from lslam.io.formats.trajectory_csv import write_csv
+from lslam.io.formats.trajectory_formats import FORMATS
+from lslam.maps.georeference import Projection, to_lat_lon
 from lslam.pipeline.map_files import georeference_of, read_json
 
 log = logging.getLogger("lslam")
@@ -44,8 +45,8 @@ def convert_trajectory(
     InputError : the change of body needs an extrinsic that `calibration` does not have. UsageError : unknown `kind` or `frame`.
     OutputExistsError : `out` is there and `overwrite` is not set.
     """
-    if kind not in WRITTEN:
-        raise UsageError(f"no trajectory format {kind!r} to write: {', '.join(WRITTEN)} are")
+    if kind not in FORMATS:
+        raise UsageError(f"no trajectory format {kind!r} to write: {', '.join(FORMATS)} are")
     wanted = FORMATS[kind]
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
@@ -167,25 +168,29 @@ WRITERS = {"kml": write_kml, "gpx": write_gpx}
 TRAJECTORY, MANIFEST = "trajectory.tum", "manifest.json"
 
 
-def georeference_beside(source: Path, kind: str) -> Georeference:
-    """Georeference in the manifest of a run, by its folder or its `trajectory.tum`.
-
-    Raises UsageError with the way out when that is unknown.
-    """
+def known_georeference(source: Path) -> Georeference | None:
+    """Georeference in the manifest of a run, by its folder or its `trajectory.tum`; None where there is none."""
     folder = source if source.is_dir() else source.parent
-    is_of_run = (folder / MANIFEST).is_file() and (source.is_dir() or source.name == TRAJECTORY)
-    if not is_of_run:
+    if not (source.is_dir() or source.name == TRAJECTORY):
+        return None
+    return georeference_of(read_json(folder / MANIFEST).get("georeference"))
+
+
+def georeference_beside(source: Path, words: str) -> Georeference:
+    """As `known_georeference`. Raises UsageError with the way out when that is unknown; words : the option that needs it."""
+    georeference = known_georeference(source)
+    if georeference is not None:
+        return georeference
+    folder = source if source.is_dir() else source.parent
+    if not (folder / MANIFEST).is_file() or not (source.is_dir() or source.name == TRAJECTORY):
         raise UsageError(
-            f"--to {kind} needs to know where on the Earth the poses lie: {source} is neither the folder of a run nor its "
+            f"{words} needs to know where on the Earth the poses lie: {source} is neither the folder of a run nor its "
             f"{TRAJECTORY}"
         )
-    georeference = georeference_of(read_json(folder / MANIFEST).get("georeference"))
-    if georeference is None:
-        raise UsageError(
-            f"--to {kind} needs to know where on the Earth the poses lie, and {folder} is not georeferenced: run the sequence "
-            "again with --gnss or --georeference where it has fixes, or with --osm"
-        )
-    return georeference
+    raise UsageError(
+        f"{words} needs to know where on the Earth the poses lie, and {folder} is not georeferenced: run the sequence "
+        "again with --gnss or --georeference where it has fixes, or with --osm"
+    )
 
 
 def convert_to_earth(
@@ -210,14 +215,7 @@ def convert_to_earth(
     """
     if kind not in WRITERS:
         raise UsageError(f"no format {kind!r} of map programs: {', '.join(WRITERS)} are")
-    if frame == "cam0":
-        raise UsageError(f"--frame cam0: poses of the camera have a world of their own, --to {kind} takes lidar or imu")
-    if out.exists() and not overwrite:
-        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
-    moved = change_frame(trajectory, frame or trajectory.frame, calibration)
-    moved = moved.select(np.isfinite(moved.positions).all(axis=1))
-    if not len(moved):
-        raise InputError(f"{trajectory.source} has no pose that is finite")
+    moved = _on_earth(trajectory, kind, out, calibration, frame, overwrite)
     places = [
         (round(lat, 7), round(lon, 7), round(h, 3))
         for lat, lon, h in to_lat_lon(moved.positions, georeference).tolist()
@@ -226,6 +224,42 @@ def convert_to_earth(
     about = f"poses of {moved.frame} by lslam, heights in m above the WGS84 ellipsoid"
     if georeference.method == "osm":
         about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
-    out.parent.mkdir(parents=True, exist_ok=True)
     WRITERS[kind](out, places, utc_of(moved.stamps_ns) if moved.has_stamps else None, name, about)
+    return moved
+
+
+def convert_to_crs(
+    trajectory: Trajectory,
+    out: Path,
+    projection: Projection,
+    calibration: Calibration,
+    *,
+    frame: str | None = None,
+    overwrite: bool = False,
+) -> Trajectory:
+    """Write `trajectory` to `out` as a table in the coordinate reference system of `projection`. Returns the written one.
+
+    Rotations are about east, north and up of its grid. Raises as `convert_to_earth`, and UsageError for a coordinate reference
+    system that does not count in metres.
+    """
+    projection.check()
+    moved = _on_earth(trajectory, "csv", out, calibration, frame, overwrite)
+    moved = replace(moved, poses=projection.carry(moved.poses), covariances=None)
+    write_csv(out, moved, projection.name)
+    return moved
+
+
+def _on_earth(
+    trajectory: Trajectory, kind: str, out: Path, calibration: Calibration, frame: str | None, overwrite: bool
+) -> Trajectory:
+    """The finite poses of the body `frame`, in a world that lies on the Earth, for the new file `out`."""
+    if frame == "cam0":
+        raise UsageError(f"--frame cam0: poses of the camera have a world of their own, --to {kind} takes lidar or imu")
+    if out.exists() and not overwrite:
+        raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
+    moved = change_frame(trajectory, frame or trajectory.frame, calibration)
+    moved = moved.select(np.isfinite(moved.positions).all(axis=1))
+    if not len(moved):
+        raise InputError(f"{trajectory.source} has no pose that is finite")
+    out.parent.mkdir(parents=True, exist_ok=True)
     return moved

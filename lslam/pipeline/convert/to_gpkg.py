@@ -1,24 +1,24 @@
-"""A georeferenced run as a GeoPackage: its trajectory, the status of each scan, and the corrected buildings."""
+"""A georeferenced run as a GeoPackage: its trajectory, the status of each scan, and the corrected buildings, with styles."""
 
 from __future__ import annotations
 
 import sqlite3
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 
 from lslam.core.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.core.extras import importing, install_hint
-from lslam.core.geometry.geodesy import from_local
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import CorrectedMap
-from lslam.core.types.gnss import Georeference
+from lslam.core.types.gnss import OutputCrs
 from lslam.io.formats.text_tables import utc_of
-from lslam.maps.georeference import to_lat_lon
+from lslam.maps.georeference import Projection, in_crs
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.convert import staged
 from lslam.pipeline.convert.convert_trajectory import georeference_beside
@@ -27,7 +27,10 @@ from lslam.pipeline.run_folder import require_run
 
 Shape = Literal["points", "lines", "polygons"]
 Value = int | float | str | datetime | None
-_WGS84 = 4326
+_SYMBOLS = {"points": ("marker", "SimpleMarker"), "lines": ("line", "SimpleLine"), "polygons": ("fill", "SimpleFill")}
+_GREEN, _ORANGE, _GREY, _BLUE, _RED = "#2e7d32", "#ef6c00", "#9e9e9e", "#1565c0", "#c62828"
+_SCANS = {"ok": _GREEN, "bridged": _ORANGE, "skipped": _GREY}
+_BUILDINGS = {"seen": _GREEN, "unseen": _GREY, "absent": _RED}
 
 
 @dataclass(frozen=True)
@@ -35,9 +38,9 @@ class GeoLayer:
     """One layer of a GeoPackage.
 
     shape : points at (3,), lines along (K, 3), or lists of polygons, each a list of rings (K, 2) whose last corner is the first;
-        all in longitude, latitude (deg) and, of three, height (m)
+        all in the projected coordinates of the file, m
     features : one place or shape each; columns : as many values by name, of one type or None
-    about : what a user of the file should know
+    about : what a user of the file should know; colours : of each value of `status`, or by "" of all
     """
 
     name: str
@@ -45,40 +48,44 @@ class GeoLayer:
     features: Sequence[Any]
     columns: Mapping[str, Sequence[Value]]
     about: str = ""
+    colours: Mapping[str, str] = field(default_factory=dict)
 
 
-def write_gpkg(path: Path, layers: Sequence[GeoLayer]) -> None:
-    """Write the layers to `path`, a new file ending in .gpkg. It is not atomic; the caller renames it.
+def write_gpkg(path: Path, layers: Sequence[GeoLayer], projection: Projection) -> None:
+    """Write the layers to `path`, a new file ending in .gpkg, with QGIS' styles. It is not atomic; the caller renames it.
 
     Raises OutputError when it cannot be written, InputError without fudgeo.
     """
     with importing("fudgeo", install_hint("geo")):
-        from fudgeo import GeoPackage
+        from fudgeo import GeoPackage, SpatialReferenceSystem
+    system = SpatialReferenceSystem(projection.plane, "EPSG", projection.epsg, projection.plane_wkt)
     try:
         package = GeoPackage.create(path, flavor="EPSG")
         try:
+            package.add_spatial_reference(system)
             for layer in layers:
-                _write_layer(package, layer)
+                _write_layer(package, layer, system)
+            _write_styles(package, layers)
         finally:
             package.connection.close()
     except (OSError, sqlite3.Error) as error:
         raise OutputError(f"{path} cannot be written: {cause(error)}") from None
 
 
-def _write_layer(package: Any, layer: GeoLayer) -> None:
+def _write_layer(package: Any, layer: GeoLayer, system: Any) -> None:
     from fudgeo import Field
     from fudgeo.enumeration import ShapeType
     from fudgeo.geometry import LineStringZ, MultiPolygon, PointZ
 
     kinds = {
-        "points": (ShapeType.point, lambda place: PointZ(x=place[0], y=place[1], z=place[2], srs_id=_WGS84)),
-        "lines": (ShapeType.linestring, lambda line: LineStringZ(line, srs_id=_WGS84)),
-        "polygons": (ShapeType.multi_polygon, lambda parts: MultiPolygon(parts, srs_id=_WGS84)),
+        "points": (ShapeType.point, lambda place: PointZ(x=place[0], y=place[1], z=place[2], srs_id=system.srs_id)),
+        "lines": (ShapeType.linestring, lambda line: LineStringZ(line, srs_id=system.srs_id)),
+        "polygons": (ShapeType.multi_polygon, lambda parts: MultiPolygon(parts, srs_id=system.srs_id)),
     }
     shape, make = kinds[layer.shape]
     made = package.create_feature_class(
         layer.name,
-        package.spatial_references[_WGS84],
+        system,
         shape,
         z_enabled=layer.shape != "polygons",
         fields=[Field(name, _type_of(values)) for name, values in layer.columns.items()],
@@ -109,7 +116,7 @@ def _plain(value: Value) -> int | float | str | None:
 
 
 def _extent(layer: GeoLayer) -> tuple[float, float, float, float]:
-    """Limits west, south, east, north."""
+    """Limits x_min, y_min, x_max, y_max."""
     parts: list[Floats] = []
     for feature in layer.features:
         parts += (
@@ -120,15 +127,54 @@ def _extent(layer: GeoLayer) -> tuple[float, float, float, float]:
     return west, south, east, north
 
 
+def _write_styles(package: Any, layers: Sequence[GeoLayer]) -> None:
+    """Write the table from which QGIS takes the style of a layer when it is opened."""
+    names = ("f_table_catalog", "f_table_schema", "f_table_name", "f_geometry_column", "styleName", "styleQML", "owner")
+    rows = [("", "", layer.name, "geom", "lslam", _style(layer), "lslam", 1) for layer in layers if layer.colours]
+    with package.connection as connection:
+        connection.execute(
+            f"CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, {' TEXT, '.join(names)} TEXT, "
+            "useAsDefault BOOLEAN, styleSLD TEXT, description TEXT, ui TEXT, update_time DATETIME)"
+        )
+        connection.executemany(
+            f"INSERT INTO layer_styles ({', '.join(names)}, useAsDefault) VALUES ({', '.join('?' * 8)})", rows
+        )
+        connection.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES ('layer_styles', 'attributes', 'layer_styles')"
+        )
+
+
+def _style(layer: GeoLayer) -> str:
+    """QGIS' description of how a layer is drawn: in one colour, or in one of each status."""
+    kind, drawn_as = _SYMBOLS[layer.shape]
+    is_single = "" in layer.colours
+    about = {"type": "singleSymbol"} if is_single else {"type": "categorizedSymbol", "attr": "status"}
+    root = Element("qgis", version="3.22", styleCategories="Symbology")
+    renderer = SubElement(root, "renderer-v2", about)
+    categories = None if is_single else SubElement(renderer, "categories")
+    symbols = SubElement(renderer, "symbols")
+    for k, (value, colour) in enumerate(layer.colours.items()):
+        if categories is not None:
+            SubElement(categories, "category", symbol=str(k), value=value, label=value, render="true")
+        symbol = SubElement(symbols, "symbol", type=kind, name=str(k), alpha="0.5" if kind == "fill" else "1")
+        drawn = SubElement(symbol, "layer", {"class": drawn_as}, enabled="1")
+        own = {"color": colour, "line_color": colour, "outline_color": colour, "line_width": "0.6", "size": "1.6"}
+        for name, text in own.items():
+            SubElement(drawn, "prop", k=name, v=text)
+    return "<!DOCTYPE qgis>" + tostring(root, encoding="unicode")
+
+
 SUFFIX = ".gpkg"
 
 
-def convert_to_gpkg(folder: Path, out: Path, *, overwrite: bool = False) -> list[GeoLayer]:
+def convert_to_gpkg(
+    folder: Path, out: Path, *, crs: OutputCrs | None = None, overwrite: bool = False
+) -> list[GeoLayer]:
     """Write the available layers of the run in `folder` to `out`, whole or not at all.
 
     `trajectory` is one line, `scans` a point each with number, stamp, UTC where stamps are Unix time, status and the standard
-    deviation where it is largest, `buildings` and `new_walls` what the run found of OpenStreetMap. WGS84, heights in m above its
-    ellipsoid.
+    deviation where it is largest, `buildings` and `new_walls` what the run found of OpenStreetMap. Coordinates are those of the
+    run's map, or of `crs`. QGIS draws scans and buildings in a colour of their status.
 
     Raises
     ------
@@ -140,23 +186,24 @@ def convert_to_gpkg(folder: Path, out: Path, *, overwrite: bool = False) -> list
     if out.exists() and not overwrite:
         raise OutputExistsError(f"{out} exists already: choose another --out, or --overwrite it")
     require_run(folder)
-    georeference = georeference_beside(folder, "gpkg")
+    projection = Projection(in_crs(georeference_beside(folder, "--to gpkg"), crs))
+    projection.check()
     run = read_run(folder)
     if not len(run.trajectory):
         raise InputError(f"{folder / 'trajectory.tum'} has no pose")
-    layers = _of_poses(run, georeference)
+    layers = _of_poses(run, projection)
     if (folder / "buildings.geojson").is_file():
-        layers += _of_buildings(read_corrected(folder / "buildings.geojson"))
+        layers += _of_buildings(read_corrected(folder / "buildings.geojson"), projection)
     with staged(out) as made:
-        write_gpkg(made, layers)
+        write_gpkg(made, layers, projection)
     return layers
 
 
-def _of_poses(run: EarlierRun, georeference: Georeference) -> list[GeoLayer]:
-    about = "heights in m above the WGS84 ellipsoid; by lslam"
-    if georeference.method == "osm":
+def _of_poses(run: EarlierRun, projection: Projection) -> list[GeoLayer]:
+    about = f"{projection.frame}; by lslam"
+    if projection.georeference.method == "osm":
         about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
-    places = to_lat_lon(run.trajectory.positions, georeference)[:, [1, 0, 2]]
+    places = projection.apply(run.trajectory.positions)
     stamps, nothing = run.trajectory.stamps_ns, [None] * len(places)
     times = utc_of(stamps) or nothing
     covariances = covariances_of(run)
@@ -178,8 +225,8 @@ def _of_poses(run: EarlierRun, georeference: Georeference) -> list[GeoLayer]:
         "end": times[-1:],
     }
     return [
-        GeoLayer("trajectory", "lines", [line], whole, about),
-        GeoLayer("scans", "points", list(places), columns, about),
+        GeoLayer("trajectory", "lines", [line], whole, about, {"": _BLUE}),
+        GeoLayer("scans", "points", list(places), columns, about, _SCANS),
     ]
 
 
@@ -190,12 +237,16 @@ def _sigmas(covariances: Floats) -> list[float | None]:
     return [float(np.sqrt(max(v, 0.0))) if k else None for v, k in zip(largest, known, strict=True)]
 
 
-def _of_buildings(found: CorrectedMap) -> list[GeoLayer]:
+def _of_buildings(found: CorrectedMap, projection: Projection) -> list[GeoLayer]:
     """Layers of buildings at their georeferenced places, as in buildings.geojson."""
+    # Buildings lie in the local frame of their own origin.
+    there = Projection(
+        replace(projection.georeference, origin=found.origin, T_enu_world=np.eye(4), epsg=projection.epsg)
+    )
     about = f"{found.attribution}; corrected by lslam" if found.attribution else "corrected by lslam"
-    held, origin = found.buildings, found.origin
+    held = found.buildings
     polygons = [
-        [[_close_ring(ring, origin) for ring in footprint.rings] for footprint in c.corrected.footprints] for c in held
+        [[_close_ring(ring, there) for ring in footprint.rings] for footprint in c.corrected.footprints] for c in held
     ]
     columns: dict[str, Any] = {
         "osm_id": [c.building.osm_id for c in held],
@@ -207,18 +258,25 @@ def _of_buildings(found: CorrectedMap) -> list[GeoLayer]:
         "height_m": [c.building.height for c in held],
         "name": [c.building.tags.get("name") for c in held],
     }
-    walls = [_to_lon_lat(wall, origin) for wall in found.new_walls]
+    walls = [_projected(wall, there) for wall in found.new_walls]
     lengths = np.linalg.norm(found.new_walls[:, 1] - found.new_walls[:, 0], axis=1).tolist()
     return [
-        GeoLayer("buildings", "polygons", polygons, columns, about),
-        GeoLayer("new_walls", "lines", walls, {"length_m": lengths}, f"walls where the map has no building; {about}"),
+        GeoLayer("buildings", "polygons", polygons, columns, about, _BUILDINGS),
+        GeoLayer(
+            "new_walls",
+            "lines",
+            walls,
+            {"length_m": lengths},
+            f"walls where the map has no building; {about}",
+            {"": _RED},
+        ),
     ]
 
 
-def _to_lon_lat(points: Floats, origin: Floats) -> Floats:
-    """Positions (K, 2), m, as (K, 3) longitude, latitude, height of the origin."""
-    return from_local(np.column_stack([points, np.zeros(len(points))]), origin)[:, [1, 0, 2]]
+def _projected(points: Floats, projection: Projection) -> Floats:
+    """Positions (K, 2), m, as (K, 3) projected coordinates, at the height of the origin."""
+    return projection.apply(np.column_stack([points, np.zeros(len(points))]))
 
 
-def _close_ring(ring: Floats, origin: Floats) -> Floats:
-    return _to_lon_lat(np.concatenate([ring, ring[:1]]), origin)[:, :2]
+def _close_ring(ring: Floats, projection: Projection) -> Floats:
+    return _projected(np.concatenate([ring, ring[:1]]), projection)[:, :2]
