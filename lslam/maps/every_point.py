@@ -105,8 +105,9 @@ class PointCollector:
         The map has intensity only when every scan has; an intensity that is not finite counts as 0.
         """
         with np.errstate(invalid="ignore", over="ignore"):
-            away = np.linalg.norm(points, axis=1)
-            kept = is_measured(points) & (away >= self._near) & (away <= self._far)
+            # As the kernel of voxels does, so that both keep the same points.
+            away2 = np.square(points, dtype=np.float64).sum(axis=1)
+            kept = is_measured(points) & (away2 >= self._near**2) & (away2 <= self._far**2)
             world = se3.apply(T_world_lidar, points[kept].astype(np.float64))
         inside = np.isfinite(world).all(axis=1)
         if self._crop is not None:

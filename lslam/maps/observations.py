@@ -48,7 +48,7 @@ class Observations:
         if scan.times is not None:
             times_ns += np.rint(1e9 * np.nan_to_num(scan.times.astype(np.float64))).astype(np.int64)
         with np.errstate(over="ignore", invalid="ignore"):
-            ranges = np.linalg.norm(scan.points, axis=1).astype(np.float32)
+            ranges = np.sqrt(np.square(scan.points, dtype=np.float64).sum(axis=1)).astype(np.float32)
         rings = np.full(count, NO_RING, np.uint16) if scan.rings is None else scan.rings
         labels = np.zeros(count, np.uint16) if scan.labels is None else scan.labels
         return cls(scan.index, times_ns, ranges, rings, labels)

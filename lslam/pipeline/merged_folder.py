@@ -32,7 +32,7 @@ from lslam.pipeline.map_files import MapNote, write_map
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, MapMaker, scan_poser, scans_again
 from lslam.pipeline.merge_runs import Merged, expanded, merge_runs
 from lslam.pipeline.outputs import config_text, write_loops
-from lslam.pipeline.rebuild import EarlierRun, open_scans
+from lslam.pipeline.rebuild import EarlierRun, is_gone, open_scans
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
 from lslam.pipeline.watch import Watch
 from lslam.reports.merge_html import SessionView, write_page
@@ -145,7 +145,8 @@ def _recording(run: EarlierRun, config: Config, problems: list[str]) -> Recordin
         scans = open_scans(replace(run, config=run.config.model_copy(update={"map": config.map})))
         return with_attributes(scans, config) if config.map.write else scans
     except InputError as error:
-        problems.append(f"the raw scans of {run.folder.name} are missing in the map: {error}")
+        why = f"cannot be read at {run.sequence_path}" if is_gone(run) else f"cannot be used ({error})"
+        problems.append(f"the raw scans of {run.folder.name} {why}: they are missing in the map")
         return None
 
 

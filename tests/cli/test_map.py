@@ -283,7 +283,7 @@ def test_scores_and_comparisons(run: Path, tmp_path: Path) -> None:
         (["--out", "no/where.ply"], 3, "the folder no does not exist"),
         (["--out", "map.xyz"], 2, "known suffixes: .ply"),
         (["--out", "a.ply", "--format", "laz"], 2, "contradicts"),
-        (["--out", "a.ply", "--voxel", "0"], 2, "map.voxel"),
+        (["--out", "a.ply", "--voxel", "-1"], 2, "map.voxel"),
         (["--out", "a.ply", "--crop", "5,-5,0,1"], 2, "pairs of a smaller and a larger"),
         (["--out", "a.ply", "--crop", "1,2,3"], 2, "x_min, x_max, y_min, y_max"),
         (["--out", "a.ply", "--format", "obj"], 2, "contradicts"),

@@ -73,7 +73,7 @@ def test_a_voxel_has_the_attributes_of_its_nearest_observation() -> None:
         assert scan.rings is not None
         assert scan.labels is not None
         world = scan.points.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
-        ranges = np.linalg.norm(scan.points, axis=1)
+        ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1).astype(np.float32)
         for k, cell in enumerate(map(tuple, np.floor(world / VOXEL).astype(int).tolist())):
             time_ns = scan.stamp_ns + round(1e9 * float(scan.times[k]))
             own = (float(ranges[k]), scan.index, time_ns, int(scan.rings[k]), int(scan.labels[k]))
@@ -133,7 +133,7 @@ def test_every_point_is_kept_in_the_order_of_the_recording(tmp_path: Path, monke
     for scan, T in scans:
         assert scan.times is not None
         assert scan.intensity is not None
-        ranges = np.linalg.norm(scan.points, axis=1)
+        ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1).astype(np.float32)
         kept = (ranges >= 2) & (ranges <= 14)
         own = slice(start, start := start + int(kept.sum()))
         world = scan.points[kept].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
