@@ -83,6 +83,11 @@ class Projection:
         """Definition of the coordinate reference system as WKT 1, which LAS needs."""
         return str(self._crs.to_wkt("WKT1_GDAL") or self._crs.to_wkt())
 
+    @property
+    def wkt2(self) -> str:
+        """The same as WKT 2."""
+        return str(self._crs.to_wkt())
+
     def apply(self, points: NDArray[Any]) -> Floats:
         """Transform points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m.
 

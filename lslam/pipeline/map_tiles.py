@@ -24,12 +24,14 @@ from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.sequence import Sequence
 from lslam.core.version import __version__
+from lslam.io.formats.copc_files import SUFFIX as COPC
 from lslam.io.formats.point_files import read_cloud, write_cloud
 from lslam.maps.georeference import ProjectedCloud, Projection
 from lslam.pipeline.map_files import MapNote, georeference_note, read_json, write_json
 from lslam.pipeline.map_pass import INTERRUPTED, build_map
 from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
 from lslam.pipeline.run_folder import SPOOL
+from lslam.pipeline.tile_index import VPC, vpc_item, write_vpc
 
 INDEX, SCHEMA = "map.json", 1
 # Points that wait for their tiles' files, so that a map of any size needs little memory and few open files.
@@ -63,6 +65,8 @@ def write_tiles(
 ) -> dict[str, Any]:
     """Write the cloud as `folder`/tile_X_Y.<suffix> and the index map.json. Returns the index.
 
+    Tiles in LAZ are COPC, `.copc.laz`; of a georeferenced run `map.vpc` makes them one layer of QGIS.
+
     Tile X, Y holds X * size <= x < (X + 1) * size, m, of the world, or of the coordinate reference system in LAS and LAZ of a
     georeferenced run. Raises OutputError, and UsageError for coordinates that no map can be written in.
     """
@@ -71,12 +75,15 @@ def write_tiles(
     if projection is not None and is_projected:
         projection.check()
         cloud = ProjectedCloud(cloud, projection)
-    tiles = []
+    tiles, items = [], []
+    ending = COPC if suffix == "laz" else f".{suffix}"
     with tempfile.TemporaryDirectory(prefix=SPOOL, dir=folder, ignore_cleanup_errors=True) as stage:
         for key, tile in _sorted_into(cloud, size, Path(stage)):
-            path = Path(stage) / f"tile_{key[0]}_{key[1]}.{suffix}"
+            path = Path(stage) / f"tile_{key[0]}_{key[1]}{ending}"
             write_cloud(path, tile, wkt=projection.wkt if projection is not None and is_projected else "")
             low, high = tile.points.min(axis=0), tile.points.max(axis=0)
+            if projection is not None and is_projected and ending == COPC:
+                items.append(vpc_item(path.name, tile, projection))
             tiles.append({"file": path.name, "points": len(tile), "low": low.tolist(), "high": high.tolist()})
         _publish(Path(stage), folder, {tile["file"] for tile in tiles})
     crs = projection.name if projection is not None and is_projected else None
@@ -96,6 +103,8 @@ def write_tiles(
         "sequence": note.sequence,
         "lslam": __version__,
     }
+    if items:
+        write_vpc(folder, items)
     write_json(folder / INDEX, index)
     return index
 
@@ -103,7 +112,8 @@ def write_tiles(
 def _publish(stage: Path, folder: Path, names: set[str]) -> None:
     """Remove the old index and tiles not in `names`, then move the new tiles to their place. The index follows later."""
     with output_errors(f"the tiles in {folder}"):
-        (folder / INDEX).unlink(missing_ok=True)
+        for index in (INDEX, VPC):
+            (folder / index).unlink(missing_ok=True)
         for file in folder.glob("tile_*_*.*"):
             if file.name not in names:
                 file.unlink()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
+from pyproj import CRS, Transformer
 from scipy.spatial import cKDTree
 
 from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError
@@ -28,7 +31,7 @@ def test_each_point_lies_in_its_tile_and_in_no_other(suffix: str, tmp_path: Path
     assert index["points"] == 5000 == sum(tile["points"] for tile in index["tiles"])
     for tile in index["tiles"]:
         points = read_cloud(tmp_path / tile["file"]).points
-        x, y = (int(part) for part in Path(tile["file"]).stem.split("_")[1:])
+        x, y = (int(part) for part in tile["file"].split(".")[0].split("_")[1:])
         assert (np.floor((points[:, :2] + 1e-4) / 25.0) >= [x, y]).all()
         assert (np.floor((points[:, :2] - 1e-3) / 25.0) <= [x, y]).all()
         assert len(points) == tile["points"]
@@ -55,8 +58,33 @@ def test_tiles_of_a_georeferenced_run_lie_on_the_grid_of_their_crs(tmp_path: Pat
     index = write_tiles(tmp_path, CLOUD, NOTE, 50.0, "laz", georeference)
     assert index["crs"] == "EPSG:32632"
     there = Projection(georeference).apply(POINTS)
-    names = {f"tile_{x}_{y}.laz" for x, y in np.floor(there[:, :2] / 50.0).astype(int).tolist()}
+    names = {f"tile_{x}_{y}.copc.laz" for x, y in np.floor(there[:, :2] / 50.0).astype(int).tolist()}
     assert {tile["file"] for tile in index["tiles"]} == names
+
+
+def test_qgis_finds_the_tiles_in_a_virtual_point_cloud(tmp_path: Path) -> None:
+    georeference = Georeference(np.array([49.0, 8.4, 110.0]), np.eye(4))
+    columns = {"time_ns": 1_700_000_000_000_000_000 + np.arange(5000), "class": np.full(5000, 40, np.uint16)}
+    cloud = ArrayCloud(CLOUD.points, CLOUD.intensity, columns)
+    index = write_tiles(tmp_path, cloud, NOTE, 50.0, "laz", georeference)
+    items = json.loads((tmp_path / "map.vpc").read_text())["features"]
+    assert sum(item["properties"]["pc:count"] for item in items) == len(cloud)
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    for item, tile in zip(items, index["tiles"], strict=True):
+        assert item["assets"]["data"]["href"] == f"./{tile['file']}"
+        about, header = item["properties"], laspy.open(tmp_path / tile["file"]).header
+        np.testing.assert_allclose(about["proj:bbox"], [*header.mins, *header.maxs], atol=1e-3)
+        assert CRS.from_wkt(about["proj:wkt2"]).to_epsg() == 32632
+        corners = np.array(item["geometry"]["coordinates"][0])
+        x, y = to_utm.transform(*corners.T)
+        assert [min(x), min(y), max(x), max(y)] == pytest.approx([*header.mins[:2], *header.maxs[:2]], abs=2e-3)
+        named = {one["name"]: one for one in about["pc:schemas"]}
+        own = {"X", "Y", "Z", "Intensity", "GpsTime", "Classification", "class"}
+        assert set(named) == own
+        assert named["class"] == {"name": "class", "size": 2, "type": "unsigned"}
+        assert about["datetime"] == "2023-11-14T22:13:20Z"
+    write_tiles(tmp_path, cloud, NOTE, 50.0, "ply", georeference)
+    assert not (tmp_path / "map.vpc").exists()
 
 
 def test_tiles_of_an_earlier_map_are_gone(tmp_path: Path) -> None:

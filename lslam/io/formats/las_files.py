@@ -21,9 +21,10 @@ from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
 from lslam.core.labels import asprs_table
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, Columns
+from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns, in_memory
 from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.copc_files import INFO, INFO_BYTES, USER_ID, copc_bytes, is_copc
 from lslam.io.formats.gps_time import gps_time_s
 from lslam.io.formats.text_tables import is_unix_time
 
@@ -148,7 +149,7 @@ def _check_layers(stream: BinaryIO, layers: int, begin: int, length: int, record
 
 
 def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
-    """Write a cloud, m, as LAS 1.4 (point format 6, with colours 7); `.laz` compresses it.
+    """Write a cloud, m, as LAS 1.4 (point format 6, with colours 7); `.laz` compresses it, `.copc.laz` holds it in memory too.
 
     Coordinates are millimetres about an offset, the floor of the smallest ones. Intensities are 16 bits: 0..1 and 0..255
     are spread over them, larger values are kept. The file is dated 1970, so the same cloud gives the same bytes.
@@ -171,19 +172,28 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
     is_unix = is_unix_time(first_ns)
     header = _header(laspy, offset, wkt, cloud.column_types, is_unix)
     factor = 65535.0 if largest <= 1.0 else 257.0 if largest <= 255.0 else 1.0
+
+    def record_of(block: CloudBlock | ArrayCloud) -> Any:
+        record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
+        steps = np.rint((block.points - offset) / SCALE)
+        record["X"], record["Y"], record["Z"] = steps.astype(np.int32).T
+        if block.intensity is not None:
+            record["intensity"] = np.clip(np.rint(block.intensity * factor), 0, 65535).astype(np.uint16)
+        for name, values in _fields(block.columns, is_unix).items():
+            record[name] = values
+        record["return_number"] = record["number_of_returns"] = np.ones(len(block), np.uint8)
+        return record
+
     with atomic_write(path) as stream:
+        if is_copc(path):
+            header.vlrs.insert(0, laspy.vlrs.vlr.VLR(USER_ID, INFO, "COPC info VLR", bytes(INFO_BYTES)))
+            laszip = laspy.vlrs.known.LasZipVlr
+            stream.write(copc_bytes(header, record_of(in_memory(cloud)), laszip).getbuffer())
+            return
         compressed = path.suffix.lower() == ".laz"
         with laspy.open(stream, mode="w", header=header, do_compress=compressed, closefd=False) as writer:
             for block in cloud.blocks():
-                record = laspy.ScaleAwarePointRecord.zeros(len(block), header=header)
-                steps = np.rint((block.points - offset) / SCALE)
-                record["X"], record["Y"], record["Z"] = steps.astype(np.int32).T
-                if block.intensity is not None:
-                    record["intensity"] = np.clip(np.rint(block.intensity * factor), 0, 65535).astype(np.uint16)
-                for name, values in _fields(block.columns, is_unix).items():
-                    record[name] = values
-                record["return_number"] = record["number_of_returns"] = np.ones(len(block), np.uint8)
-                writer.write_points(record)
+                writer.write_points(record_of(block))
 
 
 def read_las(path: Path) -> tuple[ArrayCloud, str]:
@@ -215,9 +225,14 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
     return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
 
 
+def is_extra(name: str, kind: np.dtype[Any]) -> bool:
+    """Whether a column of this type is an extra dimension; classes are one beside their own field, as are wide scan numbers."""
+    return name not in (*_COLOURS, TIME_NS, "scan") or (name == "scan" and kind.itemsize > 2)
+
+
 def _fields(columns: Columns, is_unix: bool) -> dict[str, NDArray[Any]]:
     """Values of LAS fields and extra dimensions, by name."""
-    fields: dict[str, NDArray[Any]] = {name: v for name, v in columns.items() if name not in (*_COLOURS, TIME_NS)}
+    fields: dict[str, NDArray[Any]] = {name: v for name, v in columns.items() if is_extra(name, v.dtype)}
     if TIME_NS in columns:
         fields["gps_time"] = gps_time_s(columns[TIME_NS], is_unix)
     for name in set(_COLOURS).intersection(columns):
@@ -225,10 +240,7 @@ def _fields(columns: Columns, is_unix: bool) -> dict[str, NDArray[Any]]:
     if "class" in columns:
         fields["classification"] = asprs_table()[columns["class"]]
     if "scan" in columns:
-        scans = columns["scan"]
-        fields["point_source_id"] = np.where(scans <= _LAST_SOURCE, scans, 0).astype(np.uint16)
-        if scans.dtype == np.uint16:
-            del fields["scan"]
+        fields["point_source_id"] = np.where(columns["scan"] <= _LAST_SOURCE, columns["scan"], 0).astype(np.uint16)
     return fields
 
 
