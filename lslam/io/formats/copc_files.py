@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Longs
 
 SUFFIX = ".copc.laz"
 # Record of LAS 1.4 that tells of the octree; it has to be the first, behind the header.
@@ -27,36 +28,48 @@ def is_copc(path: Path) -> bool:
     return path.name.lower().endswith(SUFFIX)
 
 
-def octree(points: Floats, low: Floats, edge: float, finest: float) -> tuple[Longs, Longs]:
-    """Nodes of points (N, 3), m, in the cube of the corner `low` (3,) and of this edge.
+def octree(axes: Sequence[NDArray[np.int32]], edge: int) -> tuple[Longs, NDArray[np.int32]]:
+    """Nodes of points in a cube of `edge` steps; axes : x, y, z (N,) of the points, whole steps from its lowest corner.
 
     A node with many points keeps the first one of each of its cells, and its eight children have the others, down to cells as
-    small as `finest`, m. Returns the keys (K, 4) of the nodes, their level and x, y, z in it, and the node (N,) of each point.
+    small as a step. Returns the keys (K, 4) of the nodes, their level and x, y, z in it, and the node (N,) of each point.
     """
-    keys, node_of, rest = [], np.zeros(len(points), np.int64), np.arange(len(points))
-    level = count = 0
+    count = len(axes[0])
+    keys, node_of, rest = [np.zeros((0, 4), np.int64)], np.zeros(count, np.int32), np.arange(count, dtype=np.int32)
+    level = nodes = 0
     while len(rest):
         size = edge / 2**level
-        places = np.clip((points[rest] - low) / size, 0, np.nextafter(2.0**level, 0))
-        boxes = places.astype(np.int64)
         packed, first, node, sizes = np.unique(
-            _packed(boxes, 1 << level), return_index=True, return_inverse=True, return_counts=True
+            _packed(axes, rest, size, 1 << level, 1 << level),
+            return_index=True,
+            return_inverse=True,
+            return_counts=True,
         )
         is_kept = sizes[node] <= _MOST
-        if size / _CELLS > finest:
-            cells = _packed(((places - boxes) * _CELLS).astype(np.int64), _CELLS)
+        if size > _CELLS:
+            cells = _packed(axes, rest, size / _CELLS, _CELLS << level, _CELLS)
             is_kept[np.unique(node * _CELLS**3 + cells, return_index=True)[1]] = True
         else:
             is_kept[:] = True
-        keys.append(np.column_stack([np.full(len(packed), level), boxes[first]]))
-        node_of[rest[is_kept]] = count + node[is_kept]
-        rest, count, level = rest[~is_kept], count + len(packed), level + 1
-    return np.concatenate(keys) if keys else np.zeros((1, 4), np.int64), node_of
+        boxes = [_boxes(axis[rest[first]], size, 1 << level) for axis in axes]
+        keys.append(np.column_stack([np.full(len(packed), level), *boxes]))
+        node_of[rest[is_kept]] = nodes + node[is_kept]
+        rest, nodes, level = rest[~is_kept], nodes + len(packed), level + 1
+    return np.concatenate(keys) if count else np.zeros((1, 4), np.int64), node_of
 
 
-def _packed(cells: Longs, side: int) -> Longs:
-    """(N,) number of each of the cells (N, 3) in a cube of `side` cells along each axis, which are at most 2**21."""
-    return np.asarray((cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2])
+def _boxes(steps: NDArray[np.int32], size: float, most: int) -> Longs:
+    """(N,) number of the box of `size` steps that each coordinate lies in; the last of `most` has its far side."""
+    return np.minimum((steps / size).astype(np.int64), most - 1)
+
+
+def _packed(axes: Sequence[NDArray[np.int32]], some: NDArray[np.int32], size: float, most: int, side: int) -> Longs:
+    """(M,) number of the box of each of the points `some`, in the cube of `side` boxes along each axis that it belongs to."""
+    packed = np.zeros(len(some), np.int64)
+    for axis in axes:
+        packed *= side
+        packed += _boxes(axis[some], size, most) % side
+    return packed
 
 
 def copc_bytes(header: Any, record: Any, laszip_record: Any) -> io.BytesIO:
@@ -71,17 +84,16 @@ def copc_bytes(header: Any, record: Any, laszip_record: Any) -> io.BytesIO:
     laszip = lazrs.LazVlr.new_for_compression(form.id, form.num_extra_bytes, use_variable_size_chunks=True)
     header.vlrs.append(laszip_record(laszip.record_data()))
     header.are_points_compressed = True
-    points = np.column_stack([record.x, record.y, record.z]).astype(np.float64)
-    low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.zeros(3))
-    step = float(header.scales[0])
+    count, step = len(record), float(header.scales[0])
+    lowest = [int(record[axis].min()) if count else 0 for axis in "XYZ"]
+    axes = [np.asarray(record[axis], np.int32) - np.int32(least) for axis, least in zip("XYZ", lowest, strict=True)]
     # The cube begins where the points do, since some programs take it from the header alone.
-    edge = max(float((high - low).max()), step)
-    keys, node_of = octree(points, low, edge, step)
-    order = np.argsort(node_of, kind="stable")
+    edge = max([1, *(int(axis.max()) for axis in axes if count)])
+    keys, node_of = octree(axes, edge)
+    order = np.argsort(node_of, kind="stable").astype(np.int32)
     counts = np.bincount(node_of, minlength=len(keys))
-    table = record.array[order]
     header.partial_reset()
-    if len(table):
+    if count:
         header.grow(record)
     stream = io.BytesIO()
     header.write_to(stream)
@@ -90,7 +102,7 @@ def copc_bytes(header: Any, record: Any, laszip_record: Any) -> io.BytesIO:
     for begin, end in zip(ends - counts, ends, strict=True):
         if begin:
             compressor.finish_current_chunk()
-        compressor.compress_many(table[begin:end].tobytes())
+        compressor.compress_many(record.array[order[begin:end]].tobytes())
     compressor.done()
     end = stream.seek(0, io.SEEK_END)
     stream.seek(header.offset_to_point_data)
@@ -99,21 +111,17 @@ def copc_bytes(header: Any, record: Any, laszip_record: Any) -> io.BytesIO:
     pages = _pages(keys, begins, sizes, counts)
     stream.seek(end)
     stream.write(_EVLR.pack(USER_ID.encode(), HIERARCHY, len(pages), b"") + pages)
-    times = record["gps_time"] if len(table) else np.zeros(1)
-    info = [
-        *(low + edge / 2),
-        edge / 2,
-        edge / _CELLS,
-        end + _EVLR.size,
-        len(pages),
-        float(times.min()),
-        float(times.max()),
-    ]
+    times = record["gps_time"] if count else np.zeros(1)
+    half = edge * step / 2
+    middle = np.array(lowest) * step + np.asarray(header.offsets) + half
+    info = struct.pack(
+        "<5d2Q2d", *middle, half, 2 * half / _CELLS, end + _EVLR.size, len(pages), times.min(), times.max()
+    )
     header.number_of_evlrs, header.start_of_first_evlr = 1, end
     stream.seek(0)
     header.write_to(stream, ensure_same_size=True)
     stream.seek(_INFO_AT)
-    stream.write(struct.pack("<5d2Q2d", *info))
+    stream.write(info)
     return stream
 
 

@@ -37,30 +37,31 @@ def _small_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_nodes_hold_the_points_of_their_cubes_and_have_parents() -> None:
-    points, low, edge = street().points, np.array([456_000.0, 5_427_000, 110]), 60.0
-    keys, node_of = octree(points, low, edge, 0.001)
-    assert len({*map(tuple, keys.tolist())}) == len(keys)
-    sizes = edge / 2.0 ** keys[:, 0]
-    corner = (low + keys[:, 1:] * sizes[:, None])[node_of]
-    assert ((points >= corner - 1e-6) & (points <= corner + sizes[node_of][:, None] + 1e-6)).all()
+    steps = np.rint((street().points - [456_000, 5_427_000, 110]) * 1000).astype(np.int32)
+    edge = int(steps.max())
+    keys, node_of = octree(list(steps.T), edge)
     known = {*map(tuple, keys.tolist())}
-    for level, x, y, z in known - {(0, 0, 0, 0)}:
-        assert (level - 1, x // 2, y // 2, z // 2) in known
-    # A node that is divided has one point in a cell, the others those that no child has.
-    counts = np.bincount(node_of, minlength=len(keys))
+    assert len(known) == len(keys)
+    sizes = edge / 2.0 ** keys[:, 0]
+    corner = (keys[:, 1:] * sizes[:, None])[node_of]
+    assert ((steps >= corner) & (steps <= corner + sizes[node_of][:, None])).all()
     parents = {(level - 1, x // 2, y // 2, z // 2) for level, x, y, z in known}
+    assert parents - {(-1, 0, 0, 0)} <= known
+    # A node that is divided has one point in each of its cells that is not empty, the others have all that is left.
     for node, key in enumerate(map(tuple, keys.tolist())):
-        own = np.floor((points[node_of == node] - low - keys[node, 1:] * sizes[node]) / sizes[node] * 8)
+        own = steps[node_of == node]
+        cells = np.minimum((own - keys[node, 1:] * sizes[node]) / sizes[node] * 8, 7).astype(int)
         if key in parents:
-            assert len(np.unique(own, axis=0)) == len(own) == counts[node]
+            assert len(np.unique(cells, axis=0)) == len(own)
         else:
-            assert counts[node] <= MOST
+            assert len(own) <= MOST
+    assert len(parents) > 5
 
 
 def test_points_that_share_a_place_end_somewhere() -> None:
-    keys, node_of = octree(np.zeros((2000, 3)), np.zeros(3), 0.5, 0.001)
-    assert keys[:, 0].max() <= np.log2(0.5 / 8 / 0.001) + 1
-    assert len(node_of) == 2000
+    keys, node_of = octree([np.array([0] * 2000 + [500], np.int32)] * 3, 500)
+    assert keys[:, 0].max() <= np.log2(500 / 8) + 1
+    assert len(node_of) == 2001
 
 
 def test_laspy_finds_every_point_and_those_of_a_box(tmp_path: Path) -> None:
