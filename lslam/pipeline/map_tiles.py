@@ -65,7 +65,7 @@ def write_tiles(
 ) -> dict[str, Any]:
     """Write the cloud as `folder`/tile_X_Y.<suffix> and the index map.json. Returns the index.
 
-    Tiles in LAZ are COPC, `.copc.laz`; of a georeferenced run `map.vpc` makes them one layer of QGIS.
+    Tiles in LAZ are COPC, `.copc.laz`; of a georeferenced run `tiles.vpc` makes them one layer of QGIS.
 
     Tile X, Y holds X * size <= x < (X + 1) * size, m, of the world, or of the coordinate reference system in LAS and LAZ of a
     georeferenced run. Raises OutputError, and UsageError for coordinates that no map can be written in.

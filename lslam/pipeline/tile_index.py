@@ -15,7 +15,7 @@ from lslam.io.formats.las_files import is_extra
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import Projection, to_wgs84
 
-VPC = "map.vpc"
+VPC = "tiles.vpc"
 _EXTENSIONS = ("pointcloud/v1.0.0", "projection/v1.1.0")
 _KINDS = {"f": "floating", "u": "unsigned", "i": "signed"}
 # Names of PDAL for the columns that have a field in LAS.

@@ -67,7 +67,7 @@ def test_qgis_finds_the_tiles_in_a_virtual_point_cloud(tmp_path: Path) -> None:
     columns = {"time_ns": 1_700_000_000_000_000_000 + np.arange(5000), "class": np.full(5000, 40, np.uint16)}
     cloud = ArrayCloud(CLOUD.points, CLOUD.intensity, columns)
     index = write_tiles(tmp_path, cloud, NOTE, 50.0, "laz", georeference)
-    items = json.loads((tmp_path / "map.vpc").read_text())["features"]
+    items = json.loads((tmp_path / "tiles.vpc").read_text())["features"]
     assert sum(item["properties"]["pc:count"] for item in items) == len(cloud)
     to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
     for item, tile in zip(items, index["tiles"], strict=True):
@@ -84,7 +84,7 @@ def test_qgis_finds_the_tiles_in_a_virtual_point_cloud(tmp_path: Path) -> None:
         assert named["class"] == {"name": "class", "size": 2, "type": "unsigned"}
         assert about["datetime"] == "2023-11-14T22:13:20Z"
     write_tiles(tmp_path, cloud, NOTE, 50.0, "ply", georeference)
-    assert not (tmp_path / "map.vpc").exists()
+    assert not (tmp_path / "tiles.vpc").exists()
 
 
 def test_tiles_of_an_earlier_map_are_gone(tmp_path: Path) -> None:

@@ -187,6 +187,9 @@ FEATURES = ("odometry.method=floam", "input.rings=elevation:16", "map.write=fals
     [
         (drive, (), "", 8),
         (drive, (), "map/run-3", 0),
+        (drive, ("map.attributes=time,scan,range",), "", 8),
+        (drive, ("map.attributes=time,scan,range", "map.voxel=0"), "", 8),
+        (drive, ("map.attributes=time,scan,range", "map.voxel=0"), "map/points", 0),
         # Of scans 0 to 7 the sixth was not registered: four are decided, and the cleaner looks three back.
         (drive, ("map.clean=true", "map.occupancy=true"), "", 1),
         (drive, ("map.clean=true", "map.occupancy=true"), "occupancy/run-3", 0),
