@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -21,6 +22,8 @@ from lslam.io.formats.point_files import read_cloud
 from lslam.io.readers import open_sequence
 from lslam.pipeline.map_attributes import with_attributes
 from lslam.pipeline.map_pass import build_map
+from lslam.registration.preprocessing.rings import RingRule
+from lslam.registration.preprocessing.views import Ringed
 from lslam.simulation.scenarios import simulate
 
 COUNT = 10
@@ -116,6 +119,23 @@ def test_rings_are_found_where_the_recording_has_none() -> None:
     # The rule counts from the top, the simulator may count from the bottom.
     assert len({*zip(rings.tolist(), truth.tolist(), strict=True)}) == 16
     assert NO_RING not in rings
+
+
+class PartlyRinged(SequenceView):
+    def scan(self, index: int) -> Scan:
+        scan = self.whole.scan(index)
+        assert scan.rings is not None
+        return replace(scan, rings=np.where(np.arange(len(scan)) % 3 == 0, NO_RING, scan.rings).astype(np.uint16))
+
+
+def test_points_without_a_ring_stay_where_none_is_required() -> None:
+    drive, rule = simulate("block", lidar="vlp16", count=2), RingRule("field", 16)
+    whole = drive.scan(1)
+    kept = Ringed(PartlyRinged(drive), rule, is_required=False).scan(1)
+    assert len(kept) == len(whole)
+    assert kept.rings is not None
+    assert np.count_nonzero(kept.rings == NO_RING) == -(-len(whole) // 3)
+    assert len(Ringed(PartlyRinged(drive), rule).scan(1)) == len(whole) - -(-len(whole) // 3)
 
 
 def test_what_cannot_be_is_said_in_one_sentence(ran: Path, tmp_path: Path) -> None:

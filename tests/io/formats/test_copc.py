@@ -49,12 +49,15 @@ def test_nodes_hold_the_points_of_their_cubes_and_have_parents() -> None:
     assert parents - {(-1, 0, 0, 0)} <= known
     # A node that is divided has one point in each of its cells that is not empty, the others have all that is left.
     for node, key in enumerate(map(tuple, keys.tolist())):
-        own = steps[node_of == node]
-        cells = np.minimum((own - keys[node, 1:] * sizes[node]) / sizes[node] * 8, 7).astype(int)
-        if key in parents:
-            assert len(np.unique(cells, axis=0)) == len(own)
-        else:
-            assert len(own) <= MOST
+        own = node_of == node
+        if key not in parents:
+            assert own.sum() <= MOST
+            continue
+        boxes = np.minimum((steps / sizes[node]).astype(int), 2 ** key[0] - 1)
+        here = (boxes == keys[node, 1:]).all(1) & (keys[node_of, 0] >= key[0])
+        cells = np.minimum((steps / (sizes[node] / 8)).astype(int), 2 ** key[0] * 8 - 1)
+        assert len(np.unique(cells[own], axis=0)) == own.sum()
+        assert len(np.unique(cells[here], axis=0)) == own.sum()
     assert len(parents) > 5
 
 
