@@ -357,7 +357,9 @@ def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
     """
     known, new = read_json(folder / EVALUATION), run_document(record, None) or {}
     if known or not (folder / EVALUATION).exists():
-        write_json(target / EVALUATION, {**new, **known, "map": new["map"]})
+        known.pop("map", None)
+        if document := {**new, **known}:
+            write_json(target / EVALUATION, document)
     else:
         log.warning(_KEPT, folder / EVALUATION, "cannot be read")
     try:

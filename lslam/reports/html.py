@@ -228,7 +228,8 @@ def _map_note(built: Any) -> str:
         return ""
     done = built.get("done")
     said = "".join(f"; {text}" for text in done) if isinstance(done, list) else ""
-    return f"{built.get('file')}, built anew after the run with voxels of {_plain(built.get('voxel'))} m{said}"
+    points = f"voxels of {_plain(built.get('voxel'))} m" if built.get("voxel") else "every point"
+    return f"{built.get('file')}, built anew after the run with {points}{said}"
 
 
 def _map_cards(crispness: Crispness | None) -> list[Card]:

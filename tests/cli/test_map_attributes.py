@@ -10,7 +10,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 import pytest
-from calling import SAMPLE, assert_one_sentence, lslam, manifest, sample_copy
+from calling import SAMPLE, assert_one_sentence, lslam, manifest, sample_copy, strict_json
 
 from lslam.core.config import load_config
 from lslam.core.labels import CLASSES
@@ -119,6 +119,21 @@ def test_rings_are_found_where_the_recording_has_none() -> None:
     # The rule counts from the top, the simulator may count from the bottom.
     assert len({*zip(rings.tolist(), truth.tolist(), strict=True)}) == 16
     assert NO_RING not in rings
+
+
+def test_a_run_whose_map_has_every_point_says_so_and_has_no_score(ran: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(ran, tmp_path / "run")
+    assert "map" in strict_json((run / "evaluation.json").read_text())
+    for _ in range(2):
+        done = lslam("map", run, "--voxel", 0, "--overwrite", "-q")
+        assert done.returncode == 0, done.stderr
+        assert "map" not in strict_json((run / "evaluation.json").read_text())
+        assert "built anew after the run with every point" in (run / "report.html").read_text()
+        assert manifest(run)["map_points"] == len(read_cloud(run / "map.ply"))
+    assert lslam("map", run, "--overwrite", "-q").returncode == 0
+    assert strict_json((run / "evaluation.json").read_text()) == strict_json((ran / "evaluation.json").read_text()) | {
+        "map": strict_json((run / "evaluation.json").read_text())["map"]
+    }
 
 
 class PartlyRinged(SequenceView):
