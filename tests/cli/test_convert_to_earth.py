@@ -125,6 +125,7 @@ def test_a_table_is_in_the_coordinates_of_the_map_and_turned_with_its_grid(run: 
         convergence = np.radians(Proj(f"EPSG:{epsg}").get_factors(lon[0], lat[0]).meridian_convergence)
         T_enu_body = np.array(told["T_enu_world"]) @ read_trajectory(folder).poses
         again = read_trajectory(out)
+        np.testing.assert_array_equal(again.stamps_ns, read_trajectory(folder).stamps_ns)
         turned = so3.exp(np.array([0.0, 0.0, convergence])) @ T_enu_body[:, :3, :3]
         apart = so3.angle(np.swapaxes(turned, 1, 2) @ again.poses[:, :3, :3])
         assert apart.max() < 2e-6

@@ -19,8 +19,9 @@ USER_ID, INFO, HIERARCHY = "copc", 1, 1000
 INFO_BYTES = 160
 _CELLS = 128  # of a node along each axis, with one point each
 _MOST = 1 << 16  # points of a node that is not divided
+_DEEPEST = 21  # level: numbers of three axes fit into 64 bits
 _INFO_AT = 375 + 54
-_EVLR_AT, _EVLR = 235, struct.Struct("<2x16sHQ32s")
+_EVLR = struct.Struct("<2x16sHQ32s")
 
 
 def is_copc(path: Path) -> bool:
@@ -46,7 +47,7 @@ def octree(axes: Sequence[NDArray[np.int32]], edge: int) -> tuple[Longs, NDArray
             return_counts=True,
         )
         is_kept = sizes[node] <= _MOST
-        if size > _CELLS:
+        if size > _CELLS and level < _DEEPEST:
             cells = _packed(axes, rest, size / _CELLS, _CELLS << level, _CELLS)
             is_kept[np.unique(node * _CELLS**3 + cells, return_index=True)[1]] = True
         else:
