@@ -313,7 +313,9 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
 def write_map(folder: RunFolder, built: BuiltMap, config: MapConfig, record: RunRecord) -> None:
     """Write map.ply, .pcd, .las or .laz with map.json beside, in map coordinates if the run is georeferenced."""
     points = len(built.merged) + (0 if built.occupancy is None else len(built.occupancy))
-    folder.require_space(BYTES_PER_POINT * points + BYTES_PER_POINT_SHOWN * len(built.sample), "the map")
+    columns = sum(kind.itemsize for kind in built.merged.column_types.values())
+    size = BYTES_PER_POINT * points + columns * len(built.merged) + BYTES_PER_POINT_SHOWN * len(built.sample)
+    folder.require_space(size, "the map")
     path = folder.path / f"map.{config.format}"
     map_files.write_built(path, built, config, record.name, record.trajectory, record.world, record.georeference)
 
