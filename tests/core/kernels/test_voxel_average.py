@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lslam.maps.kernels.voxel_average import AXIS_BITS, accumulate, enter, unpack
 
-NO_INTENSITY = np.zeros(0, np.float32)
+NO_INTENSITY, NO_TAGS = np.zeros(0, np.float32), np.zeros((0, 3), np.int64)
 ORIGIN = np.zeros(3, np.int64)
 ALL = np.array([-np.inf, np.inf] * 3)
 
@@ -24,7 +24,7 @@ def run(
     size = slots or 1 << int(np.ceil(np.log2(2 * len(points) + 2)))
     table = np.full(size, -1, np.int32)
     rows = np.empty((len(points) + 1, 5), np.int64)
-    used, gated, outside = accumulate(points, NO_INTENSITY, T, near, far, voxel, ALL, ORIGIN, table, rows, 0)
+    used, gated, outside = accumulate(points, NO_INTENSITY, NO_TAGS, T, near, far, voxel, ALL, ORIGIN, table, rows, 0)
     return rows[:used], table, gated, outside
 
 
@@ -75,7 +75,7 @@ def test_enter_finds_every_row_again(cloud: NDArray[np.float32]) -> None:
     assert np.array_equal(np.sort(slots[slots >= 0]), np.arange(len(rows)))
     # Adding the same scan to the rebuilt table opens no new row and doubles every sum.
     room = np.concatenate([rows, np.empty((len(cloud), 5), np.int64)])
-    used, *_ = accumulate(cloud, NO_INTENSITY, pose(), 0.0, 1e6, 0.5, ALL, ORIGIN, slots, room, len(rows))
+    used, *_ = accumulate(cloud, NO_INTENSITY, NO_TAGS, pose(), 0.0, 1e6, 0.5, ALL, ORIGIN, slots, room, len(rows))
     assert used == len(rows)
     assert np.array_equal(room[:used, 1:], 2 * rows[:, 1:])
 
