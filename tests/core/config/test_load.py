@@ -48,7 +48,7 @@ def test_variables_of_others_are_left_alone() -> None:
         ("mapp.voxel=1", "unknown section 'mapp'; did you mean 'map'"),
         ("voxel=1", "expected section.key=value"),
         ("map.voxel", "expected section.key=value"),
-        ("map.voxel=0", "map.voxel = 0"),
+        ("map.voxel=-1", "map.voxel = -1"),
         ("map.voxel=fast", "map.voxel = 'fast'"),
         ("map.voxel=nan", "map.voxel = nan"),
         ("map.voxel=inf", "finite"),

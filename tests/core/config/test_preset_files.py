@@ -95,7 +95,7 @@ def test_wrong_files_and_keys_of_a_preset_are_named(tmp_path: Path) -> None:
         ("[map\n", "not valid TOML"),
         ("voxel = 1\n", "unknown section 'voxel'"),
         ('[odometry]\npreset = "thesis-icp"\n', "what it stands on is said by base"),
-        ("[map]\nvoxel = 0\n", r"map\.voxel = 0"),
+        ("[map]\nvoxel = -1\n", r"map\.voxel = -1"),
     ):
         (tmp_path / "p.toml").write_text(text)
         with pytest.raises(ConfigError, match=words):
