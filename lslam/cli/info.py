@@ -75,6 +75,9 @@ def _size(count: int) -> str:
     help="Register no scans: the IMU's clock and axes, and the order of the points, are not checked.",
 )
 @click.option(
+    "--cameras", "with_cameras", is_flag=True, help="Compare edges of the images with edges of depth: pixels and time."
+)
+@click.option(
     "--imu-toml",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
@@ -90,6 +93,7 @@ def command(
     rows: int | None,
     cols: int | None,
     quick: bool,
+    with_cameras: bool,
     imu_toml: Path | None,
     as_json: bool,
     **given: Any,
@@ -111,7 +115,7 @@ def command(
         raise
     from lslam.pipeline.doctor.inspect import inspect
 
-    facts = inspect(opened, None if all_scans else scans, quick)
+    facts = inspect(opened, None if all_scans else scans, quick, with_cameras)
     if imu_toml is not None:
         _write_noise(imu_toml, facts)
     if as_json:
@@ -203,6 +207,10 @@ def _lines(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if facts["imu"]:
         yield "IMU noise", _noise(facts["imu"]["noise"])
         yield "IMU and scans turn", _turns(facts["imu"]["turns"])
+    for camera in facts.get("cameras", ()):
+        from lslam.pipeline.doctor.examine_cameras import sentence_of
+
+        yield "camera", sentence_of(camera)
     yield "GNSS", _gnss(facts["gnss"])
     yield "ground truth", _ground_truth(facts["ground_truth"])
 

@@ -28,6 +28,7 @@ _OTHERS = (
     "attributes",
     "crop",
     "clean",
+    "colour",
     "occupancy",
     "denoise",
     "mesh",
@@ -144,6 +145,7 @@ Examples:
 )
 @click.option("--crop", metavar="BOX", help="Keep x_min,x_max,y_min,y_max[,z_min,z_max] of the world, m.")
 @click.option("--clean", is_flag=True, help="Remove moving objects, such as cars and people.")
+@click.option("--colour", is_flag=True, help="Colour the points by the images of the recording's cameras.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells too, and a floor plan.")
 @click.option("--denoise", is_flag=True, help="Remove points far from their neighbours (Open3D).")
 @click.option("--mesh", is_flag=True, help="Write a surface too, FILE_mesh.ply (Open3D).")
@@ -255,11 +257,14 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
     with heeded() as stop, progress("map", len(run.trajectory)) as advance:
         stop.is_gentle = True
         built = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, on_step=advance, should_stop=stop)
-    rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans"), *crispness_rows(built.crispness)]
+    rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans")]
     document: dict[str, Any] = {"file": str(built.path), "points": built.points, "scans": built.scans}
+    if built.colour is not None:
+        rows.append(("colour", str(built.colour)))
+        document["colour"] = asdict(built.colour)
     if built.crispness is not None:
         document["crispness"] = crispness_document(built.crispness)
-    _print(rows, document, given["as_json"])
+    _print([*rows, *crispness_rows(built.crispness)], document, given["as_json"])
 
 
 def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: dict[str, Any]) -> None:
@@ -300,7 +305,7 @@ def _settings(given: dict[str, Any]) -> list[str]:
         if suffix in ("ply", "pcd", "las", "laz")
         else None,
         "crop": None if given["crop"] is None else f"[{given['crop']}]",
-        **{name: "true" if given[name] else None for name in ("clean", "occupancy", "denoise", "mesh")},
+        **{name: "true" if given[name] else None for name in ("clean", "colour", "occupancy", "denoise", "mesh")},
     }
     return [
         *of_the_map(given["settings"]),

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 @click.option("--rings", metavar="RULE", help="How rings are found: auto, field, order, rows[:N], elevation[:N].")
 @click.option("--save-feature-map", is_flag=True, help="Write feature_map.ply; for the LOAM family.")
 @click.option("--clean", is_flag=True, help="Remove moving objects from the map.")
+@click.option("--colour", is_flag=True, help="Colour the map by the images of the recording's cameras.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
 @options.imu
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
@@ -198,6 +199,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         "input.rings": given["rings"],
         "map.write_features": "true" if given["save_feature_map"] else None,
         "map.clean": "true" if given["clean"] else None,
+        "map.colour": "true" if given["colour"] else None,
         "graph.refine": "true" if given["refine"] else None,
         "map.occupancy": "true" if given["occupancy"] else None,
         "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),

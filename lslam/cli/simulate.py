@@ -90,6 +90,7 @@ if TYPE_CHECKING:
 @click.option("--from", "shift", type=float, default=0.0, metavar="M", help="Begin so far along the line.")
 @click.option("--static-start", type=float, default=0.0, metavar="S", help="Stay at the start for S seconds first.")
 @click.option("--labels", "is_labelled", is_flag=True, help="Write the class of every point, as SemanticKITTI has it.")
+@click.option("--camera", "is_filmed", is_flag=True, help="Record a camera that looks ahead, one image a scan.")
 @click.option("--overwrite", is_flag=True, help="Replace sequences/00 and poses/00.txt in an existing folder.")
 @click.option("--resume", is_flag=True, help="Continue an interrupted simulation.")
 @click.option("--show", is_flag=True, help="Print SCENARIO with all its keys as TOML.")
@@ -118,6 +119,7 @@ def command(
     shift: float,
     static_start: float,
     is_labelled: bool,
+    is_filmed: bool,
     overwrite: bool,
     resume: bool,
     show: bool,
@@ -179,7 +181,7 @@ def command(
     if plan is not None:
         written.append(_draw(drive, plan))
     if out is not None:
-        written.append(_record(drive, out, overwrite, resume, is_labelled))
+        written.append(_record(drive, out, overwrite, resume, is_labelled, is_filmed))
     _print(written, as_json)
 
 
@@ -238,18 +240,25 @@ def _write_plan(path: Path, plan: ScenePlan) -> Written:
     return Written(text, {"plan": str(path), "plan_size_m": [float(width), float(depth)]})
 
 
-def _record(drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool, is_labelled: bool) -> Written:
+def _record(
+    drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool, is_labelled: bool, is_filmed: bool
+) -> Written:
     from lslam.core.stopping import heeded
     from lslam.simulation.record import record
 
-    with heeded() as stop, console.progress("simulating", len(drive)) as advance:
+    with heeded() as stop, console.progress("simulating", len(drive) * (1 + is_filmed)) as advance:
 
         def on_scan(index: int) -> None:
             advance()
             stop.is_gentle = index + 1 < len(drive)  # a started scan is completed, so that --resume finds whole scans
             stop.check()
 
-        done = record(drive, out, overwrite, on_scan, resume, shlex.join(["lslam", *sys.argv[1:]]), is_labelled)
+        def on_image(index: int) -> None:
+            advance()
+            stop.check()
+
+        command = shlex.join(["lslam", *sys.argv[1:]])
+        done = record(drive, out, overwrite, on_scan, resume, command, is_labelled, on_image if is_filmed else None)
     assert drive.ground_truth is not None
     length = float(drive.ground_truth.path_lengths[-1])
     return Written(

@@ -17,6 +17,7 @@ from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry import se3
 from lslam.core.stopping import asking
+from lslam.core.types.camera import cameras_of
 from lslam.core.types.constraint import Manual
 from lslam.core.types.scan import Span
 from lslam.core.types.sequence import Sequence, select
@@ -86,6 +87,8 @@ def prepare(
         sequence = open_sequence(sequence)
     sequence = with_streams(sequence, config.imu.use, config.gnss.mode != "off")
     require_gnss(sequence, config.gnss)
+    if config.map.colour and config.map.write:
+        cameras_of(sequence)
     truth = sequence.ground_truth if truth is None else truth
     if truth is not None:
         # Before the odometry and not after it.

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +24,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.warned import Warnings
 from lslam.core.version import __version__
+from lslam.maps.colour import ColourCounts
 from lslam.reports.facts import describe
 
 SCHEMA = 1
@@ -69,6 +71,7 @@ class Manifest:
         self.integrity: dict[str, int] = {}
         self.segments: list[dict[str, Any]] = []
         self.map_points: int | None = None
+        self.map_colour: ColourCounts | None = None
         self.imu: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
         self.graph: dict[str, Any] = {}
@@ -192,6 +195,7 @@ class Manifest:
             **({"georeference": dict(self.georeference)} if self.georeference else {}),
             **({"localization": dict(self.localization)} if self.localization else {}),
             **({"map_points": self.map_points} if self.map_points is not None else {}),
+            **({"map_colour": asdict(self.map_colour)} if self.map_colour is not None else {}),
             "timings": {name: round(seconds, 3) for name, seconds in self.timings.items()},
             "peak_memory_mb": peak_memory_mb(),
             "started": self.started.isoformat(timespec="seconds"),

@@ -25,6 +25,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.state import State
 from lslam.maps.clean import Cleaner, PosedScan
+from lslam.maps.colour import ColourCounts
 from lslam.maps.every_point import PointCollector
 from lslam.maps.floor_plan import TopView, top_view
 from lslam.maps.merge import MapMerger
@@ -50,7 +51,8 @@ INTERRUPTED = "interrupted while the map was built: nothing of it is written"
 class BuiltMap:
     """Result of building a map: the merged map, its top view, and a sample of its points for pages.
 
-    Also the processing steps, in words, the occupancy if requested, and the meaning of each attribute of its points.
+    Also the processing steps, in words, the occupancy if requested, the numbers of a coloured map, and the meaning of each
+    attribute of its points.
     """
 
     merged: Cloud
@@ -58,6 +60,7 @@ class BuiltMap:
     sample: ArrayCloud
     done: tuple[str, ...] = ()
     occupancy: OccupancyGrid | None = None
+    colour: ColourCounts | None = None
     attributes: Mapping[str, str] = field(default_factory=dict)
 
 

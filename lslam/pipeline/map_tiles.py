@@ -27,8 +27,9 @@ from lslam.core.version import __version__
 from lslam.io.formats.copc_files import SUFFIX as COPC
 from lslam.io.formats.point_files import read_cloud, write_cloud
 from lslam.maps.georeference import ProjectedCloud, Projection
+from lslam.pipeline.colour_pass import build_finished_map
 from lslam.pipeline.map_files import MapNote, georeference_note, read_json, write_json
-from lslam.pipeline.map_pass import INTERRUPTED, build_map
+from lslam.pipeline.map_pass import INTERRUPTED
 from lslam.pipeline.rebuild import EarlierRun, place_of, results_of
 from lslam.pipeline.run_folder import SPOOL
 from lslam.pipeline.tile_index import VPC, vpc_item, write_vpc
@@ -53,7 +54,7 @@ def rebuild_in_tiles(
     Raises as `rebuild` does.
     """
     georeference = place_of(run, crs)
-    built = build_map(sequence, results_of(run), run.config, on_step, should_stop, folder)
+    built = build_finished_map(sequence, results_of(run), run.config, on_step, should_stop, folder)
     if should_stop():
         raise InterruptedRunError(INTERRUPTED)
     note = MapNote.of(sequence.name, run.config.map, built, run.world)

@@ -13,7 +13,7 @@ import numpy as np
 
 from lslam.backend.graph.factors import well_conditioned
 from lslam.core.config import Config
-from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError
+from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError, UsageError
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
@@ -70,8 +70,10 @@ def merge_into(
 ) -> dict[str, Any]:
     """Merge runs into the folder `out`. Returns its manifest.
 
-    Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`.
+    Raises as `merge_runs`, OutputExistsError and OutputError as `RunFolder`, UsageError for a map that shall be coloured.
     """
+    if config.map.colour:
+        raise UsageError("map.colour: merged maps have no colours; those of their runs have, by lslam map RUN --colour")
     folders = expanded(folders)
     with RunFolder(out, overwrite or resume, resume) as folder:
         manifest: dict[str, Any] = {"schema": SCHEMA, "kind": "merge", "lslam": __version__, "command": command}

@@ -17,7 +17,7 @@ from lslam.backend.loops import find_loops
 from lslam.core.config import Config
 from lslam.core.kernels import jit
 from lslam.core.machine import available_cores
-from lslam.maps import crispness, merge
+from lslam.maps import colour, crispness, merge
 from lslam.odometry.frontend import inertial_start
 from lslam.osm import wall_match
 from lslam.registration import optimiser
@@ -59,6 +59,7 @@ KERNELS = {
     ),
     "walls": Kernels(lambda config: bool(config.osm.extract), lambda config: wall_match.warm_up()),
     "map": Kernels(lambda config: config.map.write, _of_map, _of_map),
+    "colours": Kernels(lambda config: config.map.write and config.map.colour, lambda config: colour.warm_up()),
     "imu": Kernels(lambda config: config.imu.use, lambda config: inertial_start.warm_up(), is_of_scans=True),
 }
 

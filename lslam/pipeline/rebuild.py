@@ -39,9 +39,11 @@ from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
 from lslam.io.readers.labels import with_labels
 from lslam.io.remote import as_path
+from lslam.maps.colour import ColourCounts
 from lslam.maps.crispness import crispness
 from lslam.maps.georeference import in_crs
 from lslam.maps.mesh import require_open3d
+from lslam.pipeline.colour_pass import build_finished_map
 from lslam.pipeline.map_attributes import KEY, needs_labels
 from lslam.pipeline.map_files import (
     drop_note,
@@ -55,7 +57,7 @@ from lslam.pipeline.map_files import (
     write_built,
     write_json,
 )
-from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, build_map
+from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.registration.preprocessing.sweep_clock import SweepClock
 from lslam.registration.preprocessing.views import Clocked, WithoutClasses
@@ -104,6 +106,7 @@ class RebuiltMap:
     points: int
     scans: int
     crispness: Crispness | None
+    colour: ColourCounts | None = None
 
 
 def read_run(folder: Path, settings: Iterable[str] = ()) -> EarlierRun:
@@ -213,7 +216,7 @@ def rebuild(
     georeference = place_of(run, crs)
     is_own = path.stem == "map" and path.resolve().parent == run.folder.resolve()
     with held(run.folder) if is_own else nullcontext():
-        built = build_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
+        built = build_finished_map(sequence, results_of(run), run.config, on_step, should_stop, path.parent)
         if should_stop():
             raise InterruptedRunError(INTERRUPTED)
         score = crispness(built.merged) if run.config.map.voxel else None
@@ -225,7 +228,7 @@ def rebuild(
                 write_renewed(stage, run.folder, _record(run, built, path.name, score))
             _publish(stage, path)
     log.info("%d points in %s", len(built.merged), path)
-    return RebuiltMap(path, len(built.merged), sum(s == "ok" for s in run.statuses), score)
+    return RebuiltMap(path, len(built.merged), sum(s == "ok" for s in run.statuses), score, built.colour)
 
 
 def check_output(path: Path, overwrite: bool) -> None:

@@ -32,11 +32,12 @@ from lslam.odometry.base import FeatureSource
 from lslam.osm.corrections import write_buildings
 from lslam.pipeline import outputs
 from lslam.pipeline.back_end_pass import describe, level_world, optimise_poses, write_back_end
+from lslam.pipeline.colour_pass import build_finished_map
 from lslam.pipeline.feature_map_pass import build_feature_map, view_features
 from lslam.pipeline.job import PreparedRun, fit_to_scene, stoppable
 from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.map_pass import build_map, map_checkpoints
+from lslam.pipeline.map_pass import map_checkpoints
 from lslam.pipeline.odometry_pass import odometry_checkpoints
 from lslam.pipeline.refine_pass import refine_poses
 from lslam.pipeline.resume import may_go_on, run_identity
@@ -95,7 +96,7 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
         return
     watch.on_start("map", len(record.results))
     with manifest.timed("map_s"), stoppable(job, "interrupted while the map was written"):
-        built = build_map(
+        built = build_finished_map(
             job.sequence,
             record.results,
             config,
@@ -110,7 +111,7 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
         record.map_image, record.map_heights = built.view.image, built.view.heights
         record.map_extent = built.view.extent
         record.crispness = score
-        manifest.map_points = len(built.merged)
+        manifest.map_points, manifest.map_colour = len(built.merged), built.colour
 
 
 def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:

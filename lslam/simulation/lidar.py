@@ -142,7 +142,7 @@ def trace(
     column, ring = np.divmod(np.arange(model.rays), model.rings)
     since = column * (period / model.columns) + model.firing[ring] if moving else np.zeros(model.rays)
     rays = _into_city(model, true, poses, period, stamp_ns / 1e9 + since)
-    meeting = _Meeting(scene, bodies, stamp_ns / 1e9, None if returns is None else returns.extinction, extra)
+    meeting = Meeting(scene, bodies, stamp_ns / 1e9, None if returns is None else returns.extinction, extra)
     hits = meeting.meet(rays, model.rings)
     lucky = rng.random(model.rays) < glass if glass > 0 else np.zeros(0, np.bool_)
     if len(lucky) or (returns is not None and returns.mirror > 0):
@@ -161,7 +161,7 @@ def trace(
 
 
 @dataclass(frozen=True)
-class _Meeting:
+class Meeting:
     """Objects that the rays of a scan may hit: static ones, those that move about `stamp`, s, and leaves of some `extinction`."""
 
     scene: RayScene
@@ -280,7 +280,7 @@ def _wrap_angle(angle: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi)), np.float32)
 
 
-def _leave_panes(meeting: _Meeting, rays: Rays, hits: Hits, lucky: Bools, returns: Returns | None) -> None:
+def _leave_panes(meeting: Meeting, rays: Rays, hits: Hits, lucky: Bools, returns: Returns | None) -> None:
     """Mirror some of the rays that hit panes, and let the `lucky` of the others pass.
 
     A mirrored ray measures a point behind the pane. A passing ray hits the next object; a second pane stops it.

@@ -36,6 +36,8 @@ from lslam.io.formats.kitti_layout import (
 from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo, write_sequence_toml
 from lslam.io.formats.trajectory_files import write_kitti
 from lslam.simulation import NUMBER, check_target, part_of
+from lslam.simulation.camera import NAME as CAMERA
+from lslam.simulation.camera import SimulatedCamera, write_images
 from lslam.simulation.osm_city import OsmCity
 from lslam.simulation.osm_extract import write_extracts
 from lslam.simulation.scenarios import SimulatedDrive
@@ -225,12 +227,14 @@ def record(
     resume: bool = False,
     command: str = "",
     is_labelled: bool = False,
+    on_image: Callable[[int], None] | None = None,
 ) -> Recorded:
     """Trace all scans of `drive` and write `out`/sequences/00 and `out`/poses/00.txt.
 
     The poses are of camera 0, as KITTI's; everything else in `out` is left alone. `on_scan` is called after each scan. What
     is interrupted keeps its scans in `sequences/00.part`, and `resume` goes on there with the same bytes. Last comes the
-    sequence's `manifest.json`, with `command`, what was typed. `is_labelled` adds the class of every point.
+    sequence's `manifest.json`, with `command`, what was typed. `is_labelled` adds the class of every point; `on_image` the images
+    of a camera, and is called after each.
 
     Raises
     ------
@@ -253,7 +257,11 @@ def record(
         _check_space(out, part, drive)
         write_mark(part, drive)
         points = write_scans(drive, part, on_scan, is_labelled)
-        _write_sides(drive, part)
+        camera = None if on_image is None else SimulatedCamera(drive)
+        if camera is not None and on_image is not None:
+            for k in write_images(camera, part):
+                on_image(k)
+        _write_sides(drive, part, camera)
         truth, T_cam0_lidar = drive.ground_truth, drive.calibration.T_cam0_lidar
         assert truth is not None
         assert T_cam0_lidar is not None
@@ -306,16 +314,16 @@ def _keep_what_is_worth_it(out: Path, part: Path) -> None:
             folder.rmdir()
 
 
-def _write_sides(drive: SimulatedDrive, folder: Path) -> None:
-    """Write all files beside the scans."""
-    _write_texts(drive, folder)
+def _write_sides(drive: SimulatedDrive, folder: Path, camera: SimulatedCamera | None) -> None:
+    """Write all files beside the scans and images."""
+    _write_texts(drive, folder, camera)
     write_readings(folder, drive.readings)
     if drive.city.footprints:
         write_extracts(folder, drive.city, drive.readings.origin, np.random.default_rng([drive.seed, _MAP_SEED]))
     write_truth(folder / TRUTH, drive.vehicle, drive.stamps_ns, drive.end, drive.readings)
 
 
-def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
+def _write_texts(drive: SimulatedDrive, folder: Path, camera: SimulatedCamera | None) -> None:
     """Write times.txt, calib.txt and sequence.toml, for further LiDARs in their folders."""
     info = replace(
         _info(drive),
@@ -326,6 +334,7 @@ def _write_texts(drive: SimulatedDrive, folder: Path) -> None:
         T_lidar_imu=drive.calibration.T_lidar_imu,
         T_lidar_gnss=drive.calibration.T_lidar_gnss,
         lidars={mount.name: mount.T_lidar_other for mount in drive.scenario.lidars} or None,
+        cameras=None if camera is None else {CAMERA: camera.info},
     )
     for lidar, place in lidars_of(drive, folder):
         T_cam0_lidar = lidar.calibration.T_cam0_lidar

@@ -14,8 +14,10 @@ from scipy.spatial import cKDTree
 from lslam.core.errors import InputError, LslamError, OutputError, OutputExistsError
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.gnss import Georeference
+from lslam.io.formats.ply_files import ply_columns
 from lslam.io.formats.point_files import read_cloud
-from lslam.maps.georeference import Projection
+from lslam.maps.colour import ColouredCloud
+from lslam.maps.georeference import ProjectedCloud, Projection
 from lslam.pipeline import map_tiles
 from lslam.pipeline.map_files import MapNote
 from lslam.pipeline.map_tiles import check_tiles, is_tiles, read_tiles, write_tiles
@@ -39,6 +41,24 @@ def test_each_point_lies_in_its_tile_and_in_no_other(suffix: str, tmp_path: Path
     away, nearest = cKDTree(POINTS).query(whole.points)
     assert away.max() < 0.002
     assert sorted(nearest.tolist()) == list(range(5000))
+
+
+def test_tiles_keep_the_colours_of_their_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_tiles, "BUFFERED", 1000)
+    colours = np.random.default_rng(5).integers(0, 256, (5000, 3)).astype(np.uint8)
+    index = write_tiles(tmp_path, ColouredCloud(CLOUD, colours), NOTE, 25.0, "ply")
+    for tile in index["tiles"]:
+        columns = ply_columns(tmp_path / tile["file"])
+        _, nearest = cKDTree(POINTS).query(np.stack([columns[axis] for axis in "xyz"], axis=1))
+        assert (np.stack([columns[c] for c in ("red", "green", "blue")], axis=1) == colours[nearest]).all()
+
+
+def test_projected_points_keep_their_colours() -> None:
+    colours = np.random.default_rng(5).integers(0, 256, (5000, 3)).astype(np.uint8)
+    projection = Projection(Georeference(np.array([49.0, 8.4, 100.0]), np.eye(4)))
+    blocks = list(ProjectedCloud(ColouredCloud(CLOUD, colours), projection).blocks())
+    found = np.concatenate([np.stack([block.columns[c] for c in ("red", "green", "blue")], axis=1) for block in blocks])
+    assert (found == colours).all()
 
 
 def test_few_points_in_memory_give_the_same_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

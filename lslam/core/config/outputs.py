@@ -46,6 +46,7 @@ class MapConfig(Section):
     range_min: float = Field(2.0, ge=0, description="m; nearer points are left out")
     range_max: float = Field(80.0, gt=0, description="m; farther points are left out")
     clean: bool = Field(False, description="take out what moves: points that other scans see through")
+    colour: bool = Field(False, description="take the colours of the points from the images of the recording's cameras")
     occupancy: bool = Field(
         False,
         description="write occupancy.npz and .ply, cells that beams ended in or passed, and floor_plan.png and .yaml",
@@ -70,8 +71,8 @@ class MapConfig(Section):
         self.require_order("range_min", "occupancy_range")
         if 0 < self.voxel < FINEST_M:
             raise ValueError(f"voxel = {self.voxel:g} must be {FINEST_M:g} m or more, or 0 for every point")
-        if self.voxel == 0 and (self.mesh or self.denoise):
-            raise ValueError("voxel = 0 keeps every point, and mesh and denoise need voxels: set one")
+        if self.voxel == 0 and (self.mesh or self.denoise or self.colour):
+            raise ValueError("voxel = 0 keeps every point, and mesh, denoise and colour need voxels: set one")
         require_box("ego_box", self.ego_box)
         if self.crop is not None and len(self.crop) not in (4, 6):
             raise ValueError(f"crop = {list(self.crop)} must be x_min, x_max, y_min, y_max and perhaps z_min, z_max")

@@ -45,6 +45,18 @@ def read_rectification(path: str | Path) -> Floats | None:
     return _rigid(_entry(path, entries, "R_rect_00", 9).reshape(3, 3), np.zeros(3), path, "R_rect_00")
 
 
+def read_projection(path: str | Path, key: str) -> Floats:
+    """(3, 4) projection `P2` of an odometry `calib.txt`, `P_rect_02` of a raw day: rectified camera 0, m, to pixels.
+
+    Raises InputError without it, and where it is none.
+    """
+    path = as_path(path)
+    P = _entry(path, read_entries(path), key, 12).reshape(3, 4)
+    if not (P[0, 0] > 0 and P[1, 1] > 0 and np.allclose(P[2, :3], [0, 0, 1]) and abs(np.linalg.det(P[:, :3])) > 0):
+        raise InputError(f"calibration {path}: {key} is no projection of a rectified camera")
+    return P
+
+
 def read_raw_cam0_lidar(folder: str | Path) -> Floats:
     """`T_cam0_lidar` (4, 4) of a raw day, in the rectified camera 0 when `calib_cam_to_cam.txt` is there."""
     T = read_rigid(as_path(folder) / "calib_velo_to_cam.txt")

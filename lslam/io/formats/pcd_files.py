@@ -6,6 +6,7 @@ import io
 import math
 import re
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -67,6 +68,15 @@ def pcd_header(count: int, kind: np.dtype[Any]) -> bytes:
         f"VERSION 0.7\nFIELDS {' '.join(names)}\nSIZE {sizes}\nTYPE {types}\n"
         f"COUNT {' '.join('1' for _ in names)}\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
     ).encode()
+
+
+def packed_colour(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Columns with red, green and blue as the one field `rgb` of the Point Cloud Library: three bytes within a float32."""
+    if not {"red", "green", "blue"} <= set(columns):
+        return dict(columns)
+    red, green, blue = (columns[name].astype(np.uint32) for name in ("red", "green", "blue"))
+    others = {name: values for name, values in columns.items() if name not in ("red", "green", "blue")}
+    return {"rgb": ((red << 16) | (green << 8) | blue).view(np.float32), **others}
 
 
 def _read_header(path: Path, data: bytes) -> _Header:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError, UsageError, input_errors
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock
+from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.las_files import read_las, write_las
-from lslam.io.formats.pcd_files import pcd_columns, pcd_header
+from lslam.io.formats.pcd_files import packed_colour, pcd_columns, pcd_header
 from lslam.io.formats.ply_files import ply_columns, ply_header
 from lslam.io.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
 from lslam.io.formats.point_records import KITTI, WAY_OUT, PointRecord, name_columns, recognise
@@ -193,25 +193,29 @@ def write_cloud(path: Path, cloud: Cloud, *, comment: str = "", wkt: str = "") -
         return
     if suffix not in MAP_SUFFIXES:
         raise UsageError(f"{path}: no map file lslam writes; known suffixes: {', '.join(MAP_SUFFIXES)}")
-    kind = _record_type(cloud)
+    is_ply = suffix == ".ply"
+    packed = dict if is_ply else packed_colour
+    kind = _record_type(cloud, packed)
     with atomic_write(path) as stream:
-        stream.write(ply_header(len(cloud), kind, comment) if suffix == ".ply" else pcd_header(len(cloud), kind))
+        stream.write(ply_header(len(cloud), kind, comment) if is_ply else pcd_header(len(cloud), kind))
         for block in cloud.blocks():
-            stream.write(_records(block, kind).tobytes())
+            stream.write(_records(block, kind, packed).tobytes())
 
 
-def _record_type(cloud: Cloud) -> np.dtype[Any]:
-    """Record of a point in PLY and PCD, packed; times are seconds, since neither has integers of 64 bits."""
+def _record_type(cloud: Cloud, packed: Callable[[Columns], Columns]) -> np.dtype[Any]:
+    """Record of a point in PLY and PCD, its columns packed; times are seconds, since neither has integers of 64 bits."""
     names = [*AXES, "intensity"] if cloud.has_intensity else AXES
-    columns = [
-        ("time", "<f8") if name == TIME_NS else (name, kind.newbyteorder("<"))
-        for name, kind in cloud.column_types.items()
+    columns = packed({name: np.empty(0, kind) for name, kind in cloud.column_types.items()})
+    further = [
+        ("time", "<f8") if name == TIME_NS else (name, values.dtype.newbyteorder("<"))
+        for name, values in columns.items()
     ]
-    return np.dtype([*((name, "<f4") for name in names), *columns])
+    return np.dtype([*((name, "<f4") for name in names), *further])
 
 
-def _records(block: CloudBlock, kind: np.dtype[Any]) -> NDArray[Any]:
-    values = {**dict(zip(AXES, block.points.T, strict=True)), "intensity": block.intensity, **block.columns}
+def _records(block: CloudBlock, kind: np.dtype[Any], packed: Callable[[Columns], Columns]) -> NDArray[Any]:
+    columns = packed(block.columns)
+    values = {**dict(zip(AXES, block.points.T, strict=True)), "intensity": block.intensity, **columns}
     if TIME_NS in values:
         values["time"] = 1e-9 * block.columns[TIME_NS]
     table = np.empty(len(block), kind)

@@ -16,6 +16,7 @@ from lslam.core.geometry import so3
 from lslam.core.printable import toml_text
 from lslam.core.untrusted import parse_toml
 from lslam.io.formats.atomic import write_text
+from lslam.io.formats.camera_info import CameraInfo, camera_of
 from lslam.io.formats.point_records import parse_record
 
 FILE_NAME = "sequence.toml"
@@ -89,6 +90,7 @@ class SequenceInfo:
     T_cam0_lidar, T_lidar_imu, T_lidar_gnss : (4, 4) extrinsics, written in the table `[extrinsics]`
     lidars : further LiDARs and where they sit, T_lidar_other (4, 4) by folder, or by frame or topic of a bag
     frames : further frames of the robot, T_lidar_frame (4, 4) by name
+    cameras : by name
     """
 
     name: str | None = _text("text")
@@ -124,6 +126,7 @@ class SequenceInfo:
     T_lidar_gnss: Matrix | None = None
     lidars: Mapping[str, Matrix] | None = None
     frames: Mapping[str, Matrix] | None = None
+    cameras: Mapping[str, CameraInfo] | None = None
 
     def over(self, other: SequenceInfo) -> SequenceInfo:
         """Merge with `other`: its values are taken where this has none."""
@@ -160,6 +163,8 @@ def parse_sequence_toml(text: str, path: Path | str) -> SequenceInfo:
     for key in ("lidars", "frames"):
         if tables[key]:
             values[key] = {name: _transform(path, f"{key}.{name}", T) for name, T in tables[key].items()}
+    if tables["cameras"]:
+        values["cameras"] = {name: camera_of(path, name, T, _transform) for name, T in tables["cameras"].items()}
     if (values.get("rows") is None) != (values.get("cols") is None):
         raise InputError(f"{path}: rows and cols of organised clouds go together, one of them is missing")
     return SequenceInfo(**values)
@@ -182,6 +187,7 @@ def sequence_toml_text(info: SequenceInfo) -> str:
     for key, matrices in tables.items():
         rows = {name: np.asarray(T, np.float64).tolist() for name, T in matrices.items() if T is not None}
         tree[key] = rows or None
+    tree["cameras"] = {name: camera.tree() for name, camera in (info.cameras or {}).items()} or None
     return toml_text({key: value for key, value in tree.items() if value is not None})
 
 
@@ -191,6 +197,7 @@ _TABLES = {
     "extrinsics": "T_lidar_imu = [...]",
     "lidars": '"FOLDER" = [T_lidar_other, 12 numbers]',
     "frames": "base_link = [T_lidar_base_link, 12 numbers]",
+    "cameras": '[cameras.front] with images = "FOLDER"',
 }
 
 

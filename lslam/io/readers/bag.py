@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from lslam.io.formats.bag_streams import Stream, chain, is_static, read_poses
 from lslam.io.formats.packet_messages import is_decoded
 from lslam.io.formats.point_cloud import TIME_NAMES, PointCloud
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo, parse_sequence_toml
+from lslam.io.readers.bag_cameras import bag_cameras
 from lslam.io.readers.bag_lidars import UNNAMED, Halves, Links, ScanIndex, choose_lidars, places_of, put_together
 from lslam.io.readers.bag_packets import open_packets
 from lslam.io.readers.bag_topics import (
@@ -174,6 +176,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> Sequence:
     links = Links(bag, voice)
     sequence.calibration, sequence.has_assumed_extrinsics = find_extrinsics(links, frame, imu, gnss, info, voice)
     sequence.ground_truth = find_truth(sequence, links, frame, voice)
+    sequence.open_cameras = partial(bag_cameras, bag, links, frame, sequence.ahead, info.cameras)
     if own is not None and own.imu is not None:
         if left_out := [t.name for t in bag.of_type("Imu")]:
             voice.notes.append(f"IMU from the sensor's packets: {', '.join(left_out)} left out; --imu-topic reads one")

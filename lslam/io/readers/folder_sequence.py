@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from lslam.io.formats.point_files import check_size, read_array, read_bytes, rea
 from lslam.io.formats.point_records import KITTI, PointRecord, name_columns, parse_record
 from lslam.io.formats.sequence_toml import LENGTHS, SequenceInfo
 from lslam.io.formats.state_files import DAMAGE, HEADERS
+from lslam.io.readers.cameras import folder_cameras
 from lslam.io.readers.ground_truth import Voice, load_poses
 from lslam.io.readers.listing import check_stamps
 from lslam.io.readers.point_clock import PointClock, open_clock, read_samples
@@ -160,6 +162,7 @@ class Folder:
                 "notes": self.voice.notes,
                 "problems": problems,
                 **parts,
+                **({"open_cameras": partial(folder_cameras, self.path, info.cameras)} if info.cameras else {}),
             }
         )
         return settle_unit(sequence)

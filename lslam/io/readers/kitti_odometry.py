@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 from lslam.core.errors import InputError
@@ -12,6 +13,7 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.calibration_files import read_odometry_calib
 from lslam.io.formats.point_records import KITTI
 from lslam.io.formats.sequence_toml import SequenceInfo
+from lslam.io.readers.cameras import kitti_cameras
 from lslam.io.readers.folder_sequence import Folder, FolderSequence
 from lslam.io.readers.ground_truth import find_ground_truth, to_lidar
 from lslam.io.readers.listing import DEFAULT_RATE_HZ, list_scans, load_stamps, nominal_stamps
@@ -64,6 +66,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
         correction_deg=vertical_correction(info, folder.files, record, voice.notes),
         sensor=info.sensor or (None if folder.has_toml or record != KITTI else "HDL-64E"),
         clock=folder.clock(stamps, rate) if has_times and not compensated else None,
+        open_cameras=partial(kitti_cameras, path, folder.files, stamps, calibration.T_cam0_lidar),
     )
 
 

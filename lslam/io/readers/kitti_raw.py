@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from lslam.io.formats.point_files import SUFFIXES
 from lslam.io.formats.sequence_toml import SequenceInfo
 from lslam.io.formats.time_columns import read_stamps
 from lslam.io.readers.bag_topics import GNSS, IMU, Companion, why_none
+from lslam.io.readers.cameras import kitti_raw_cameras
 from lslam.io.readers.folder_sequence import Folder, FolderSequence
 from lslam.io.readers.ground_truth import find_ground_truth, oxts_truth, to_lidar
 from lslam.io.readers.kitti_odometry import KIND as KITTI_ODOMETRY
@@ -126,6 +128,7 @@ def open_folder(path: Path, overrides: SequenceInfo, why: str) -> FolderSequence
         correction_deg=vertical_correction(info, folder.files, folder.record, voice.notes),
         sweep_s=sweep,
         sensor=info.sensor or (None if folder.has_toml else "HDL-64E"),
+        open_cameras=partial(kitti_raw_cameras, path),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from math import inf, isnan, log, nan
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.camera import Camera
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
@@ -43,6 +45,7 @@ class SequenceOnDisk(Scans):
     stated_times : what is stated about the times of points; has_assumed_extrinsics : nothing says where the IMU sits
     clock : how per-point times are read, None when there are none or they are not to be used
     unit_m : of coordinates, None where nobody states it
+    open_cameras : finds its cameras, which nobody pays for who does not ask
     """
 
     name: str
@@ -63,9 +66,14 @@ class SequenceOnDisk(Scans):
     has_assumed_extrinsics: bool = False
     clock: PointClock | None = None
     unit_m: float | None = None
+    open_cameras: Callable[[], list[Camera]] = list
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
+
+    def cameras(self) -> list[Camera]:
+        """Cameras of the recording. Raises InputError where one has no calibration, stamps or images."""
+        return self.open_cameras()
 
     @property
     def time_rule(self) -> TimeRule | None:

@@ -23,6 +23,7 @@ from lslam.io.readers.lookup import find_folder
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.integrity.directions import EMPTIED_SHARE, emptied, filled_directions
 from lslam.pipeline.doctor import Facts, Finding, plural
+from lslam.pipeline.doctor.examine_cameras import examine_cameras
 from lslam.pipeline.doctor.examine_imu import examine_imu
 from lslam.pipeline.doctor.examine_positions import examine_gaps, examine_gnss, examine_jumps
 from lslam.pipeline.doctor.examine_turns import examine_turns
@@ -100,12 +101,13 @@ _FOLLOWS = {
 }
 
 
-def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False) -> Facts:
+def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False, with_cameras: bool = False) -> Facts:
     """JSON-ready facts about `sequence`; point statistics come from `samples` scans spread evenly, all when None.
 
     `findings` are what is wrong: `code`, `what`, `way_out`; `problems` the same as sentences. Scans that cannot be read are
     among them. With `is_quick` no scan is registered, so the IMU's clock and axes are not compared with the scans, and
-    no clock of points without times is sought.
+    no clock of points without times is sought. With `with_cameras` cameras are checked against the scans, which are registered
+    for it; raises InputError where there is none.
     """
     findings = [Finding("recording", sentence) for sentence in sequence.problems]
     n = len(sequence)
@@ -133,6 +135,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
     turns = None if imu is None or is_quick or is_clock_wrong else examine_turns(sequence, findings)
     if turns is not None and not turns["is_judged"]:
         notes.append("IMU: the sensor hardly turns in the first scans, so its clock and axes could not be checked")
+    cameras = examine_cameras(clocked, findings) if with_cameras else None
     gnss = examine_gnss(sequence, findings)
     findings += [*examine_gaps(sequence), *examine_jumps(sequence.ground_truth)]
     bag: Bag | None = getattr(sequence, "bag", None)
@@ -156,6 +159,7 @@ def inspect(sequence: Sequence, samples: int | None = 50, is_quick: bool = False
             key: None if T is None else np.asarray(T).tolist() for key, T in sequence.calibration.extrinsics.items()
         },
         "imu": None if imu is None else {**imu, "turns": turns},
+        **({} if cameras is None else {"cameras": cameras}),
         "gnss": gnss,
         "ground_truth": _ground_truth(sequence.ground_truth, sequence.stamps_ns),
         "notes": notes,

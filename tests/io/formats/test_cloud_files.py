@@ -13,9 +13,12 @@ import numpy as np
 import pytest
 
 from lslam.core.errors import InputError, OutputError, UsageError
+from lslam.core.extras import importing_open3d
 from lslam.core.types import cloud as cloud_module
 from lslam.core.types.cloud import ArrayCloud, CloudBlock, bounds, in_memory
 from lslam.io.formats.las_files import read_las
+from lslam.io.formats.pcd_files import pcd_columns
+from lslam.io.formats.ply_files import ply_columns
 from lslam.io.formats.point_files import MAP_SUFFIXES, read_cloud, write_cloud
 
 
@@ -135,3 +138,36 @@ def test_clouds_of_blocks() -> None:
     assert [b.tolist() for b in bounds(Two())] == [[-1, 1, 1], [0, 5, 2]]
     assert np.isnan(bounds(ArrayCloud.of([]))[0]).all()
     assert len(in_memory(ArrayCloud.of([], []))) == 0
+
+
+def test_further_columns_are_written_in_every_format(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    colours = rng.integers(0, 256, (3, 500)).astype(np.uint8)
+    columns = {
+        "red": colours[0],
+        "green": colours[1],
+        "blue": colours[2],
+        "views": rng.integers(0, 9, 500).astype(np.uint16),
+    }
+    cloud = ArrayCloud(rng.uniform(-9, 9, (500, 3)), rng.random(500).astype(np.float32), columns)
+    for suffix in ("ply", "pcd", "las", "laz"):
+        write_cloud(tmp_path / f"a.{suffix}", cloud)
+        np.testing.assert_allclose(read_cloud(tmp_path / f"a.{suffix}").points, cloud.points, atol=0.001)
+    ply, pcd = ply_columns(tmp_path / "a.ply"), pcd_columns(tmp_path / "a.pcd")
+    assert list(ply) == ["x", "y", "z", "intensity", "red", "green", "blue", "views"]
+    for name, values in columns.items():
+        assert ply[name].dtype == values.dtype
+        assert (ply[name] == values).all()
+    # PCL: the bytes blue, green, red of a float32.
+    packed = np.ascontiguousarray(pcd["rgb"]).view(np.uint8).reshape(-1, 4)
+    assert (colours[::-1] == packed[:, :3].T).all()
+    assert (pcd["views"] == columns["views"]).all()
+    for suffix in ("las", "laz"):
+        las = laspy.read(tmp_path / f"a.{suffix}")
+        assert las.header.point_format.id == 7
+        assert (np.stack([las.red, las.green, las.blue]) == 257 * colours.astype(int)).all()
+    with importing_open3d():
+        import open3d
+    for suffix in ("ply", "pcd"):
+        seen = open3d.io.read_point_cloud(str(tmp_path / f"a.{suffix}"))
+        np.testing.assert_allclose(255 * np.asarray(seen.colors), colours.T, atol=1e-3)

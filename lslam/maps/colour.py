@@ -1,0 +1,217 @@
+"""Colours of a map's points from the images of cameras, with memory for a few images and none for the map."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import output_errors
+from lslam.core.geometry import portable
+from lslam.core.stopping import checking
+from lslam.core.types.arrays import Bools, Floats, Longs
+from lslam.core.types.camera import Image, Lens
+from lslam.core.types.cloud import BLOCK, ArrayCloud, Cloud, CloudBlock
+from lslam.maps.exposure import image_gains
+
+GREY = 128  # of points that no image shows
+CHANNELS = ("red", "green", "blue")
+VIEWS = 7  # kept of a point, of which the median is taken: odd, so that a majority decides
+# Points that are culled together, and those that images are compared by.
+_RUN, _COMPARED = 1 << 12, 1 << 16
+_NEIGHBOURHOOD, _FEWEST = 2.0, 5  # spacings about a point in which its plane lies, and points that make one
+
+
+@dataclass(frozen=True)
+class ColouredCloud:
+    """A cloud whose blocks have columns red, green and blue, uint8; satisfies `Cloud`.
+
+    colours : (M, 3) uint8, in the order of the cloud
+    """
+
+    cloud: Cloud
+    colours: NDArray[np.uint8]
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether the cloud has intensities."""
+        return self.cloud.has_intensity
+
+    @property
+    def column_types(self) -> Mapping[str, np.dtype[Any]]:
+        """Types of the columns of the cloud, and of its colours."""
+        return {**self.cloud.column_types, **dict.fromkeys(CHANNELS, np.dtype(np.uint8))}
+
+    def __len__(self) -> int:
+        return len(self.cloud)
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """The blocks of the cloud with their colours."""
+        at = 0
+        for block in self.cloud.blocks():
+            some = self.colours[at : at + len(block)]
+            at += len(block)
+            columns = {**block.columns, **{name: some[:, k] for k, name in enumerate(CHANNELS)}}
+            yield CloudBlock(block.points, block.intensity, columns)
+
+
+@dataclass(frozen=True)
+class ColourCounts:
+    """Numbers of a coloured map: its points, those that no image shows, images used, and images left out by reason."""
+
+    points: int
+    unseen: int
+    images: int
+    outside: int
+    unreadable: int
+
+    def __str__(self) -> str:
+        left_out = {"without a registered scan before and after": self.outside, "unreadable": self.unreadable}
+        more = "".join(f", {count} {why} left out" for why, count in left_out.items() if count)
+        seen = self.points - self.unseen
+        return f"{seen} of {self.points} points from {self.images} images{more}; {self.unseen} that none shows are grey"
+
+
+class MapColourer:
+    """Collects the colours of a map's points image by image.
+
+    Points and their views lie in temporary files, mapped into memory: 100 bytes a point.
+
+    Parameters
+    ----------
+    cloud : the map; spacing : of its points, m; reach : farthest from a camera, m
+    spool : folder beside which the files are made; None: the system's temporary one
+
+    Attributes
+    ----------
+    images : number of images so far; unseen : after `result`, points that none of them shows
+
+    Raises
+    ------
+    OutputError : the files cannot be written
+    """
+
+    def __init__(self, cloud: Cloud, spacing: float, reach: float, spool: Path | None = None) -> None:
+        self._cloud, self._spacing, self._reach, self._spool = cloud, spacing, reach, spool
+        self.images, self.unseen = 0, 0
+        count = len(cloud)
+        self._origin: Floats = np.zeros(3)
+        self._points = self._stored(np.float32, count, 3)
+        at = 0
+        for block in cloud.blocks():
+            if not at:
+                self._origin = np.floor(block.points[0])
+            self._points[at : at + len(block)] = block.points - self._origin
+            at += len(block)
+        first = np.arange(0, count, _RUN)
+        self._runs: Longs = np.stack([first, np.minimum(first + _RUN, count)], axis=1)
+        bounds = [(self._points[a:b].min(0), self._points[a:b].max(0)) for a, b in self._runs]
+        self._low, self._high = (np.array([pair[k] for pair in bounds]).reshape(-1, 3) for k in (0, 1))
+        self._normals = self._stored(np.int8, count, 3)
+        self._estimate_normals()
+        self._ranks = self._stored(np.float32, count, VIEWS)
+        self._views = self._stored(np.int32, count, VIEWS)
+        self._colours = self._stored(np.uint8, count, VIEWS, 3)
+
+    def add(
+        self, image: Image, lens: Lens, T_world_camera: Floats, others: Iterable[Floats] = (), weight: float = 1.0
+    ) -> int:
+        """Add an image (height, width, 3) by its pose (4, 4). Returns the number of points that it shows.
+
+        others : (N, 3) each, world, m: further points that are in the way, of what passes while the image is taken
+        weight : of the image among others, above 0: less for one that is blurred
+        """
+        from lslam.maps.kernels.views import collect, splat
+
+        R, centre = T_world_camera[:3, :3], T_world_camera[:3, 3] - self._origin
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R.T, -portable.product(R.T, centre[:, None])[:, 0]
+        runs = self._runs[self._in_view(lens, centre, R[:, 2])]
+        depth = np.full(image.shape[:2], np.inf, np.float32)
+        splat(self._points, runs, T, lens.parameters, self._spacing, self._reach, depth)
+        for points in others:
+            near = (points - self._origin).astype(np.float32)
+            splat(near, np.array([[0, len(near)]]), T, lens.parameters, self._spacing, self._reach, depth)
+        shown = collect(
+            self._points,
+            self._normals,
+            runs,
+            T,
+            lens.parameters,
+            self._spacing,
+            self._reach,
+            depth,
+            np.ascontiguousarray(image),
+            self.images,
+            weight,
+            self._ranks,
+            self._views,
+            self._colours,
+        )
+        self.images += 1
+        return int(shown)
+
+    def result(self) -> ColouredCloud:
+        """The map with the colours of all images, their exposures brought together; grey where there is none."""
+        from lslam.maps.kernels.views import medians
+
+        step = max(1, len(self._cloud) // _COMPARED)
+        some = slice(None, None, step)
+        gains = image_gains(self._views[some], self._colours[some], self._ranks[some] > 0, self.images)
+        out = self._stored(np.uint8, len(self._cloud), 3)
+        out[:] = GREY
+        self.unseen = int(medians(self._ranks, self._views, self._colours, gains, out))
+        return ColouredCloud(self._cloud, out)
+
+    def _in_view(self, lens: Lens, centre: Floats, axis: Floats) -> Bools:
+        """(R,) whether a run may have points within reach, and in front of a pinhole."""
+        nearest = np.clip(centre, self._low, self._high) - centre
+        within = (nearest**2).sum(1) <= self._reach**2
+        if lens.model == "fisheye":
+            return np.asarray(within)
+        farthest = np.where(axis > 0, self._high, self._low) - centre
+        return np.asarray(within & ((farthest * axis).sum(1) > 0))
+
+    def _estimate_normals(self) -> None:
+        """Normals of all points by their neighbourhoods, some runs at a time with those that their neighbours are in."""
+        from lslam.maps.kernels.crispness import cell_keys, normals
+
+        radius = _NEIGHBOURHOOD * self._spacing
+        for begin in checking(range(0, len(self._runs), BLOCK // _RUN)):
+            own = slice(begin, begin + BLOCK // _RUN)
+            low, high = self._low[own, None] - radius, self._high[own, None] + radius
+            near = ((low <= self._high) & (self._low <= high)).all(2).any(0)
+            points = np.concatenate([self._points[a:b] for a, b in self._runs[near]]).astype(np.float64)
+            corner = points.min(0)
+            keys = cell_keys(points, corner, radius)
+            order = np.argsort(keys, kind="stable")
+            a, b = self._runs[own][0, 0], self._runs[own][-1, 1]
+            queries = self._points[a:b].astype(np.float64)
+            units = normals(points[order], keys[order], queries, corner, radius, _FEWEST)
+            self._normals[a:b] = np.rint(127 * units)
+
+    def _stored(self, kind: type[Any], count: int, *shape: int) -> NDArray[Any]:
+        """Array (count, *shape) of zeros in a temporary file that goes with it; room on the disk is taken at once."""
+        row = np.dtype(kind).itemsize * int(np.prod(shape))
+        if not count:
+            return np.zeros((0, *shape), kind)
+        place = self._spool or tempfile.gettempdir()
+        with output_errors(place), tempfile.TemporaryFile(prefix=".lslam-map-", dir=self._spool) as file:
+            # A hole in a file would fail when it is filled, and end the process.
+            for start in range(0, count, BLOCK):
+                file.write(bytes(row * min(BLOCK, count - start)))
+            file.flush()
+            return np.asarray(np.memmap(file, kind, "r+", shape=(count, *shape)))
+
+
+def warm_up() -> None:
+    """Compile or load the kernels, so that a caller can do it under the compile lock."""
+    grid = np.stack(np.meshgrid(np.arange(3), np.arange(3), [5]), axis=-1).reshape(-1, 3) - [1, 1, 0]
+    colourer = MapColourer(ArrayCloud.of(grid), 1.0, 10.0)
+    colourer.add(np.zeros((8, 8, 3), np.uint8), Lens("pinhole", (8, 8), (8.0, 8.0, 3.5, 3.5)), np.eye(4))
+    colourer.result()

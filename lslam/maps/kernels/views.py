@@ -1,0 +1,175 @@
+"""Views of map points in images: a depth buffer of splats, the pixels of the points that are seen, and a few views kept of each.
+
+A point at range r stands for a square of the map's spacing s, which covers s / r radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.kernels.jit import inline, kernel
+from lslam.core.kernels.projection import project
+
+_MIX_A, _MIX_B = -4658895280553007687, -7723592293110705685  # of splitmix64, as int64
+
+
+@inline
+def _share(point: int, view: int) -> float:
+    """Number in (0, 1], evenly spread, which a point and a view always share."""
+    h = (point * 1000003 + view + 1) * -7046029254386353131
+    h = (h ^ ((h >> 30) & 0x3FFFFFFFF)) * _MIX_A
+    h = (h ^ ((h >> 27) & 0x1FFFFFFFFF)) * _MIX_B
+    h = h ^ ((h >> 31) & 0x1FFFFFFFF)
+    return (float((h >> 11) & 0x1FFFFFFFFFFFFF) + 1.0) / 9007199254740993.0
+
+
+@inline
+def _seen_from(
+    points: NDArray[np.float32], i: int, T: NDArray[np.float64], lens: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Pixel and range, m, of point i; NaN where the lens does not see it."""
+    px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+    x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
+    y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
+    z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+    u, v = project(x, y, z, lens)
+    return u, v, np.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def splat(
+    points: NDArray[np.float32],
+    runs: NDArray[np.int64],
+    T: NDArray[np.float64],
+    lens: NDArray[np.float64],
+    spacing: float,
+    reach: float,
+    depth: NDArray[np.float32],
+) -> None:
+    """Enter the points of `runs` (R, 2), begin and end, into the buffer of ranges `depth` (height, width), m.
+
+    T : (4, 4) camera from points; spacing, reach : m; farther points are left out
+    """
+    height, width = depth.shape
+    for r in range(len(runs)):
+        for i in range(runs[r, 0], runs[r, 1]):
+            u, v, far = _seen_from(points, i, T, lens)
+            # Within a spacing of its point the camera would see nothing else.
+            if not (far > spacing and far <= reach):
+                continue
+            half_u, half_v = 0.5 * spacing / far * lens[1], 0.5 * spacing / far * lens[2]
+            if not (u + half_u > -0.5 and v + half_v > -0.5 and u - half_u < width - 0.5 and v - half_v < height - 0.5):
+                continue
+            first_u, last_u = max(int(np.rint(u - half_u)), 0), min(int(np.rint(u + half_u)), width - 1)
+            first_v, last_v = max(int(np.rint(v - half_v)), 0), min(int(np.rint(v + half_v)), height - 1)
+            for row in range(first_v, last_v + 1):
+                for column in range(first_u, last_u + 1):
+                    if far < depth[row, column]:
+                        depth[row, column] = far
+
+
+@kernel
+def collect(
+    points: NDArray[np.float32],
+    normals: NDArray[np.int8],
+    runs: NDArray[np.int64],
+    T: NDArray[np.float64],
+    lens: NDArray[np.float64],
+    spacing: float,
+    reach: float,
+    depth: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    view: int,
+    weight: float,
+    ranks: NDArray[np.float32],
+    views: NDArray[np.int32],
+    colours: NDArray[np.uint8],
+) -> int:
+    """Enter the colour of every point that the image shows into the views kept of it. Returns the number of such points.
+
+    A point is seen if nothing lies before it by more than the map's depth resolution: its spacing, and on a slanted surface what
+    a neighbour whose splat covers the same pixel is nearer. Where the number of views exceeds the room, priority sampling
+    (Duffield et al. 2007) keeps each in proportion to the solid angle that the point's surface covers in it.
+
+    normals : (N, 3) in 127ths, 0 where unknown; depth : from `splat`; view : number of the image
+    ranks, views, colours : (N, K), (N, K) and (N, K, 3) of the views kept; rank 0 where there is none
+    """
+    height, width = depth.shape
+    count = 0
+    for r in range(len(runs)):
+        for i in range(runs[r, 0], runs[r, 1]):
+            u, v, far = _seen_from(points, i, T, lens)
+            if not (far > spacing and far <= reach):
+                continue
+            if not (u > -0.5 and v > -0.5 and u < width - 0.5 and v < height - 0.5):
+                continue
+            row, column = int(np.rint(v)), int(np.rint(u))
+            nx, ny, nz = normals[i, 0] / 127.0, normals[i, 1] / 127.0, normals[i, 2] / 127.0
+            cosine = 1.0
+            if nx * nx + ny * ny + nz * nz > 0.0:
+                # The camera's place in the frame of the points is -R^T t.
+                cx = points[i, 0] + T[0, 0] * T[0, 3] + T[1, 0] * T[1, 3] + T[2, 0] * T[2, 3]
+                cy = points[i, 1] + T[0, 1] * T[0, 3] + T[1, 1] * T[1, 3] + T[2, 1] * T[2, 3]
+                cz = points[i, 2] + T[0, 2] * T[0, 3] + T[1, 2] * T[1, 3] + T[2, 2] * T[2, 3]
+                cosine = min(abs(nx * cx + ny * cy + nz * cz) / far, 1.0)
+            pixels = cosine * lens[1] * lens[2] * (spacing / far) ** 2
+            if pixels < 1.0:
+                continue
+            tangent = np.sqrt(1.0 - cosine * cosine) / cosine
+            if far - depth[row, column] > spacing * (1.0 + 0.5 * np.sqrt(2.0) * tangent):
+                continue
+            count += 1
+            rank = weight * pixels / _share(i, view)
+            slot = 0
+            for k in range(1, ranks.shape[1]):
+                if ranks[i, k] < ranks[i, slot]:
+                    slot = k
+            if rank > ranks[i, slot]:
+                ranks[i, slot], views[i, slot] = rank, view
+                for c in range(3):
+                    colours[i, slot, c] = image[row, column, c]
+    return count
+
+
+@kernel
+def medians(
+    ranks: NDArray[np.float32],
+    views: NDArray[np.int32],
+    colours: NDArray[np.uint8],
+    gains: NDArray[np.float64],
+    out: NDArray[np.uint8],
+) -> int:
+    """Write the vector median (Astola et al. 1990) of the views of each point into `out` (N, 3); returns how many have none.
+
+    It is the view nearest to all others, and of two the one of higher rank: always a colour that a camera saw. Points without a
+    view keep what `out` holds.
+
+    gains : (V, 3) brightness of each image by channel, which is divided out
+    """
+    room = ranks.shape[1]
+    seen = np.empty((room, 3))
+    rank = np.empty(room)
+    unseen = 0
+    for i in range(len(ranks)):
+        n = 0
+        for k in range(room):
+            if ranks[i, k] > 0.0:
+                rank[n] = ranks[i, k]
+                for c in range(3):
+                    seen[n, c] = colours[i, k, c] / gains[views[i, k], c]
+                n += 1
+        if n == 0:
+            unseen += 1
+            continue
+        best, least = 0, np.inf
+        for k in range(n):
+            total = 0.0
+            for j in range(n):
+                for c in range(3):
+                    total += abs(seen[k, c] - seen[j, c])
+            if total < least or (total == least and rank[k] > rank[best]):
+                best, least = k, total
+        for c in range(3):
+            out[i, c] = np.uint8(min(max(np.rint(seen[best, c]), 0.0), 255.0))
+    return unseen
