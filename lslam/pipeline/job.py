@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.odometry.frontend.inertial_start import with_imu_settings
+from lslam.odometry.frontend.wheel_start import Wheels, begin_wheels
 from lslam.odometry.frontend.mounting import with_up
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.frontend.register_scans import sweep_of
@@ -71,6 +72,7 @@ class PreparedRun:
     store: KeyframeStore
     folder: RunFolder | None = None
     checkpoints: OdometryCheckpoints | None = None
+    wheels: Wheels = field(default_factory=Wheels)
 
     def kept(self, stage: str) -> Checkpoints | None:
         """Checkpoints of a later stage beside those of odometry."""
@@ -89,6 +91,7 @@ def prepare(
     require_gnss(sequence, config.gnss)
     if config.map.colour and config.map.write:
         cameras_of(sequence)
+    wheels = begin_wheels(sequence, config.wheels)
     truth = sequence.ground_truth if truth is None else truth
     if truth is not None:
         # Before the odometry and not after it.
@@ -106,7 +109,7 @@ def prepare(
     osm = open_osm(sequence, config)
     manual = read_manual(config, chosen)
     manifest, store = Manifest(command, chosen, config), KeyframeStore(deflate=config.keyframes.deflate)
-    return PreparedRun(chosen, odometry, config, truth, given, manifest, watch, osm, manual, store)
+    return PreparedRun(chosen, odometry, config, truth, given, manifest, watch, osm, manual, store, wheels=wheels)
 
 
 def is_open(config: Config, key: str) -> bool:

@@ -43,7 +43,7 @@ class Manifest:
     deskew : treatment of the motion within a scan, `describe_deskew`
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates begin and whether z is up
-    imu : use of the IMU, empty without `--imu`; keyframes : how many and how large
+    imu, wheels : use of them, empty without `--imu` and `--wheels`; keyframes : how many and how large
     graph, georeference : what the back end did and where on the Earth the world lies, empty where it did nothing
     refinement : how much thinner planes became by it, empty where none was asked for
     localization : how the drive was found in a map that exists and how many scans that holds, empty without one
@@ -73,6 +73,7 @@ class Manifest:
         self.map_points: int | None = None
         self.map_colour: ColourCounts | None = None
         self.imu: dict[str, Any] = {}
+        self.wheels: dict[str, Any] = {}
         self.keyframes: dict[str, Any] = {}
         self.graph: dict[str, Any] = {}
         self.refinement: dict[str, Any] = {}
@@ -184,6 +185,7 @@ class Manifest:
                 "both (N, 6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2",
             },
             **({"imu": dict(self.imu)} if self.imu else {}),
+            **({"wheels": dict(self.wheels)} if self.wheels else {}),
             "counts": dict(self.counts),
             **({"posed_by": dict(self.posed_by)} if self.posed_by else {}),
             **({"integrity": dict(self.integrity)} if self.integrity else {}),

@@ -34,6 +34,7 @@ from lslam.odometry.frontend.motion_models import copy_of
 from lslam.odometry.frontend.register_scans import estimate, is_diverged, to_trajectory
 from lslam.odometry.frontend.segments import Begin
 from lslam.odometry.frontend.tracker import Tracker
+from lslam.odometry.frontend.wheel_start import close_wheels
 from lslam.odometry.given import GivenPoses
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel
 from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
@@ -83,7 +84,9 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
 
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
     inertial = _begin_imu(job)
-    motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else inertial.motion
+    motion: MotionModel | None = job.wheels.motion or inertial.motion
+    if isinstance(job.odometry, GivenPoses):
+        motion = job.odometry.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
             sequence,
@@ -110,6 +113,9 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     if config.imu.use:
         manifest.imu = close_inertial(inertial, results)
         manifest.problems += inertial.problems
+    if job.wheels.motion is not None:
+        manifest.wheels = close_wheels(job.wheels)
+        manifest.problems += job.wheels.problems
     _report_faults(results, manifest)
     results = join_segments(results, store, config, manifest, watch.should_stop)
     manifest.keyframes = {"count": len(store), "bytes": store.size}
@@ -141,6 +147,8 @@ def _begin_segment(job: PreparedRun, inertial: Inertial) -> Begin | None:
 
     def begin(pose: Floats) -> Tracker:
         motion: MotionModel = ConstantVelocity(pose)
+        if job.wheels.motion is not None:
+            motion = job.wheels.motion.fresh(pose)
         if inertial.motion is not None and inertial.start is not None:
             motion = copy_of(inertial.motion, inertial.start, config)
         return Tracker(create_odometry(with_imu_settings(config)), _stationary(config), motion)

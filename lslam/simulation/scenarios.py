@@ -19,6 +19,7 @@ from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration, Scans
 from lslam.core.types.trajectory import Trajectory
+from lslam.core.types.wheels import WheelStream
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
 from lslam.simulation.imu import ImuModel, imu_named
@@ -30,7 +31,8 @@ from lslam.simulation.osm_place import read_extract
 from lslam.simulation.routes import FIRST_VISIT, Visit, WayPoints, read_way_points
 from lslam.simulation.scenario_files import Scenario, scenario_named
 from lslam.simulation.scene_mesh import RayScene
-from lslam.simulation.sensors import ORIGIN, GnssModel, Sensors, read_sensors
+from lslam.simulation.sensors import BASE, ORIGIN, GnssModel, Sensors, read_sensors
+from lslam.simulation.wheels import WheelModel
 
 FASTEST = 40.0  # m/s
 LONGEST_STAND = 600.0  # s
@@ -96,14 +98,16 @@ class SimulatedDrive(Scans):
         self.end = self.stamps_ns[-1] / 1e9 + 1 / self.rate_hz
         self.sensors = sensors or Sensors()
         self.readings = read_sensors(self.vehicle, self.sensors, scenario.carrier, self.end, self._seeds, origin)
-        imu, gnss = self.readings.imu, self.readings.gnss
+        imu, gnss, wheels = self.readings.imu, self.readings.gnss, self.readings.wheels
         self.calibration = Calibration(
             T_cam0_lidar=kitti_like_cam0(),
             T_lidar_imu=None if imu is None else imu.T_lidar_imu,
             T_lidar_gnss=None if gnss is None else gnss.T_lidar_gnss,
+            frames={} if wheels is None or wheels.stream.T_lidar_base is None else {BASE: wheels.stream.T_lidar_base},
         )
         self.imu: ImuStream | None = None if imu is None else imu.stream
         self.gnss: GnssStream | None = None if gnss is None else gnss.stream
+        self.wheels: WheelStream | None = None if wheels is None else wheels.stream
         self.notes: list[str] = []
         self.problems: list[str] = []
         self._shaking = shaking(scenario.vibration, np.random.default_rng([*self._seeds, _SHAKING_SEED]))
@@ -191,6 +195,7 @@ def simulate(
     origin: Iterable[float] | None = None,
     imu: str | ImuModel | None = None,
     gnss: GnssModel | None = None,
+    wheels: WheelModel | None = None,
     static_start: float = 0.0,
     visit: Visit = FIRST_VISIT,
 ) -> SimulatedDrive:
@@ -209,7 +214,7 @@ def simulate(
         without `way_points` the drive goes along its streets
     origin : lat, lon (deg) and perhaps height (m) of the city's x = y = 0 (default: the middle of the extract's buildings,
         else the first point of GeoJSON way-points, else a place of no meaning)
-    imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along
+    imu, gnss : an IMU (a name of `IMUS` or a model) and a receiver that ride along; wheels : of a car
     static_start : s of standing before the drive begins, 0: as the scenario has it; its scans come on top of a default `count`
     visit : another drive through the same town: other traffic and noise, another start, the opposite direction
 
@@ -232,7 +237,7 @@ def simulate(
     if not 0 <= static_start <= LONGEST_STAND:
         raise UsageError(f"--static-start {static_start:g} is out of range: 0 to {LONGEST_STAND:g} s")
     measuring = imu_named(imu) if isinstance(imu, str) else imu
-    sensors = Sensors(None if measuring is None else chosen.imu.of(measuring), gnss)
+    sensors = Sensors(None if measuring is None else chosen.imu.of(measuring), gnss, wheels)
     chosen = chosen.model_copy(update={"speed": cruise, "start_speed": begin})
     given = None if origin is None else checked_origin(origin)
     extract = None if osm is None else read_extract(osm, given)

@@ -14,10 +14,11 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
-from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv
+from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv, write_stamped_csv, write_wheels_csv
 from lslam.io.formats.trajectory_files import write_tum
 from lslam.simulation.imu import GRAVITY, T_CAR_IMU, T_OUSTER_IMU, ImuModel, SimulatedImu, simulate_imu
 from lslam.simulation.kinematics import Motion
+from lslam.simulation.wheels import T_CAR_BASE, SimulatedWheels, WheelModel, simulate_wheels
 
 # lat, lon (deg), height (m) of the city's origin unless a scenario has its own: open ground at Karlsruhe.
 ORIGIN = np.array([49.0, 8.4, 115.0])
@@ -27,9 +28,10 @@ ORIGIN = np.array([49.0, 8.4, 115.0])
 T_CAR_ANTENNA = se3.make(np.eye(3), np.array([-0.9, 0.0, -0.15]))
 T_DRONE_ANTENNA = se3.make(np.eye(3), np.array([-0.1, 0.0, 0.35]))
 T_WALKER_ANTENNA = se3.make(np.eye(3), np.array([-0.05, 0.0, 0.25]))
-IMU_FILE, GNSS_FILE, TRUTH = "imu.csv", "gnss.csv", "truth"
+IMU_FILE, GNSS_FILE, WHEELS_FILE, TRUTH = "imu.csv", "gnss.csv", "wheels.csv", "truth"
 TRUTH_HZ = 100
-_IMU_SEED, _GNSS_SEED = 2**32 - 11, 2**32 - 12  # of the generators; the scenarios count down from 2**32 - 1
+BASE = "base_link"
+_IMU_SEED, _GNSS_SEED, _WHEELS_SEED = 2**32 - 11, 2**32 - 12, 2**32 - 14  # of the generators; the scenarios count down from 2**32 - 1
 
 
 @dataclass(frozen=True)
@@ -124,15 +126,16 @@ def _errors(model: GnssModel, count: int, rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True)
 class Mounts:
-    """Mounting of sensors on a carrier, (4, 4) in the LiDAR frame."""
+    """Mounting of sensors on a carrier, (4, 4) in the LiDAR frame; T_lidar_base : of its wheels, None where it has none."""
 
     T_lidar_imu: Floats
     T_lidar_antenna: Floats
+    T_lidar_base: Floats | None = None
 
 
 # In a car's boot and on its roof; what flies or is carried is light and small: the IMU shares the LiDAR's board.
 MOUNTS = {
-    "car": Mounts(T_CAR_IMU, T_CAR_ANTENNA),
+    "car": Mounts(T_CAR_IMU, T_CAR_ANTENNA, T_CAR_BASE),
     "drone": Mounts(T_OUSTER_IMU, T_DRONE_ANTENNA),
     "walker": Mounts(T_OUSTER_IMU, T_WALKER_ANTENNA),
 }
@@ -144,6 +147,7 @@ class Sensors:
 
     imu: ImuModel | None = None
     gnss: GnssModel | None = None
+    wheels: WheelModel | None = None
 
     def __post_init__(self) -> None:
         if self.gnss is not None:
@@ -157,6 +161,7 @@ class Readings:
     imu: SimulatedImu | None
     gnss: SimulatedGnss | None
     origin: Floats
+    wheels: SimulatedWheels | None = None
 
 
 def read_sensors(
@@ -164,24 +169,29 @@ def read_sensors(
 ) -> Readings:
     """Simulate the readings of `sensors` from 0 to `end` s of `motion`, each with a generator of its own.
 
-    carrier : a key of `MOUNTS`, which says where they sit
+    carrier : a key of `MOUNTS`, which says where they sit; what flies or is carried has no wheels
     """
-    mounts, imu, gnss = MOUNTS[carrier], None, None
+    mounts, imu, gnss, wheels = MOUNTS[carrier], None, None, None
     if sensors.imu is not None:
         generator = np.random.default_rng([*seeds, _IMU_SEED])
         imu = simulate_imu(motion, sensors.imu, mounts.T_lidar_imu, end, generator)
     if sensors.gnss is not None:
         generator = np.random.default_rng([*seeds, _GNSS_SEED])
         gnss = simulate_gnss(motion, sensors.gnss, mounts.T_lidar_antenna, origin, end, generator)
-    return Readings(imu, gnss, np.asarray(origin, np.float64))
+    if sensors.wheels is not None and mounts.T_lidar_base is not None:
+        generator = np.random.default_rng([*seeds, _WHEELS_SEED])
+        wheels = simulate_wheels(motion, sensors.wheels, mounts.T_lidar_base, end, generator)
+    return Readings(imu, gnss, np.asarray(origin, np.float64), wheels)
 
 
 def write_readings(folder: Path, readings: Readings) -> None:
-    """Write `imu.csv` and `gnss.csv` of the sensors of the drive."""
+    """Write `imu.csv`, `gnss.csv` and `wheels.csv` of the sensors of the drive."""
     if readings.imu is not None:
         write_imu_csv(folder / IMU_FILE, readings.imu.stream)
     if readings.gnss is not None:
         write_gnss_csv(folder / GNSS_FILE, readings.gnss.stream)
+    if readings.wheels is not None:
+        write_wheels_csv(folder / WHEELS_FILE, readings.wheels.stream)
 
 
 def write_truth(folder: Path, motion: Motion, scan_stamps_ns: Longs, end: float, readings: Readings) -> None:

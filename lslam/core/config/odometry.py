@@ -1,4 +1,4 @@
-"""Sections of odometry: the method, registration and its recovery, features, and the IMU."""
+"""Sections of odometry: the method, registration and its recovery, features, the IMU and wheels."""
 
 from __future__ import annotations
 
@@ -310,6 +310,23 @@ class ImuConfig(Section):
     )
 
 
+class WheelsConfig(Section):
+    """Whether and how wheels predict the motion between scans and within them."""
+
+    source: str = Field(
+        "",
+        description="topic of a bag (Odometry or TwistStamped), or a CSV file, in the folder of the sequence or by its path; "
+        "empty: none; `--wheels`",
+    )
+    frame: str = Field(
+        "", description="of which they are the speeds, x forward; absent: the messages' own, base_link of a file"
+    )
+    wheelbase_m: float | None = Field(None, gt=0, description="m; between the axles, where the file has a steering angle")
+    gap_s: float = Field(
+        0.2, gt=0, description="s; time without readings beyond which a scan falls back to constant velocity"
+    )
+
+
 class FrontEndConfig(Section):
     """The sections of what registers scans."""
 
@@ -322,6 +339,7 @@ class FrontEndConfig(Section):
     lio_sam: LioSamConfig = LioSamConfig()
     lio_mapping: LioMappingConfig = LioMappingConfig()
     imu: ImuConfig = ImuConfig()
+    wheels: WheelsConfig = WheelsConfig()
 
     @model_validator(mode="before")
     @classmethod

@@ -93,6 +93,23 @@ def read_poses(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
     return replace(stream, values=_poses(stream.values))
 
 
+def read_twists(bag: Bag, topic: BagTopic, problems: list[str]) -> Stream:
+    """Speeds (N, 9) of an Odometry or TwistStamped topic: m/s along x, rad/s about z, and the pose beside them.
+
+    The pose is position, m, and quaternion xyzw, NaN of a TwistStamped. The stream's frame is that of the twist.
+    """
+
+    def twist(data: bytes) -> _Row:
+        message = bag.decode(topic, data)
+        own = getattr(message.twist, "twist", message.twist)
+        body = getattr(message, "child_frame_id", message.header.frame_id).lstrip("/")
+        pose = getattr(message, "pose", None)
+        place = [np.nan] * 7 if pose is None else _numbers(topic, pose.pose.position, pose.pose.orientation)
+        return stamp_of(message), body, [float(own.linear.x), float(own.angular.z), *place]
+
+    return _read(bag, topic, problems, 9, twist)
+
+
 def _read(bag: Bag, topic: BagTopic, problems: list[str], width: int, row_of: Callable[[bytes], _Row]) -> Stream:
     """Rows of `width` numbers, made by `row_of` from the messages of a topic."""
     stamps, messages, values = array("q"), array("q"), array("d")

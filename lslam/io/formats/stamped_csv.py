@@ -1,4 +1,4 @@
-"""CSV files of stamped numbers with named columns: `imu.csv`, where EuRoC's imu0/data.csv reads as well, and `gnss.csv`."""
+"""CSV files of stamped numbers with named columns: `imu.csv`, as EuRoC's imu0/data.csv, `gnss.csv` and `wheels.csv`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from lslam.core.printable import shown
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
+from lslam.core.types.wheels import WheelStream
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.text_tables import read_table
 from lslam.io.formats.time_columns import find_clock, unread_columns
@@ -26,6 +27,7 @@ _STEMS = (
 )
 _ALIASES = [tuple(stem + axis for stem in stems) for stems in _STEMS for axis in "xyz"]
 GNSS_COLUMNS = ("lat_deg", "lon_deg", "alt_m", "sigma_m")
+WHEEL_COLUMNS = ("speed", "yaw_rate")
 
 
 def read_stamped_csv(
@@ -138,3 +140,32 @@ def read_gnss_csv(path: Path, notes: list[str] | None = None) -> GnssStream:
 def write_gnss_csv(path: Path, gnss: GnssStream) -> None:
     """Write `gnss` atomically; it reads back exactly."""
     write_stamped_csv(path, GNSS_COLUMNS, gnss.stamps_ns, np.hstack([gnss.lat_lon_alt, gnss.sigma[:, None]]))
+
+
+def read_wheels_csv(path: Path, wheelbase_m: float | None = None, notes: list[str] | None = None) -> WheelStream:
+    """Read speeds of wheels, m/s: `stamp_ns` (or seconds), `speed`, or `left` and `right`, their mean; nothing is converted.
+
+    If known, the turn stands in `yaw_rate`, rad/s, or in `steering`, rad, of front wheels `wheelbase_m` before the axle (kinematic
+    bicycle). Raises InputError naming file and line, or what is missing.
+    """
+    either = [("speed", "v", "velocity", "linear_x", "speed_m_s"), ("left", "speed_left"), ("right", "speed_right")]
+    turns = [("yaw_rate", "angular_z", "wz", "omega", "yaw_rate_rad_s"), ("steering", "steering_angle", "steering_rad")]
+    stamps, values = read_stamped_csv(path, [], [*either, *turns], notes)
+    speed, left, right, yaw_rate, steering = values.T
+    if np.isnan(speed).all():
+        speed = 0.5 * (left + right)
+    if not len(stamps) or np.isnan(speed).all():
+        raise InputError(f"{path}: no speed of wheels; a column speed, in m/s, is needed, or left and right")
+    if np.isnan(yaw_rate).all() and not np.isnan(steering).all():
+        if wheelbase_m is None:
+            raise InputError(
+                f"{path}: steering turns by the distance of the axles: state it by --set wheels.wheelbase_m=2.7"
+            )
+        yaw_rate = speed * np.tan(steering) / wheelbase_m
+    return WheelStream(stamps, speed, None if np.isnan(yaw_rate).all() else yaw_rate)
+
+
+def write_wheels_csv(path: Path, wheels: WheelStream) -> None:
+    """Write `wheels` atomically; it reads back exactly, but for the frame."""
+    measured = [wheels.speed] if wheels.yaw_rate is None else [wheels.speed, wheels.yaw_rate]
+    write_stamped_csv(path, WHEEL_COLUMNS[: len(measured)], wheels.stamps_ns, np.column_stack(measured))

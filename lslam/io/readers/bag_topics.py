@@ -93,7 +93,7 @@ def check_parts(bag: Bag, topic: BagTopic) -> None:
 
 @dataclass(frozen=True)
 class Companion:
-    """Kind of stream beside the scans: name, flag, message type, reader, and the options that need it."""
+    """Kind of stream beside the scans: name, flag, message type or types (`A or B`), reader, and the options that need it."""
 
     name: str
     flag: str
@@ -111,7 +111,7 @@ def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) 
 
     None, with a problem in `voice`, when there are several topics or no usable samples.
     """
-    topics = bag.of_type(kind.type)
+    topics = bag.of_type(*kind.type.split(" or "))
     if wanted is not None:
         topics = [_named(bag, topics, wanted, kind.flag, f"{kind.type} messages")]
     if len(topics) > 1:
@@ -134,7 +134,7 @@ def load_companion(bag: Bag, kind: Companion, wanted: str | None, voice: Voice) 
 
 def why_none(bag: Bag, kind: Companion) -> LslamError:
     """Advice for a user who needs a stream that was not loaded: choose one of several topics, or there is none."""
-    topics = bag.of_type(kind.type)
+    topics = bag.of_type(*kind.type.split(" or "))
     if len(topics) > 1:
         flags = _flags(topics, kind.flag)
         return UsageError(f"{bag.path} has {kind.name} on {len(topics)} topics, choose one:\n{flags}")

@@ -38,6 +38,7 @@ from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.navigation_state import NavigationState
+from lslam.odometry.inertial.wheel_calibration import WheelCalibration
 from lslam.odometry.inertial.window import Moment, Past, Window
 from lslam.odometry.integrity.monitor import Seen
 from lslam.odometry.plane_factors import Sightings, WindowPrior, WindowValues
@@ -81,6 +82,7 @@ STATE_CLASSES = (
     InertialStart,
     Tracked,
     Window,
+    WheelCalibration,
     WindowPrior,
     WindowValues,
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuStream
+from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.saturation import with_hidden
 from lslam.odometry.kernels.strapdown import overlaps
 
@@ -109,7 +110,7 @@ def mean_forces(imu: ImuStream) -> Floats:
     return np.asarray(imu.accel[: len(imu) // width * width].reshape(-1, width, 3).mean(axis=1))
 
 
-def gaps(imu: ImuStream, longest_s: float) -> Longs:
+def gaps(imu: ImuStream | WheelStream, longest_s: float) -> Longs:
     """(G, 2) ns: begin and end of every stretch that no sample tells of, before and after all included.
 
     In a pause longer than `longest_s` half of that after the last sample and before the next is still known as well as in
