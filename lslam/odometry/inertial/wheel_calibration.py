@@ -26,8 +26,12 @@ YAW_OFFSET_SIGMA = 0.02
 # Random walks per sqrt(s): of the scale, as tyres warm up and loads shift, and of the yaw rate's offset, rad/s.
 SCALE_WALK, YAW_OFFSET_WALK = 1e-4, 1e-5
 # Of a step before any was seen: m2 per m, along and across, and rad2 per s; and the least of each.
-STEP_NOISE = np.array([1e-3, 1e-3, 1e-4])
+STEP_NOISE = np.array([1e-4, 1e-3, 1e-4])
 LEAST_NOISE = np.array([1e-6, 1e-6, 1e-8])
+# s; of a reading's time, beside the offset of all.
+JITTER_S = 0.02
+# Median of chi2 with one degree of freedom.
+MEDIAN_SQUARE = 0.4549
 U, ARM, YAW_SCALE, YAW_OFFSET, OFFSET_S = slice(0, 3), slice(3, 6), 6, 7, 8
 
 
@@ -144,12 +148,13 @@ class WheelCalibration:
         out = np.zeros((4, 4))
         out[:3, :3] = steps.way[k] * (across * np.eye(3) + (along - across) * np.outer(u, u))
         out[3, 3] = turning * steps.seconds[k]
-        return out
+        # What changes its speed slips, and one reading is later than another.
+        late = steps.jacobian[k, :, OFFSET_S] * JITTER_S
+        return np.asarray(out + np.outer(late, late))
 
     def spread(self, steps: WheelSteps, k: int) -> Floats:
-        """(4, 4) covariance of step `k`: of the states, and of what they do not explain."""
-        J = steps.jacobian[k]
-        return np.asarray(J @ self.covariance @ J.T + self.step_noise(steps, k))
+        """(4, 4) covariance of step `k` by that of the states."""
+        return np.asarray(steps.jacobian[k] @ self.covariance @ steps.jacobian[k].T)
 
     def corrected(self, steps: WheelSteps, k: int, rest: Floats, C: Floats) -> WheelCalibration:
         """After registration found step `k` longer by `rest` (4,), m and rad about `up`, with the covariance C (4, 4)."""
@@ -160,7 +165,7 @@ class WheelCalibration:
         J, own = steps.jacobian[k], self.step_noise(steps, k)
         told = J @ P @ J.T + C
         states, covariance = kalman.update(
-            self.states, P, J[:size], rest[:size], (own + C)[:size, :size], INNOVATION_SIGMAS
+            self.states, P, J[:size], rest[:size], (own + C)[:size, :size], INNOVATION_SIGMAS / size**0.5
         )
         u = self.direction
         across = float(rest[:3] @ rest[:3] - (u @ rest[:3]) ** 2) / 2
@@ -176,13 +181,12 @@ def learnt(
 ) -> tuple[Floats, Floats]:
     """Densities of noise (N,), and the counts behind them, after squared innovations (N,) over so much each, `per` (N,).
 
-    known : (N,) part of the squares that is not this noise's. An innovation tells by the share that is not known: one along a
-    direction that registration leaves open tells nothing. Those beyond `INNOVATION_SIGMAS` are cut there.
+    known : (N,) part of the squares that is not this noise's. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
+    its variance: a density grows with each one above, and shrinks with each below, so that slip, however much, counts as one
+    innovation. One counts by the share that is not known: along a direction that registration leaves open it tells nothing.
     """
     own = noise * per
-    bounded = np.minimum(squares, INNOVATION_SIGMAS**2 * (own + known))
-    largest = np.maximum(own, bounded)
-    share = np.where(per > 0, np.square(largest / np.maximum(largest + known, 1e-300)), 0.0)
+    share = np.square(own / np.maximum(own + known, 1e-300))
     counts = np.minimum(counts + share, NOISE_MEMORY_SCANS)
-    seen = np.maximum((bounded - known) / np.maximum(per, 1e-300), 0.0)
-    return np.maximum(noise + share / counts * (seen - noise), least), counts
+    side = np.where(squares > MEDIAN_SQUARE * (own + known), 1.0, -1.0)
+    return np.maximum(noise * np.exp(share / counts * side), least), counts

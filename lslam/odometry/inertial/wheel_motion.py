@@ -102,6 +102,7 @@ class WheelMotion(ConstantVelocity):
         blend = self._blend(self.predict(instant_ns)[None], instant_ns, np.zeros(1), self._instant_ns, self._pose)
         if blend is None:
             return result
+        C = C + _open(result)
         self._learn_from(blend, instant_ns, middle, C)
         R, up = self._pose[:3, :3], self.calibration.up
         G = np.zeros((6, 4))
@@ -111,6 +112,8 @@ class WheelMotion(ConstantVelocity):
         expected = blend.poses[0]
         turn = so3.log(middle[:3, :3] @ expected[:3, :3].T)
         rest = np.concatenate([middle[:3, 3] - expected[:3, 3], turn])
+        # Beyond so many sigma one of both is wrong: the registration was accepted.
+        P *= max(1.0, kalman.square(rest, P + 2 * C) / INNOVATION_SIGMAS**2)
         return result.moved(*kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age))
 
     def correct(
@@ -163,8 +166,8 @@ class WheelMotion(ConstantVelocity):
         steps = self.calibration.steps(self.wheels, anchor_ns, instants, yaw_rate)
         c, m = se3.log(se3.relative(anchor, steady)), se3.log(steps.poses)
         apart4 = np.column_stack([m[:, :3] - c[:, :3], (m[:, 3:] - c[:, 3:]) @ up])
-        own = self.calibration.spread(steps, k)
-        gain, cost = np.eye(4), own
+        own, gain = self.calibration.step_noise(steps, k), np.eye(4)
+        cost = self.calibration.spread(steps, k) + own
         if is_known:
             seconds = float(steps.seconds[k])
             u = self.calibration.direction
@@ -183,8 +186,8 @@ class WheelMotion(ConstantVelocity):
                 own = own.copy()
                 own[:3, :3] += change**2 * np.outer(u, u)
             gain = np.linalg.solve(others + own, others).T
-            # What its weight leaves of the wheels: the mean of both is no more certain by constant velocity.
-            cost = own + own @ np.linalg.solve(others, own)
+            # The less of the wheels is in the mean, the less it says: constant velocity is no measurement.
+            cost = self.calibration.spread(steps, k) + own + own @ np.linalg.solve(others, own)
         twist = c + np.hstack([apart4 @ gain[:3].T, (apart4 @ gain[3])[:, None] * up])
         return _Blend(se3.normalise(anchor @ se3.exp(twist)), cost, steps, steady)
 
@@ -225,6 +228,12 @@ class _Blend:
     covariance: Floats
     steps: WheelSteps
     steady: Floats
+
+
+def _open(result: RegistrationResult) -> Floats:
+    """(6, 6) that a registration's covariance lacks: of directions that no surface holds it says a metre, and knows nothing."""
+    scaled = result.degenerate / np.repeat([1.0, result.lever_arm], 3)
+    return np.asarray(UNTOLD * scaled.T @ scaled)
 
 
 def _size(rest: Floats) -> float:
