@@ -1,8 +1,8 @@
 """From speeds of wheels to the LiDAR's motion, and the calibration of the wheels by registered motion.
 
 A step of the LiDAR is linear in what is not known: u, metres that the LiDAR moves along each of its axes per metre of the wheels,
-has their scale, and the direction in which the LiDAR is mounted; the arm from their axle to the LiDAR swings with the turn. Scale
-and offset of the yaw rate and the offset of the clocks are states as well.
+has their scale and the direction in which the LiDAR is mounted; the arm from the LiDAR to their axle swings with the turn. Scale and
+offset of the yaw rate and the offset of the clocks are states as well.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Floats
 from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, NOISE_MEMORY_SCANS, OFFSET_SIGMA
 from lslam.odometry.kernels import kalman
 
-# One sigma: tyres and their pressure, and a vehicle's pitch on its springs; of an axis that nobody states, half of all there is.
+# One sigma of u: along, tyres and their pressure; across, a vehicle's pitch on its springs; of an axis that nobody states.
 SCALE_SIGMA, AXIS_SIGMA, UNKNOWN_AXIS_SIGMA = 0.05, 0.02, 0.5
 # m; of a frame whose place is stated, and of one at an unknown place on a vehicle.
 ARM_SIGMA, UNKNOWN_ARM_SIGMA = 0.05, 1.0
-# rad/s; of a yaw rate at rest.
+# rad/s; of the yaw rate at rest.
 YAW_OFFSET_SIGMA = 0.02
 # Random walks per sqrt(s): of the scale, as tyres warm up and loads shift, and of the yaw rate's offset, rad/s.
 SCALE_WALK, YAW_OFFSET_WALK = 1e-4, 1e-5
@@ -36,24 +36,16 @@ U, ARM, YAW_SCALE, YAW_OFFSET, OFFSET_S = slice(0, 3), slice(3, 6), 6, 7, 8
 
 
 @dataclass(frozen=True)
-class WheelSteps:
-    """Motions of the LiDAR by its wheels from one instant to K others, in its axes at the first.
+class WheelStep:
+    """Motion of the LiDAR by its wheels from one instant to a later one, in its axes at the first.
 
-    moved : (K, 3) m; turn : (K,) rad about `up` (3,); jacobian : (K, 4, 9) of moved and turn by the states
-    way : (K,) m of the wheels, without a sign; seconds : (K,)
+    pose : (4, 4); jacobian : (4, 9) of the way and of the turn about `up` by the states; way : m, without a sign; seconds : s
     """
 
-    moved: Floats
-    turn: Floats
+    pose: Floats
     jacobian: Floats
-    way: Floats
-    seconds: Floats
-    up: Floats
-
-    @property
-    def poses(self) -> Floats:
-        """(K, 4, 4)"""
-        return se3.make(so3.exp(self.turn[:, None] * self.up), self.moved)
+    way: float
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -63,8 +55,7 @@ class WheelCalibration:
     up : (3,) axis of the yaw rate in LiDAR axes; has_yaw : whether it is measured
     states (9,), covariance (9, 9) : u; arm from the LiDAR to the axle, m; scale and offset, rad/s, of the yaw rate; s to
         add to stamps
-    noise : (3,) of what is left, m2 per m along u and across, and rad2 per s
-    counts : (3,) steps that it was learnt from, each by what it told
+    noise : (3,) of what is left, m2 per m along u and across, and rad2 per s; counts : (3,) steps behind it
     """
 
     up: Floats
@@ -77,16 +68,15 @@ class WheelCalibration:
     @classmethod
     def of(cls, wheels: WheelStream) -> WheelCalibration:
         """The prior: as the frame of the wheels says, or forward along x of the LiDAR where nothing places it."""
-        T = wheels.T_lidar_base
-        if T is None:
-            axes, arm, spread, arm_sigma = np.eye(3), np.zeros(3), [UNKNOWN_AXIS_SIGMA] * 3, UNKNOWN_ARM_SIGMA
-        else:
-            axes, arm, spread, arm_sigma = T[:3, :3], T[:3, 3], [SCALE_SIGMA, AXIS_SIGMA, AXIS_SIGMA], ARM_SIGMA
-        states = np.concatenate([axes[:, 0], arm, [1.0, 0.0, 0.0]])
+        T = np.eye(4) if wheels.T_lidar_base is None else wheels.T_lidar_base
+        spread, arm_sigma = [SCALE_SIGMA, AXIS_SIGMA, AXIS_SIGMA], ARM_SIGMA
+        if wheels.T_lidar_base is None:
+            spread, arm_sigma = [UNKNOWN_AXIS_SIGMA] * 3, UNKNOWN_ARM_SIGMA
         own = np.repeat([arm_sigma, SCALE_SIGMA, YAW_OFFSET_SIGMA, OFFSET_SIGMA], [3, 1, 1, 1])
-        P = np.diag(np.concatenate([np.zeros(3), own**2]))
-        P[U, U] = axes @ np.diag(np.square(spread)) @ axes.T
-        return cls(axes[:, 2].copy(), wheels.yaw_rate is not None, states, P)
+        P = np.diag(np.square(np.concatenate([spread, own])))
+        P[U, U] = T[:3, :3] @ P[U, U] @ T[:3, :3].T
+        states = np.concatenate([T[:3, 0], T[:3, 3], [1.0, 0.0, 0.0]])
+        return cls(T[:3, 2].copy(), wheels.yaw_rate is not None, states, P)
 
     @property
     def direction(self) -> Floats:
@@ -97,83 +87,83 @@ class WheelCalibration:
     @property
     def scale(self) -> tuple[float, float]:
         """Metres of the LiDAR per metre of the wheels, and its sigma."""
-        u = self.states[U]
-        length = float(np.linalg.norm(u))
-        return length, float(np.sqrt(u @ self.covariance[U, U] @ u)) / max(length, 1e-9)
+        u = self.direction
+        return float(np.linalg.norm(self.states[U])), float(np.sqrt(u @ self.covariance[U, U] @ u))
 
-    def steps(self, wheels: WheelStream, anchor_ns: int, instants_ns: Longs, yaw_rate: float) -> WheelSteps:
-        """Motions from an instant to others; `yaw_rate`, rad/s, is for wheels that measure none."""
-        u, arm, offset_ns = self.states[U], self.states[ARM], round(1e9 * float(self.states[OFFSET_S]))
-        ends = np.append(instants_ns, anchor_ns)
-        first, last = np.searchsorted(wheels.stamps_ns, [ends.min() - offset_ns, ends.max() - offset_ns])
+    def step(self, wheels: WheelStream, begin_ns: int, end_ns: int, yaw_rate: float) -> WheelStep:
+        """Motion from one instant to a later one; `yaw_rate`, rad/s, is for wheels that measure none."""
+        offset_ns, up = round(1e9 * float(self.states[OFFSET_S])), self.up
+        first, last = np.searchsorted(wheels.stamps_ns, [begin_ns - offset_ns, end_ns - offset_ns])
         around = slice(max(int(first) - 1, 0), int(last) + 1)
-        stamps = wheels.stamps_ns[around] + offset_ns
-        instants = np.unique(np.concatenate([stamps[(stamps > ends.min()) & (stamps < ends.max())], ends]))
-        times, own = 1e-9 * (instants - anchor_ns), 1e-9 * (stamps - anchor_ns)
-        speed = np.interp(times, own, wheels.speed[around])
-        raw = np.full(len(times), yaw_rate)
+        own = 1e-9 * (wheels.stamps_ns[around] + offset_ns - begin_ns)
+        seconds = 1e-9 * (end_ns - begin_ns)
+        times = np.concatenate([[0.0], own[(own > 0) & (own < seconds)], [seconds]])
+        speed, raw = np.interp(times, own, wheels.speed[around]), np.full(len(times), yaw_rate)
+        rate = raw
         if wheels.yaw_rate is not None:
             raw = np.interp(times, own, wheels.yaw_rate[around])
-        rate = self.states[YAW_SCALE] * raw - self.states[YAW_OFFSET] if self.has_yaw else raw
-        here = int(np.searchsorted(instants, anchor_ns))
-        at = np.searchsorted(instants, instants_ns)
+            rate = self.states[YAW_SCALE] * raw - self.states[YAW_OFFSET]
 
         def integral(values: Floats) -> Floats:
-            grown = np.append(0.0, np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(times)))
-            return np.asarray(grown - grown[here])
+            return np.append(0.0, np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(times)))
 
-        turn = integral(rate)
-        way, ahead, aside = (integral(v)[at] for v in (speed, speed * np.cos(turn), speed * np.sin(turn)))
-        up = self.up
-        along, plane = np.outer(up, up), np.eye(3) - np.outer(up, up)
-        A = way[:, None, None] * along + ahead[:, None, None] * plane + aside[:, None, None] * so3.hat(up)
-        swing = so3.exp(turn[at, None] * up) - np.eye(3)
-        # The axle is at `arm`: the LiDAR moves by what the axle does less what the arm swings.
-        moved = A @ u - swing @ arm
-        J = np.zeros((len(at), 4, 9))
-        J[:, :3, U], J[:, :3, ARM] = A, -swing
-        J[:, :3, OFFSET_S] = (speed[here] - speed[at])[:, None] * u
+        turns = integral(rate)
+        turn = float(turns[-1])
+        way, ahead, aside = (float(integral(v)[-1]) for v in (speed, speed * np.cos(turns), speed * np.sin(turns)))
+        along = np.outer(up, up)
+        A = way * along + ahead * (np.eye(3) - along) + aside * so3.hat(up)
+        R = so3.exp(turn * up)
+        swing, arm = R - np.eye(3), self.states[ARM]
+        moved = A @ self.states[U] - swing @ arm
+        J = np.zeros((4, 9))
+        J[:3, U], J[:3, ARM], J[:3, OFFSET_S] = A, -swing, (speed[0] - speed[-1]) * self.states[U]
         if self.has_yaw:
-            raw_turn = integral(raw)[at]
-            for k, by_state in ((YAW_SCALE, raw_turn), (YAW_OFFSET, -times[at]), (OFFSET_S, rate[here] - rate[at])):
-                J[:, 3, k] = by_state
-                # A steady turn heads by half of itself on the way, and the arm swings by all of it.
-                J[:, :3, k] += by_state[:, None] * np.cross(up, 0.5 * moved - arm)
-        return WheelSteps(moved, turn[at], J, np.abs(way), np.abs(times[at]), up)
+            J[3, [YAW_SCALE, YAW_OFFSET, OFFSET_S]] = integral(raw)[-1], -seconds, rate[0] - rate[-1]
+            # A steady turn heads by half of itself on the way; the arm swings by all of it.
+            J[:3] += np.outer(np.cross(up, 0.5 * moved - arm), J[3])
+        return WheelStep(se3.make(R, moved), J, abs(way), seconds)
 
-    def step_noise(self, steps: WheelSteps, k: int) -> Floats:
-        """(4, 4) covariance of step `k` that no state explains."""
-        u = self.direction
+    def step_noise(self, step: WheelStep) -> Floats:
+        """(4, 4) covariance of a step that no state explains."""
         along, across, turning = self.noise
         out = np.zeros((4, 4))
-        out[:3, :3] = steps.way[k] * (across * np.eye(3) + (along - across) * np.outer(u, u))
-        out[3, 3] = turning * steps.seconds[k]
+        out[:3, :3] = step.way * by_axis(along, across, self.direction)
+        out[3, 3] = turning * step.seconds
         # What changes its speed slips, and one reading is later than another.
-        late = steps.jacobian[k, :, OFFSET_S] * JITTER_S
+        late = step.jacobian[:, OFFSET_S] * JITTER_S
         return np.asarray(out + np.outer(late, late))
 
-    def spread(self, steps: WheelSteps, k: int) -> Floats:
-        """(4, 4) covariance of step `k` by that of the states."""
-        return np.asarray(steps.jacobian[k] @ self.covariance @ steps.jacobian[k].T)
+    def spread(self, step: WheelStep) -> Floats:
+        """(4, 4) covariance of a step by that of the states."""
+        return np.asarray(step.jacobian @ self.covariance @ step.jacobian.T)
 
-    def corrected(self, steps: WheelSteps, k: int, rest: Floats, C: Floats) -> WheelCalibration:
-        """After registration found step `k` longer by `rest` (4,), m and rad about `up`, with the covariance C (4, 4)."""
-        seconds, size = float(steps.seconds[k]), 4 if self.has_yaw else 3
-        P = self.covariance.copy()
-        P[U, U] += SCALE_WALK**2 * seconds * np.eye(3)
-        P[YAW_OFFSET, YAW_OFFSET] += YAW_OFFSET_WALK**2 * seconds
-        J, own = steps.jacobian[k], self.step_noise(steps, k)
-        told = J @ P @ J.T + C
-        states, covariance = kalman.update(
-            self.states, P, J[:size], rest[:size], (own + C)[:size, :size], INNOVATION_SIGMAS / size**0.5
-        )
-        u = self.direction
-        across = float(rest[:3] @ rest[:3] - (u @ rest[:3]) ** 2) / 2
-        squares = np.array([(u @ rest[:3]) ** 2, across, rest[3] ** 2])
-        known = np.array([u @ told[:3, :3] @ u, (np.trace(told[:3, :3]) - u @ told[:3, :3] @ u) / 2, told[3, 3]])
-        per = np.array([steps.way[k], steps.way[k], seconds])
-        noise, counts = learnt(self.noise, self.counts, squares, known, per, LEAST_NOISE)
-        return replace(self, states=states, covariance=covariance, noise=noise, counts=counts)
+    def corrected(self, step: WheelStep, rest: Floats, C: Floats) -> WheelCalibration:
+        """After registration found a step longer by `rest` (4,), m and rad about `up`, with the covariance C (4, 4)."""
+        P, J, size = self.covariance.copy(), step.jacobian, 4 if self.has_yaw else 3
+        P[U, U] += SCALE_WALK**2 * step.seconds * np.eye(3)
+        P[YAW_OFFSET, YAW_OFFSET] += YAW_OFFSET_WALK**2 * step.seconds
+        noise = (self.step_noise(step) + C)[:size, :size]
+        # The norm counts: an error along one axis is one, whatever the others are.
+        states, covariance = kalman.update(self.states, P, J[:size], rest[:size], noise, INNOVATION_SIGMAS / size**0.5)
+        squares, known = split(rest, J @ P @ J.T + C, self.direction)
+        per = np.array([step.way, step.way, step.seconds])
+        left, counts = learnt(self.noise, self.counts, squares, known, per, LEAST_NOISE)
+        return replace(self, states=states, covariance=covariance, noise=left, counts=counts)
+
+
+def by_axis(along: float, across: float, direction: Floats) -> Floats:
+    """(3, 3) covariance of one variance along a unit vector (3,) and another across it."""
+    return np.asarray(across * np.eye(3) + (along - across) * np.outer(direction, direction))
+
+
+def split(rest: Floats, C: Floats, direction: Floats) -> tuple[Floats, Floats]:
+    """Squares (3,) of an innovation (4,) along a unit vector, across it, the mean of both, and of the turn; those C expects."""
+
+    def parts(S: Floats) -> Floats:
+        along = float(direction @ S[:3, :3] @ direction)
+        return np.array([along, (float(np.trace(S[:3, :3])) - along) / 2, S[3, 3]])
+
+    return parts(np.outer(rest, rest)), parts(C)
 
 
 def learnt(

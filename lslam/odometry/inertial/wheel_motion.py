@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -17,23 +17,49 @@ from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
-from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelSteps, learnt
+from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelStep, by_axis, learnt, split
 from lslam.odometry.kernels import kalman
 from lslam.odometry.uncertainty import USUAL
 from lslam.registration.result import RegistrationResult
 
 # (m/s2)2 along and across, (rad/s2)2: least of what constant velocity does not follow.
 LEAST_ACCELERATION = np.array([0.1, 0.1, 0.03]) ** 2
-# m2 and rad2, of the directions of which wheels say nothing.
+# m2 and rad2, of the directions of which wheels, or surfaces, say nothing.
 UNTOLD = 1e2
 
 
-class WheelMotion(ConstantVelocity):
-    """Constant velocity whose way and turn are those of the wheels, as far as these predict scans better.
+@dataclass(frozen=True)
+class ReckonedStep:
+    """The LiDAR's motion to an instant, by wheels and constant velocity together.
 
-    Both predictions are averaged by their mean squared innovations, which are learnt while driving: wheels of another robot have
-    no weight. A registered motion is weighed against the wheels by the covariances of both. Tyres hold no more than gravity: a
-    speed of the wheels that changes faster is slip, and constant velocity goes on.
+    pose : (4, 4) in the world; covariance : (4, 4) of the wheels' part in the way and the turn, axes of the LiDAR at the begin
+    wheels, steady : of either alone, (4, 4) in axes of the begin; is_slip : wheels change their speed more than tyres hold
+    """
+
+    pose: Floats
+    covariance: Floats
+    wheels: WheelStep
+    steady: Floats
+    is_slip: bool
+
+
+@dataclass(frozen=True)
+class LearntFromScan:
+    """What a registered step told: the calibration, the accelerations with their counts, and how wrong each predicted, m."""
+
+    instant_ns: int
+    calibration: WheelCalibration
+    acceleration: Floats
+    counts: Floats
+    errors: tuple[float, float]
+
+
+class WheelMotion(ConstantVelocity):
+    """Constant velocity whose way and turn from scan to scan are those of the wheels, as far as these predict them better.
+
+    Both predictions are averaged by the noise of each, which is learnt while driving: wheels of another robot have no weight. A
+    registered motion is weighed against the wheels by the covariances of both. Tyres hold no more than gravity: a speed of the
+    wheels that changes faster is slip, and constant velocity goes on. The motion within a sweep is that of constant velocity.
 
     gap_s : time between readings beyond which there are none
     """
@@ -44,10 +70,10 @@ class WheelMotion(ConstantVelocity):
         "slip_scans",
         "gap_scans",
         "_acceleration",
-        "_acceleration_counts",
+        "_counts",
         "_agreed_ns",
     )
-    CLEARED: ClassVar[tuple[str, ...]] = (*ConstantVelocity.CLEARED, "_taught")
+    CLEARED: ClassVar[tuple[str, ...]] = (*ConstantVelocity.CLEARED, "_reckoned", "_learnt")
 
     def __init__(self, wheels: WheelStream, gap_s: float, pose: Floats | None = None) -> None:
         super().__init__(pose)
@@ -55,64 +81,51 @@ class WheelMotion(ConstantVelocity):
         self.calibration = WheelCalibration.of(wheels)
         self.slip_scans = self.gap_scans = 0
         self._gaps = gaps(wheels, gap_s)
-        # Of constant velocity: variances along and across, (m/s2)2, and of the turn, (rad/s2)2, and counts behind them.
-        self._acceleration = np.square([USUAL[0], USUAL[0], USUAL[3]])
-        self._acceleration_counts = np.ones(3)
+        # Of constant velocity: variances along and across, (m/s2)2, and of the turn, (rad/s2)2, and the steps behind them.
+        self._acceleration, self._counts = np.square([USUAL[0], USUAL[0], USUAL[3]]), np.ones(3)
         # When wheels last changed their speed by no more than tyres hold, ns.
         self._agreed_ns: int | None = None
-        # Whether wheels slip on the step to come; and from `fuse` at an instant, ns, what `correct` takes over.
-        self._is_slipping = False
-        self._taught: tuple[int, WheelCalibration, Floats, Floats, tuple[float, float]] | None = None
+        # Until the next `correct`: the step to the scan, and what its registration told.
+        self._reckoned: ReckonedStep | None = None
+        self._learnt: LearntFromScan | None = None
         self._errors: list[tuple[float, float]] = []
 
     def fresh(self, pose: Floats) -> WheelMotion:
         """One that has learnt as much, and expects the first scan at `pose` (4, 4)."""
         other = WheelMotion(self.wheels, self.gap_s, pose)
-        other.calibration, other.slip_scans, other.gap_scans = self.calibration, self.slip_scans, self.gap_scans
-        other._acceleration, other._acceleration_counts = self._acceleration, self._acceleration_counts
-        other._errors = list(self._errors)
+        empty = other.state()
+        other.restore({**self.state(), **{name: empty[name] for name in ConstantVelocity.STATE}})
         return other
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
         prior = super().sweep(stamp_ns, span)
-        if prior.change is not None or self._instant_ns is None:
+        self._reckoned = None if prior.change is not None else self._reckon(stamp_ns)
+        if self._reckoned is None:
             return prior
-        blend = self._blend(prior.poses, stamp_ns, prior.times, self._instant_ns, self._pose)
-        return prior if blend is None else MotionPrior(prior.times, blend.poses)
-
-    def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
-        """The sweep's motion again, now that registration gave the `pose` (4, 4) at the stamp for `prior`."""
-        refined = super().refine(prior, stamp_ns, pose)
-        if refined is prior:
-            return prior
-        middle, instant_ns = middle_of(prior, stamp_ns, pose)
-        blend = self._blend(refined.poses, stamp_ns, refined.times, instant_ns, middle)
-        return refined if blend is None else MotionPrior(refined.times, blend.poses)
+        return replace(prior, poses=self._reckoned.pose @ se3.relative(prior.pose, prior.poses))
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The registered motion since the last scan weighed against the wheels', each by its covariance.
 
         prior : of the registration, says how the sweep moved
         """
-        C = result.covariance
         middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
-        if C is None or not result.is_accepted or self._instant_ns is None or instant_ns <= self._instant_ns:
+        if result.covariance is None or not result.is_accepted:
             return result
-        blend = self._blend(self.predict(instant_ns)[None], instant_ns, np.zeros(1), self._instant_ns, self._pose)
-        if blend is None:
+        reckoned = self._reckoned = self._reckon(instant_ns)
+        if reckoned is None:
             return result
-        C = C + _open(result)
-        self._learn_from(blend, instant_ns, middle, C)
-        R, up = self._pose[:3, :3], self.calibration.up
+        C = result.covariance + _open(result)
+        self._learnt = self._learn_from(reckoned, instant_ns, middle, C)
+        up = self._pose[:3, :3] @ self.calibration.up
         G = np.zeros((6, 4))
-        G[:3, :3], G[3:, 3] = R, R @ up
-        P = G @ blend.covariance @ G.T
-        P[3:, 3:] += UNTOLD * (np.eye(3) - np.outer(R @ up, R @ up))
-        expected = blend.poses[0]
-        turn = so3.log(middle[:3, :3] @ expected[:3, :3].T)
-        rest = np.concatenate([middle[:3, 3] - expected[:3, 3], turn])
-        # Beyond so many sigma one of both is wrong: the registration was accepted.
+        G[:3, :3], G[3:, 3] = self._pose[:3, :3], up
+        P = G @ reckoned.covariance @ G.T
+        P[3:, 3:] += UNTOLD * (np.eye(3) - np.outer(up, up))
+        turn = so3.log(middle[:3, :3] @ reckoned.pose[:3, :3].T)
+        rest = np.concatenate([middle[:3, 3] - reckoned.pose[:3, 3], turn])
+        # Beyond so many sigma one of both is wrong, and the registration was accepted.
         P *= max(1.0, kalman.square(rest, P + 2 * C) / INNOVATION_SIGMAS**2)
         return result.moved(*kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age))
 
@@ -121,16 +134,17 @@ class WheelMotion(ConstantVelocity):
     ) -> None:
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
         _, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
-        if self._instant_ns is not None and instant_ns > self._instant_ns:
-            is_covered = covers(self._gaps, self._instant_ns, instant_ns)
-            self.gap_scans += not is_covered
-            self.slip_scans += self._is_slipping
-            if not self._is_slipping and is_covered:
-                self._agreed_ns = instant_ns
-        if self._taught is not None and self._taught[0] == instant_ns:
-            _, self.calibration, self._acceleration, self._acceleration_counts, errors = self._taught
-            self._errors.append(errors)
-        self._taught, self._is_slipping = None, False
+        reckoned, learnt_now = self._reckoned, self._learnt
+        if reckoned is not None:
+            self.slip_scans += reckoned.is_slip
+            self._agreed_ns = self._agreed_ns if reckoned.is_slip else instant_ns
+        elif self._instant_ns is not None and not covers(self._gaps, self._instant_ns, instant_ns):
+            self.gap_scans += 1
+        if learnt_now is not None and learnt_now.instant_ns == instant_ns:
+            self.calibration = learnt_now.calibration
+            self._acceleration, self._counts = learnt_now.acceleration, learnt_now.counts
+            self._errors.append(learnt_now.errors)
+        self._reckoned = self._learnt = None
         super().correct(stamp_ns, pose, prior, is_registered)
 
     def prior_errors(self) -> tuple[float, float] | None:
@@ -148,54 +162,41 @@ class WheelMotion(ConstantVelocity):
         """Go on where `state` was taken."""
         super().restore(state)
         self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
-        self._is_slipping = False
 
-    def _blend(
-        self, steady: Floats, stamp_ns: int, times: Floats, anchor_ns: int, anchor: Floats
-    ) -> _Blend | None:
-        """Both predictions averaged at `times` (K,), s from the stamp; None where wheels say nothing.
-
-        steady : (K, 4, 4) of constant velocity; anchor : (4, 4) pose from which both go on
-        """
-        instants = stamp_ns + np.round(1e9 * times).astype(np.int64)
-        k = len(times) // 2 if anchor_ns < instants.min() else len(times) - 1
-        if not covers(self._gaps, min(anchor_ns, int(instants.min())), max(anchor_ns, int(instants.max()))):
+    def _reckon(self, instant_ns: int) -> ReckonedStep | None:
+        """The step from the newest pose to an instant; None where there is none, or wheels say nothing of it."""
+        begin_ns = self._instant_ns
+        if begin_ns is None or instant_ns <= begin_ns or not covers(self._gaps, begin_ns, instant_ns):
             return None
-        up, is_known = self.calibration.up, self._step_s > 0
+        up, u, is_known = self.calibration.up, self.calibration.direction, self._step_s > 0
         yaw_rate = float(up @ self._twist[3:]) / self._step_s if is_known else 0.0
-        steps = self.calibration.steps(self.wheels, anchor_ns, instants, yaw_rate)
-        c, m = se3.log(se3.relative(anchor, steady)), se3.log(steps.poses)
-        apart4 = np.column_stack([m[:, :3] - c[:, :3], (m[:, 3:] - c[:, 3:]) @ up])
-        own, gain = self.calibration.step_noise(steps, k), np.eye(4)
-        cost = self.calibration.spread(steps, k) + own
+        wheels = self.calibration.step(self.wheels, begin_ns, instant_ns, yaw_rate)
+        steady = se3.relative(self._pose, self.predict(instant_ns))
+        before, by_wheels = se3.log(steady), se3.log(wheels.pose)
+        apart = np.append(by_wheels[:3] - before[:3], up @ (by_wheels[3:] - before[3:]))
+        noise, seconds = self.calibration.step_noise(wheels), wheels.seconds
+        gain, is_slip, lost = np.eye(4), False, np.zeros((4, 4))
         if is_known:
-            seconds = float(steps.seconds[k])
-            u = self.calibration.direction
-            along, across, turning = self._acceleration * seconds**4
             others = np.zeros((4, 4))
-            others[:3, :3] = across * np.eye(3) + (along - across) * np.outer(u, u)
-            others[3, 3] = turning
-            change = float(u @ apart4[k, :3])
-            since = seconds
-            if anchor_ns == self._instant_ns and self._agreed_ns is not None:
-                since = max(since, 1e-9 * (int(instants[k]) - self._agreed_ns))
-            most = (GRAVITY * since * seconds) ** 2 + INNOVATION_SIGMAS**2 * float(u @ own[:3, :3] @ u)
-            if anchor_ns == self._instant_ns:
-                self._is_slipping = change**2 > most
-            if change**2 > most:
-                own = own.copy()
-                own[:3, :3] += change**2 * np.outer(u, u)
-            gain = np.linalg.solve(others + own, others).T
+            others[:3, :3] = seconds**4 * by_axis(self._acceleration[0], self._acceleration[1], u)
+            others[3, 3] = seconds**4 * self._acceleration[2]
+            since = seconds if self._agreed_ns is None else max(seconds, 1e-9 * (instant_ns - self._agreed_ns))
+            most = (GRAVITY * since * seconds) ** 2 + INNOVATION_SIGMAS**2 * float(u @ noise[:3, :3] @ u)
+            change = float(u @ apart[:3])
+            is_slip = change**2 > most
+            noise[:3, :3] += is_slip * change**2 * np.outer(u, u)
+            gain = np.linalg.solve(others + noise, others).T
             # The less of the wheels is in the mean, the less it says: constant velocity is no measurement.
-            cost = self.calibration.spread(steps, k) + own + own @ np.linalg.solve(others, own)
-        twist = c + np.hstack([apart4 @ gain[:3].T, (apart4 @ gain[3])[:, None] * up])
-        return _Blend(se3.normalise(anchor @ se3.exp(twist)), cost, steps, steady)
+            lost = noise @ np.linalg.solve(others, noise)
+        part = gain @ apart
+        twist = before + np.concatenate([part[:3], part[3] * up])
+        pose = se3.normalise(self._pose @ se3.exp(twist))
+        return ReckonedStep(pose, self.calibration.spread(wheels) + noise + lost, wheels, steady, is_slip)
 
-    def _learn_from(self, blend: _Blend, instant_ns: int, middle: Floats, C: Floats) -> None:
-        """Calibrate the wheels and their noise, and that of constant velocity, by the registered `middle` (4, 4)."""
-        R, up, u = self._pose[:3, :3], self.calibration.up, self.calibration.direction
-        B = np.zeros((4, 6))
-        B[:3, :3], B[3, 3:] = R.T, R @ up
+    def _learn_from(self, reckoned: ReckonedStep, instant_ns: int, middle: Floats, C: Floats) -> LearntFromScan:
+        """What the registered `middle` (4, 4) with covariance C (6, 6) tells of the wheels and of constant velocity."""
+        up, B = self.calibration.up, np.zeros((4, 6))
+        B[:3, :3], B[3, 3:] = self._pose[:3, :3].T, self._pose[:3, :3] @ up
         # Both ends of the step were registered.
         both = 2 * (B @ C @ B.T)
         registered = se3.relative(self._pose, middle)
@@ -204,30 +205,14 @@ class WheelMotion(ConstantVelocity):
             turn = so3.log(registered[:3, :3] @ expected[:3, :3].T)
             return np.append(registered[:3, 3] - expected[:3, 3], up @ turn)
 
-        rest = rest_of(blend.steps.poses[0])
-        calibration = self.calibration.corrected(blend.steps, 0, rest, both)
-        acceleration, counts = self._acceleration, self._acceleration_counts
-        steady = se3.relative(self._pose, blend.steady[0])
-        errors = (_size(rest), _size(rest_of(steady)))
+        rest, off = rest_of(reckoned.wheels.pose), rest_of(reckoned.steady)
+        calibration = self.calibration.corrected(reckoned.wheels, rest, both)
+        acceleration, counts = self._acceleration, self._counts
         if self._step_s > 0:
-            off = rest_of(steady)
-            along = float(u @ off[:3]) ** 2
-            known_along = float(u @ both[:3, :3] @ u)
-            squares = np.array([along, (float(off[:3] @ off[:3]) - along) / 2, off[3] ** 2])
-            known = np.array([known_along, (np.trace(both[:3, :3]) - known_along) / 2, both[3, 3]])
-            per = np.full(3, float(blend.steps.seconds[0]) ** 4)
+            per = np.full(3, reckoned.wheels.seconds**4)
+            squares, known = split(off, both, self.calibration.direction)
             acceleration, counts = learnt(acceleration, counts, squares, known, per, LEAST_ACCELERATION)
-        self._taught = instant_ns, calibration, acceleration, counts, errors
-
-
-@dataclass(frozen=True)
-class _Blend:
-    """Poses (K, 4, 4) in the world; `covariance` (4, 4) of the wheels' part in them at the reference, in axes of the anchor."""
-
-    poses: Floats
-    covariance: Floats
-    steps: WheelSteps
-    steady: Floats
+        return LearntFromScan(instant_ns, calibration, acceleration, counts, (_size(rest), _size(off)))
 
 
 def _open(result: RegistrationResult) -> Floats:
