@@ -14,7 +14,7 @@ import numpy as np
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.wheels import WheelStream
-from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, NOISE_MEMORY_SCANS, OFFSET_SIGMA
+from lslam.odometry.inertial.gyroscope import NOISE_MEMORY_SCANS, OFFSET_SIGMA
 from lslam.odometry.kernels import kalman
 
 # One sigma of u: along, tyres and their pressure; across, a vehicle's pitch on its springs; of an axis that nobody states.
@@ -139,12 +139,14 @@ class WheelCalibration:
 
     def corrected(self, step: WheelStep, rest: Floats, C: Floats) -> WheelCalibration:
         """After registration found a step longer by `rest` (4,), m and rad about `up`, with the covariance C (4, 4)."""
-        P, J, size = self.covariance.copy(), step.jacobian, 4 if self.has_yaw else 3
+        P, J, size = self.covariance.copy(), step.jacobian.copy(), 4 if self.has_yaw else 3
+        # By the registered turn: the noise of the measured one would be taken for a scale that is too large.
+        J[3, YAW_SCALE] += self.has_yaw * rest[3] / self.states[YAW_SCALE]
         P[U, U] += SCALE_WALK**2 * step.seconds * np.eye(3)
         P[YAW_OFFSET, YAW_OFFSET] += YAW_OFFSET_WALK**2 * step.seconds
         noise = (self.step_noise(step) + C)[:size, :size]
-        # The norm counts: an error along one axis is one, whatever the others are.
-        states, covariance = kalman.update(self.states, P, J[:size], rest[:size], noise, INNOVATION_SIGMAS / size**0.5)
+        # Slip has no usual size: what is larger than expected counts accordingly less.
+        states, covariance = kalman.update(self.states, P, J[:size], rest[:size], noise, 1.0)
         squares, known = split(rest, J @ P @ J.T + C, self.direction)
         per = np.array([step.way, step.way, step.seconds])
         left, counts = learnt(self.noise, self.counts, squares, known, per, LEAST_NOISE)
