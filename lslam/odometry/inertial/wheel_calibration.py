@@ -14,7 +14,7 @@ import numpy as np
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.wheels import WheelStream
-from lslam.odometry.inertial.gyroscope import NOISE_MEMORY_SCANS, OFFSET_SIGMA
+from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, NOISE_MEMORY_SCANS, OFFSET_SIGMA
 from lslam.odometry.kernels import kalman
 
 # One sigma of u: along, tyres and their pressure; across, a vehicle's pitch on its springs; of an axis that nobody states.
@@ -175,10 +175,12 @@ def learnt(
 
     known : (N,) part of the squares that is not this noise's. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
     its variance: a density grows with each one above, and shrinks with each below, so that slip, however much, counts as one
-    innovation. One counts by the share that is not known: along a direction that registration leaves open it tells nothing.
+    innovation. One counts by the share that is not known: along a direction that registration leaves open it tells nothing. What
+    neither explains, beyond `INNOVATION_SIGMAS`, counts in full.
     """
     own = noise * per
-    share = np.square(own / np.maximum(own + known, 1e-300))
+    is_beyond = squares > INNOVATION_SIGMAS**2 * (own + known)
+    share = np.where(is_beyond, 1.0, np.square(own / np.maximum(own + known, 1e-300)))
     counts = np.minimum(counts + share, NOISE_MEMORY_SCANS)
     side = np.where(squares > MEDIAN_SQUARE * (own + known), 1.0, -1.0)
     return np.maximum(noise * np.exp(share / counts * side), least), counts

@@ -116,8 +116,8 @@ class WheelMotion(ConstantVelocity):
         reckoned = self._reckoned = self._reckon(instant_ns)
         if reckoned is None:
             return result
-        C = result.covariance + _open(result)
-        self._learnt = self._learn_from(reckoned, instant_ns, middle, C)
+        C = result.covariance
+        self._learnt = self._learn_from(reckoned, instant_ns, middle, C + _open(result))
         up = self._pose[:3, :3] @ self.calibration.up
         G = np.zeros((6, 4))
         G[:3, :3], G[3:, 3] = self._pose[:3, :3], up
@@ -191,9 +191,7 @@ class WheelMotion(ConstantVelocity):
         part = gain @ apart
         twist = before + np.concatenate([part[:3], part[3] * up])
         pose = se3.normalise(self._pose @ se3.exp(twist))
-        # The calibration errs alike in every step, and what errs alike adds up as many times faster as there are steps.
-        alike = (len(self._errors) + 1) * self.calibration.spread(wheels)
-        return ReckonedStep(pose, alike + noise + lost, wheels, steady, is_slip)
+        return ReckonedStep(pose, self.calibration.spread(wheels) + noise + lost, wheels, steady, is_slip)
 
     def _learn_from(self, reckoned: ReckonedStep, instant_ns: int, middle: Floats, C: Floats) -> LearntFromScan:
         """What the registered `middle` (4, 4) with covariance C (6, 6) tells of the wheels and of constant velocity."""
