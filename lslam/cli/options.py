@@ -76,6 +76,11 @@ poses = click.option(
     help="Trajectory of another program instead of odometry.",
 )
 imu = click.option("--imu/--no-imu", default=None, help="Predict and deskew with the IMU [default: no].")
+wheels = click.option(
+    "--wheels",
+    metavar="TOPIC|FILE",
+    help="Predict with speeds of wheels: a topic of the bag (Odometry, TwistStamped), or a CSV file beside the scans.",
+)
 resumed = click.option(
     "--resume", is_flag=True, help="Go on with a run that was killed or interrupted; needs its --out."
 )

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
 @click.option("--colour", is_flag=True, help="Colour the map by the images of the recording's cameras.")
 @click.option("--occupancy", is_flag=True, help="Write occupied and free cells, and a floor plan.")
 @options.imu
+@options.wheels
 @click.option("--loops/--no-loops", default=None, help="Close loops where a place is seen again [default: yes].")
 @options.refine
 @options.manual
@@ -160,7 +161,12 @@ def resolved(given: dict[str, Any]) -> Config:
 
 def _variant(config: Config) -> str:
     """Method and sensors as text, for the name of the default folder."""
-    parts = {"-imu": config.imu.use, "-osm": config.osm.extract, "-in-map": config.localize.map}
+    parts = {
+        "-imu": config.imu.use,
+        "-wheels": config.wheels.source,
+        "-osm": config.osm.extract,
+        "-in-map": config.localize.map,
+    }
     return config.odometry.method + "".join(word for word, is_used in parts.items() if is_used)
 
 
@@ -203,6 +209,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         "graph.refine": "true" if given["refine"] else None,
         "map.occupancy": "true" if given["occupancy"] else None,
         "imu.use": None if given["imu"] is None else str(given["imu"]).lower(),
+        "wheels.source": None if given["wheels"] is None else json.dumps(given["wheels"], ensure_ascii=False),
         "input.strict": "true" if given["strict"] else None,
         "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),
         **options.manual_settings(given["loops_file"], given["control"]),

@@ -80,6 +80,9 @@ if TYPE_CHECKING:
     "--gnss-outage", type=(float, float), multiple=True, metavar="FROM TO", help="Seconds without fixes; repeatable."
 )
 @click.option(
+    "--wheels/--no-wheels", default=True, show_default=True, help="Record speed and yaw rate of a car's wheels."
+)
+@click.option(
     "--visit",
     type=int,
     default=0,
@@ -114,6 +117,7 @@ def command(
     imu_model: str,
     gnss_rate: float,
     gnss_outage: tuple[tuple[float, float], ...],
+    wheels: bool,
     visit: int,
     reverse: bool,
     shift: float,
@@ -157,6 +161,7 @@ def command(
     from lslam.simulation.routes import Visit
     from lslam.simulation.scenarios import simulate
     from lslam.simulation.sensors import GnssModel
+    from lslam.simulation.wheels import WheelModel
 
     if plan is not None and out is None and osm is not None and path_file is None:
         _print([_draw_map(scenario, seed, settings, osm, at, plan)], as_json)
@@ -174,6 +179,7 @@ def command(
         origin=at,
         imu=imu_model if imu else None,
         gnss=GnssModel(gnss_rate, outages=gnss_outage) if gnss_rate else None,
+        wheels=WheelModel() if wheels else None,
         static_start=static_start,
         visit=Visit(visit, reverse, shift),
     )

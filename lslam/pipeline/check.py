@@ -47,7 +47,9 @@ def check_config(config: Config) -> None:
     _check_imu(config)
     if config.wheels.source and (config.imu.use or method == "poses"):
         other = "--imu" if config.imu.use else "--poses"
-        raise UsageError(f"--wheels and {other} both say how the sensor moves, and are not weighed together yet: drop one of them")
+        raise UsageError(
+            f"--wheels and {other} both say how the sensor moves, and are not weighed together yet: drop one of them"
+        )
     if config.map.write and (config.map.denoise or config.map.mesh):
         from lslam.maps.mesh import require_open3d
 

@@ -84,9 +84,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
 
     watch.on_start("odometry", len(sequence) - (0 if checkpoints is None else checkpoints.scans))
     inertial = _begin_imu(job)
-    motion: MotionModel | None = job.wheels.motion or inertial.motion
-    if isinstance(job.odometry, GivenPoses):
-        motion = job.odometry.motion
+    motion = job.odometry.motion if isinstance(job.odometry, GivenPoses) else job.wheels.motion or inertial.motion
     with manifest.timed("odometry_s"), Keyframing(store, config) as keyframing:
         results = estimate(
             sequence,
@@ -113,9 +111,8 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     if config.imu.use:
         manifest.imu = close_inertial(inertial, results)
         manifest.problems += inertial.problems
-    if job.wheels.motion is not None:
-        manifest.wheels = close_wheels(job.wheels)
-        manifest.problems += job.wheels.problems
+    manifest.wheels = close_wheels(job.wheels, job.odometry.ignores_prior)
+    manifest.problems += job.wheels.problems
     _report_faults(results, manifest)
     results = join_segments(results, store, config, manifest, watch.should_stop)
     manifest.keyframes = {"count": len(store), "bytes": store.size}

@@ -19,6 +19,7 @@ from lslam.core.kernels import jit
 from lslam.core.machine import available_cores
 from lslam.maps import colour, crispness, merge
 from lslam.odometry.frontend import inertial_start
+from lslam.odometry.inertial import wheel_motion
 from lslam.osm import wall_match
 from lslam.registration import optimiser
 from lslam.registration.preprocessing import ground
@@ -61,6 +62,9 @@ KERNELS = {
     "map": Kernels(lambda config: config.map.write, _of_map, _of_map),
     "colours": Kernels(lambda config: config.map.write and config.map.colour, lambda config: colour.warm_up()),
     "imu": Kernels(lambda config: config.imu.use, lambda config: inertial_start.warm_up(), is_of_scans=True),
+    "wheels": Kernels(
+        lambda config: bool(config.wheels.source), lambda config: wheel_motion.warm_up(), is_of_scans=True
+    ),
 }
 
 

@@ -25,6 +25,7 @@ from lslam.core.errors import (
 from lslam.core.printable import printable_tree, shown
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
+from lslam.core.types.wheels import WheelStream
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
 from lslam.core.version import __version__
 from lslam.io.readers import open_sequence
@@ -116,11 +117,15 @@ def _files(path: Path) -> Iterator[tuple[str, os.stat_result]]:
 
 
 def run_identity(
-    sequence: Sequence, truth: Trajectory | None, config: Config, given: Trajectory | None = None
+    sequence: Sequence,
+    truth: Trajectory | None,
+    config: Config,
+    given: Trajectory | None = None,
+    wheels: WheelStream | None = None,
 ) -> dict[str, str]:
     """Facts that a run and its resumption must share beside the configuration; for manifest.json.
 
-    given : the poses of --poses
+    given : the poses of --poses; wheels : the readings of --wheels
 
     Raises InputError when the recording cannot be listed.
     """
@@ -133,6 +138,7 @@ def run_identity(
         "input": input_digest(sequence, truth),
         "reading": reading.hexdigest(),
         "imu": imu_digest(sequence) if config.imu.use else "",
+        "wheels": "" if wheels is None else _digest(vars(wheels).values()),
         "gnss": _digest(() if gnss is None else vars(gnss).values()),
         "osm": extract_digest(config.osm),
         "poses": _digest(() if given is None else (given.stamps_ns, given.poses)),
@@ -204,6 +210,7 @@ def _difference(
         "input": "the recording or its ground truth is another or was changed",
         "reading": "the recording is read in another way (times, extrinsics, topic)",
         "imu": "the IMU's samples are others",
+        "wheels": "the readings of --wheels are others",
         "gnss": "the satellite fixes are others",
         "osm": "the extract of OpenStreetMap is another",
         "poses": "the poses of --poses are others",

@@ -165,7 +165,9 @@ def in_folder(
     place = out if isinstance(out, RemotePath) else None
     if place is not None:
         check_place(place, overwrite or resume)
-    manifest.identity = run_identity(job.sequence, job.truth, job.config, job.given)
+    manifest.identity = run_identity(
+        job.sequence, job.truth, job.config, job.given, None if job.wheels.motion is None else job.wheels.motion.wheels
+    )
     if place is not None and resume:
         may_go_on(place, manifest.identity, job.config)
     path = out if place is None else spool_of(place)

@@ -61,7 +61,7 @@ def summary(record: RunRecord, evaluation: Evaluation | None) -> str:
     rows = [("status", facts.status), *(("", reason) for reason in facts.reasons if reason not in below)]
     rows += _scan_rows(facts)
     rows.append(("path", f"{facts.path_length:.1f} m in {facts.duration:.1f} s"))
-    rows += imu_rows(record)
+    rows += imu_rows(record) + wheel_rows(record)
     rows += localization_rows(record, evaluation) + back_end_rows(record, evaluation)
     rows += _refined_rows(record)
     rows += _score_rows(record, evaluation)
@@ -109,6 +109,26 @@ def imu_rows(record: RunRecord) -> list[tuple[str, str]]:
     if said := _calibration_text(imu):
         rows.append(("", said))
     return rows
+
+
+def wheel_rows(record: RunRecord) -> list[tuple[str, str]]:
+    """Names and values on the contribution of the wheels; empty without wheels."""
+    wheels = record.manifest.get("wheels")
+    if not wheels:
+        return []
+    own, steady = wheels["prior_error_m"], wheels["constant_velocity_error_m"]
+    if own is None:
+        return [("wheels", "used; no registered scan told their scale")]
+    used = "used" if wheels["used"] else "hardly used"
+    parts = [f"scale {wheels['scale']:.4f} ({wheels['scale_sigma']:.4f})"]
+    parts += [f"slip in {counted(wheels['scans_with_slip'], 'scan')}"] if wheels["scans_with_slip"] else []
+    return [
+        (
+            "wheels",
+            f"{used}; they predict scans to {metres(own)} m, constant velocity to {metres(steady)} m (medians, turns at 10 m)",
+        ),
+        ("", ", ".join(parts)),
+    ]
 
 
 def _calibration_text(imu: dict[str, Any]) -> str:

@@ -88,6 +88,11 @@ def describe_drive(drive: SimulatedDrive) -> dict[str, Any]:
         "sensors": {
             "imu": None if drive.sensors.imu is None else asdict(drive.sensors.imu),
             "gnss": None if drive.sensors.gnss is None else asdict(drive.sensors.gnss),
+            **(
+                {}
+                if sensors.wheels is None or drive.sensors.wheels is None
+                else {"wheels": asdict(drive.sensors.wheels)}
+            ),
         },
         "extrinsics": {key: T for key, T in vars(drive.calibration).items() if key.startswith("T_") and T is not None},
         "place": {
@@ -331,6 +336,7 @@ def _write_texts(drive: SimulatedDrive, folder: Path, camera: SimulatedCamera | 
         ground_truth_frame="cam0",
         imu=None if drive.imu is None else IMU_FILE,
         gnss=None if drive.gnss is None else GNSS_FILE,
+        frames=drive.calibration.frames or None,
         T_lidar_imu=drive.calibration.T_lidar_imu,
         T_lidar_gnss=drive.calibration.T_lidar_gnss,
         lidars={mount.name: mount.T_lidar_other for mount in drive.scenario.lidars} or None,

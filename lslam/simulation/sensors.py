@@ -31,7 +31,11 @@ T_WALKER_ANTENNA = se3.make(np.eye(3), np.array([-0.05, 0.0, 0.25]))
 IMU_FILE, GNSS_FILE, WHEELS_FILE, TRUTH = "imu.csv", "gnss.csv", "wheels.csv", "truth"
 TRUTH_HZ = 100
 BASE = "base_link"
-_IMU_SEED, _GNSS_SEED, _WHEELS_SEED = 2**32 - 11, 2**32 - 12, 2**32 - 14  # of the generators; the scenarios count down from 2**32 - 1
+_IMU_SEED, _GNSS_SEED, _WHEELS_SEED = (
+    2**32 - 11,
+    2**32 - 12,
+    2**32 - 14,
+)  # of the generators; the scenarios count down from 2**32 - 1
 
 
 @dataclass(frozen=True)

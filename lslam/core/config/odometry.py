@@ -321,7 +321,9 @@ class WheelsConfig(Section):
     frame: str = Field(
         "", description="of which they are the speeds, x forward; absent: the messages' own, base_link of a file"
     )
-    wheelbase_m: float | None = Field(None, gt=0, description="m; between the axles, where the file has a steering angle")
+    wheelbase_m: float | None = Field(
+        None, gt=0, description="m; between the axles, where the file has a steering angle"
+    )
     gap_s: float = Field(
         0.2, gt=0, description="s; time without readings beyond which a scan falls back to constant velocity"
     )

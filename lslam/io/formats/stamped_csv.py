@@ -145,8 +145,8 @@ def write_gnss_csv(path: Path, gnss: GnssStream) -> None:
 def read_wheels_csv(path: Path, wheelbase_m: float | None = None, notes: list[str] | None = None) -> WheelStream:
     """Read speeds of wheels, m/s: `stamp_ns` (or seconds), `speed`, or `left` and `right`, their mean; nothing is converted.
 
-    If known, the turn stands in `yaw_rate`, rad/s, or in `steering`, rad, of front wheels `wheelbase_m` before the axle (kinematic
-    bicycle). Raises InputError naming file and line, or what is missing.
+    If known, the turn stands in `yaw_rate`, rad/s, or in `steering`, rad, of front wheels `wheelbase_m` before the axle, as of a
+    kinematic bicycle. Raises InputError naming file and line, or what is missing.
     """
     either = [("speed", "v", "velocity", "linear_x", "speed_m_s"), ("left", "speed_left"), ("right", "speed_right")]
     turns = [("yaw_rate", "angular_z", "wz", "omega", "yaw_rate_rad_s"), ("steering", "steering_angle", "steering_rad")]

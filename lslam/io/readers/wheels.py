@@ -42,20 +42,22 @@ def read_wheels(
     if used.sum() < LEAST_READINGS:
         raise InputError(f"wheels: {source} has {len(wheels)} readings, {int(used.sum())} of them finite and in order")
     if not used.all():
-        problems.append(f"wheels: {int((~used).sum())} of {len(used)} readings of {source} are not finite or go back in time")
+        problems.append(
+            f"wheels: {int((~used).sum())} of {len(used)} readings of {source} are not finite or go back in time"
+        )
     stamps = wheels.stamps_ns[used]
     if stamps[0] > sequence.stamps_ns[-1] or stamps[-1] < sequence.stamps_ns[0]:
         raise InputError(
-            f"wheels: {source} has readings from {1e-9 * stamps[0]:.3f} to {1e-9 * stamps[-1]:.3f} s and no scan lies there, they "
-            f"are from {1e-9 * sequence.stamps_ns[0]:.3f} to {1e-9 * sequence.stamps_ns[-1]:.3f} s: is it of another drive?"
+            f"wheels: {source} has readings from {1e-9 * stamps[0]:.3f} to {1e-9 * stamps[-1]:.3f} s and no scan lies there, "
+            f"they are from {1e-9 * sequence.stamps_ns[0]:.3f} to {1e-9 * sequence.stamps_ns[-1]:.3f} s: is it of another drive?"
         )
     if frame:
-        T = sequence.calibration.T_lidar(frame)
+        T: Floats | None = sequence.calibration.T_lidar(frame)
     else:
         T = sequence.calibration.known().get(own)
         if T is None:
             notes.append(
-                f"wheels: nothing says where {own or 'their frame'} sits; it is estimated. wheels.frame names a frame that is known"
+                f"wheels: nothing says where {own or 'their frame'} sits: it is estimated; wheels.frame names one that is known"
             )
     yaw_rate = None if wheels.yaw_rate is None else wheels.yaw_rate[used]
     return WheelStream(stamps, wheels.speed[used], yaw_rate, T)

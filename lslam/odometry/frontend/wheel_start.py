@@ -9,6 +9,7 @@ from typing import Any
 from lslam.core.config.odometry import WheelsConfig
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers.wheels import read_wheels
+from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.imu_estimate import WORSE_RATIO
 from lslam.odometry.inertial.wheel_calibration import OFFSET_S, YAW_OFFSET, YAW_SCALE, U
 from lslam.odometry.inertial.wheel_motion import WheelMotion
@@ -43,15 +44,21 @@ def begin_wheels(sequence: Sequence, config: WheelsConfig) -> Wheels:
     return part
 
 
-def close_wheels(part: Wheels) -> dict[str, Any]:
-    """What the manifest says of the wheels when the run is over; problems that arose on the way are added to `part`."""
+def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
+    """What the manifest says of the wheels when the run is over, nothing without; `part` gets the problems on the way.
+
+    ignores_prior : of the method
+    """
     motion = part.motion
-    assert motion is not None
+    if motion is None:
+        return {}
+    if ignores_prior:
+        part.problems.append("wheels: the method predicts by itself, they only bridge scans that fail")
     last, errors = motion.calibration, motion.prior_errors()
     scale, sigma = last.scale
     if motion.gap_scans:
         part.problems.append(f"wheels: {motion.gap_scans} scans fell into gaps and were predicted by constant velocity")
-    is_worse = errors is not None and errors[0] > WORSE_RATIO * errors[1]
+    is_worse = errors is not None and errors[0] > WORSE_RATIO * errors[1] + InertialMotion.SLACK_M
     if errors is not None and is_worse:
         part.problems.append(
             f"wheels: they predict scans {errors[0]:.3f} m wrong where constant velocity is {errors[1]:.3f} m wrong, and got "
@@ -71,5 +78,7 @@ def close_wheels(part: Wheels) -> dict[str, Any]:
         "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
     }
     if last.has_yaw:
-        facts["yaw_scale"], facts["yaw_offset_rad_s"] = (round(float(last.states[k]), 5) for k in (YAW_SCALE, YAW_OFFSET))
+        facts["yaw_scale"], facts["yaw_offset_rad_s"] = (
+            round(float(last.states[k]), 5) for k in (YAW_SCALE, YAW_OFFSET)
+        )
     return facts

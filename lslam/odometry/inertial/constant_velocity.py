@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -98,8 +98,8 @@ class ConstantVelocity(Stateful, MotionModel):
     MAX_STRETCH = 5.0
     # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
     MAX_ACCELERATION = 20.0
-    STATE = ("_instant_ns", "_pose", "_twist", "_step_s", "_velocity")
-    CLEARED = ("_predicted",)
+    STATE: ClassVar[tuple[str, ...]] = ("_instant_ns", "_pose", "_twist", "_step_s", "_velocity")
+    CLEARED: ClassVar[tuple[str, ...]] = ("_predicted",)
 
     def __init__(self, pose: Floats | None = None) -> None:
         self._instant_ns: int | None = None

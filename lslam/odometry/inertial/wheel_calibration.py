@@ -1,8 +1,8 @@
 """From speeds of wheels to the LiDAR's motion, and the calibration of the wheels by registered motion.
 
 A step of the LiDAR is linear in what is not known: u, metres that the LiDAR moves along each of its axes per metre of the wheels,
-has their scale and the direction in which the LiDAR is mounted; the arm from the LiDAR to their axle swings with the turn. Scale and
-offset of the yaw rate and the offset of the clocks are states as well.
+has their scale and the direction in which the LiDAR is mounted; the arm from the LiDAR to their axle swings with the turn. Scale
+and offset of the yaw rate and the offset of the clocks are states as well.
 """
 
 from __future__ import annotations

@@ -185,7 +185,7 @@ class WheelMotion(ConstantVelocity):
             change = float(u @ apart[:3])
             is_slip = change**2 > most
             noise[:3, :3] += is_slip * change**2 * np.outer(u, u)
-            gain = np.linalg.solve(others + noise, others).T
+            gain[:] = np.linalg.solve(others + noise, others).T
             # The less of the wheels is in the mean, the less it says: constant velocity is no measurement.
             lost = noise @ np.linalg.solve(others, noise)
         part = gain @ apart
@@ -223,3 +223,13 @@ def _open(result: RegistrationResult) -> Floats:
 
 def _size(rest: Floats) -> float:
     return float(np.linalg.norm(rest[:3]) + LEVER_M * abs(rest[3]))
+
+
+def warm_up() -> None:
+    """Compile or load what the first scans would otherwise wait for."""
+    wheels = WheelStream(np.arange(20, dtype=np.int64) * 20_000_000, np.ones(20), np.zeros(20))
+    motion = WheelMotion(wheels, 1.0)
+    for k in range(3):
+        prior = motion.sweep(100_000_000 * k, Span())
+        result = RegistrationResult(prior.pose, covariance=1e-4 * np.eye(6))
+        motion.correct(100_000_000 * k, motion.fuse(100_000_000 * k, result, prior).T_world_lidar, prior)
