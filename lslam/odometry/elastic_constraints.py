@@ -16,8 +16,7 @@ from lslam.core.geometry import noise, se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
-from lslam.odometry.inertial.constant_velocity import middle_of
-from lslam.odometry.uncertainty import USUAL
+from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, middle_of
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,7 @@ class LastSweep(Stateful):
 
     def _change_over(self, span_s: float) -> Floats:
         """(6, 6) covariance, LiDAR axes, of the change of motion from one sweep to the next."""
-        usual = np.diag((USUAL * span_s**2) ** 2) if self._change is None else self._change
+        usual = np.diag((USUAL_ACCELERATION * span_s**2) ** 2) if self._change is None else self._change
         return np.asarray(usual + LEAST_CHANGE**2 * np.eye(6))
 
 

@@ -19,12 +19,11 @@ from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.state import Stateful
+from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION
 from lslam.registration.result import RegistrationResult
 
 # Scans over which the change of the motion is averaged: a second.
 MEMORY_SCANS = 10
-# m/s2 and rad/s2, prior sigmas of the acceleration: a car brakes, a hand turns.
-USUAL = np.repeat([3.0, 1.0], 3)
 
 
 class DeskewUncertainty(Stateful):
@@ -62,7 +61,9 @@ class DeskewUncertainty(Stateful):
             return np.zeros((6, 6))
         if self.scans == 0:
             T, L = prior.span_s, self._lead_s
-            return np.diag((USUAL * L**2 / 6.0 + USUAL * ((T**2 - L**2) / 24.0 + L * (T - L) / 4.0)) ** 2)
+            return np.diag(
+                (USUAL_ACCELERATION * L**2 / 6.0 + USUAL_ACCELERATION * ((T**2 - L**2) / 24.0 + L * (T - L) / 4.0)) ** 2
+            )
         alike = np.repeat([np.trace(self._mean[:3, :3]) / 3, np.trace(self._mean[3:, 3:]) / 3], 3)
         # The prior that the covariance is isotropic weighs as many scans as it has directions.
         share = self.scans / (self.scans + len(self._mean))

@@ -46,9 +46,9 @@ def check_config(config: Config) -> None:
         raise UsageError("--imu does nothing with --poses, whose motion is given: drop one of them")
     _check_imu(config)
     if config.wheels.source and (config.imu.use or method == "poses"):
-        other = "--imu" if config.imu.use else "--poses"
+        other = "--poses" if method == "poses" else f"the IMU of {method}" if method in TIGHTLY_COUPLED else "--imu"
         raise UsageError(
-            f"--wheels and {other} both say how the sensor moves, and are not weighed together yet: drop one of them"
+            f"--wheels and {other} both predict the motion and are not weighed together yet: drop one of them"
         )
     if config.map.write and (config.map.denoise or config.map.mesh):
         from lslam.maps.mesh import require_open3d

@@ -65,7 +65,7 @@ def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
             "hardly any weight: are they this robot's, in m/s and rad/s, on the clock of the scans?"
         )
     facts = {
-        "used": not is_worse,
+        "used": errors is not None and not is_worse,
         "decisions": part.notes,
         "readings": len(motion.wheels),
         "scale": round(scale, 5),

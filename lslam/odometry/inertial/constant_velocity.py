@@ -17,6 +17,9 @@ from lslam.odometry.inertial.course import Course, motion_covariance
 from lslam.registration.preprocessing.deskew import knots_over
 from lslam.registration.result import RegistrationResult
 
+# m/s2 and rad/s2, prior sigmas of the acceleration: a car brakes, a hand turns.
+USUAL_ACCELERATION = np.repeat([3.0, 1.0], 3)
+
 
 class MotionModel(Protocol):
     """Predicts the pose of a scan and the motion within it, and is corrected by registration.

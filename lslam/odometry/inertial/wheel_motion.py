@@ -14,12 +14,11 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State
 from lslam.core.types.wheels import WheelStream
-from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
+from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, ConstantVelocity, middle_of
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
 from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelStep, by_axis, learnt, split
 from lslam.odometry.kernels import kalman
-from lslam.odometry.uncertainty import USUAL
 from lslam.registration.result import RegistrationResult
 
 # (m/s2)2 along and across, (rad/s2)2: least of what constant velocity does not follow.
@@ -82,7 +81,7 @@ class WheelMotion(ConstantVelocity):
         self.slip_scans = self.gap_scans = 0
         self._gaps = gaps(wheels, gap_s)
         # Of constant velocity: variances along and across, (m/s2)2, and of the turn, (rad/s2)2, and the steps behind them.
-        self._acceleration, self._counts = np.square([USUAL[0], USUAL[0], USUAL[3]]), np.ones(3)
+        self._acceleration, self._counts = np.square(USUAL_ACCELERATION[[0, 0, 3]]), np.ones(3)
         # When wheels last changed their speed by no more than tyres hold, ns.
         self._agreed_ns: int | None = None
         # Until the next `correct`: the step to the scan, and what its registration told.
@@ -216,9 +215,15 @@ class WheelMotion(ConstantVelocity):
 
 
 def _open(result: RegistrationResult) -> Floats:
-    """(6, 6) that a registration's covariance lacks: of directions that no surface holds it says a metre, and knows nothing."""
-    scaled = result.degenerate / np.repeat([1.0, result.lever_arm], 3)
-    return np.asarray(UNTOLD * scaled.T @ scaled)
+    """(6, 6) that a registration's covariance lacks: of directions that no surface holds it says a metre, and knows nothing.
+
+    The direction itself is known to a degree: by what is left of the others, hundreds of scans would tell a scale. So where a way
+    is open, ways teach nothing.
+    """
+    ways, turns = result.degenerate[:, :3], result.degenerate[:, 3:] / result.lever_arm
+    lacks = np.zeros((6, 6))
+    lacks[:3, :3], lacks[3:, 3:] = UNTOLD * np.sum(ways**2) * np.eye(3), UNTOLD * turns.T @ turns
+    return lacks
 
 
 def _size(rest: Floats) -> float:
