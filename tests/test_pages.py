@@ -227,6 +227,9 @@ REGISTER = [match.groups() for match in _ROW.finditer(METHODS.text.split("## Reg
 # Not quantities: empty arrays, indices, sizes, keys and marks.
 MARKS = {
     "ORDER",
+    "YAW_SCALE",
+    "YAW_OFFSET",
+    "OFFSET_S",
     "SHARED",
     "STATE_SIZE",
     "PLANE_SIZE",
