@@ -119,7 +119,7 @@ def wheel_rows(record: RunRecord) -> list[tuple[str, str]]:
     own, steady = wheels["prior_error_m"], wheels["constant_velocity_error_m"]
     if own is None:
         return [("wheels", "no registered scan told their scale")]
-    used = "used" if wheels["used"] else "hardly used"
+    used = "used" if wheels["used"] else "refused on the way"
     parts = [f"scale {wheels['scale']:.4f} ({wheels['scale_sigma']:.4f})"]
     parts += [f"slip in {counted(wheels['scans_with_slip'], 'scan')}"] if wheels["scans_with_slip"] else []
     return [

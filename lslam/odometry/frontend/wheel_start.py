@@ -9,8 +9,6 @@ from typing import Any
 from lslam.core.config.odometry import WheelsConfig
 from lslam.core.types.sequence import Sequence
 from lslam.io.readers.wheels import read_wheels
-from lslam.odometry.inertial.fusion import InertialMotion
-from lslam.odometry.inertial.imu_estimate import WORSE_RATIO
 from lslam.odometry.inertial.wheel_calibration import OFFSET_S, YAW_OFFSET, YAW_SCALE, U
 from lslam.odometry.inertial.wheel_motion import WheelMotion
 
@@ -58,14 +56,10 @@ def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
     scale, sigma = last.scale
     if motion.gap_scans:
         part.problems.append(f"wheels: {motion.gap_scans} scans fell into gaps and were predicted by constant velocity")
-    is_worse = errors is not None and errors[0] > WORSE_RATIO * errors[1] + InertialMotion.SLACK_M
-    if errors is not None and is_worse:
-        part.problems.append(
-            f"wheels: they predict scans {errors[0]:.3f} m wrong where constant velocity is {errors[1]:.3f} m wrong, and got "
-            "hardly any weight: are they this robot's, in m/s and rad/s, on the clock of the scans?"
-        )
+    if motion.refusal:
+        part.problems.append(f"the wheels were refused on the way, the run went on without them: {motion.refusal}")
     facts = {
-        "used": errors is not None and not is_worse,
+        "used": errors is not None and not motion.refusal,
         "decisions": part.notes,
         "readings": len(motion.wheels),
         "scale": round(scale, 5),

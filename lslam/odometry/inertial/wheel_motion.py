@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -15,11 +16,15 @@ from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State
 from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, ConstantVelocity, middle_of
+from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS
 from lslam.odometry.inertial.imu_cleaning import covers, gaps
+from lslam.odometry.inertial.imu_estimate import WORSE_RATIO
 from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelStep, by_axis, learnt, split
 from lslam.odometry.kernels import kalman
 from lslam.registration.result import RegistrationResult
+
+log = logging.getLogger("lslam")
 
 # (m/s2)2 along and across, (rad/s2)2: least of what constant velocity does not follow.
 LEAST_ACCELERATION = np.array([0.1, 0.1, 0.03]) ** 2
@@ -44,13 +49,16 @@ class ReckonedStep:
 
 @dataclass(frozen=True)
 class LearntFromScan:
-    """What a registered step told: the calibration, the accelerations with their counts, and how wrong each predicted, m."""
+    """What a registered step told: the calibration, the accelerations with their counts, and how wrong each predicted, m.
+
+    errors : none where surfaces leave the way open
+    """
 
     instant_ns: int
     calibration: WheelCalibration
     acceleration: Floats
     counts: Floats
-    errors: tuple[float, float]
+    errors: tuple[float, float] | None
 
 
 class WheelMotion(ConstantVelocity):
@@ -66,6 +74,7 @@ class WheelMotion(ConstantVelocity):
     STATE: ClassVar[tuple[str, ...]] = (
         *ConstantVelocity.STATE,
         "calibration",
+        "refusal",
         "slip_scans",
         "gap_scans",
         "_acceleration",
@@ -78,6 +87,7 @@ class WheelMotion(ConstantVelocity):
         super().__init__(pose)
         self.wheels, self.gap_s = wheels, gap_s
         self.calibration = WheelCalibration.of(wheels)
+        self.refusal = ""
         self.slip_scans = self.gap_scans = 0
         self._gaps = gaps(wheels, gap_s)
         # Of constant velocity: variances along and across, (m/s2)2, and of the turn, (rad/s2)2, and the steps behind them.
@@ -137,12 +147,14 @@ class WheelMotion(ConstantVelocity):
         if reckoned is not None:
             self.slip_scans += reckoned.is_slip
             self._agreed_ns = self._agreed_ns if reckoned.is_slip else instant_ns
-        elif self._instant_ns is not None and not covers(self._gaps, self._instant_ns, instant_ns):
+        elif not self.refusal and self._instant_ns is not None and not covers(self._gaps, self._instant_ns, instant_ns):
             self.gap_scans += 1
         if learnt_now is not None and learnt_now.instant_ns == instant_ns:
             self.calibration = learnt_now.calibration
             self._acceleration, self._counts = learnt_now.acceleration, learnt_now.counts
-            self._errors.append(learnt_now.errors)
+            if learnt_now.errors is not None:
+                self._errors.append(learnt_now.errors)
+                self._judge()
         self._reckoned = self._learnt = None
         super().correct(stamp_ns, pose, prior, is_registered)
 
@@ -162,10 +174,22 @@ class WheelMotion(ConstantVelocity):
         super().restore(state)
         self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
 
+    def _judge(self) -> None:
+        """Refuse wheels that predict scans clearly worse than constant velocity does, as an IMU is refused."""
+        if self.refusal or len(self._errors) < InertialMotion.JUDGED:
+            return
+        own, steady = np.median(np.array(self._errors[-InertialMotion.JUDGED :]), axis=0)
+        if own > WORSE_RATIO * steady + InertialMotion.SLACK_M:
+            self.refusal = (
+                f"they predict scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
+                f"{LEVER_M:.0f} m): are they this robot's, in m/s and rad/s, on the clock of the scans?"
+            )
+            log.warning("the wheels are refused from here on: %s", self.refusal)
+
     def _reckon(self, instant_ns: int) -> ReckonedStep | None:
         """The step from the newest pose to an instant; None where there is none, or wheels say nothing of it."""
         begin_ns = self._instant_ns
-        if begin_ns is None or instant_ns <= begin_ns or not covers(self._gaps, begin_ns, instant_ns):
+        if self.refusal or begin_ns is None or instant_ns <= begin_ns or not covers(self._gaps, begin_ns, instant_ns):
             return None
         up, u, is_known = self.calibration.up, self.calibration.direction, self._step_s > 0
         yaw_rate = float(up @ self._twist[3:]) / self._step_s if is_known else 0.0
@@ -211,7 +235,10 @@ class WheelMotion(ConstantVelocity):
             per = np.full(3, reckoned.wheels.seconds**4)
             squares, known = split(off, both, self.calibration.direction)
             acceleration, counts = learnt(acceleration, counts, squares, known, per, LEAST_ACCELERATION)
-        return LearntFromScan(instant_ns, calibration, acceleration, counts, (_size(rest), _size(off)))
+        is_open = np.trace(C[:3, :3]) > UNTOLD
+        return LearntFromScan(
+            instant_ns, calibration, acceleration, counts, None if is_open else (_size(rest), _size(off))
+        )
 
 
 def _open(result: RegistrationResult) -> Floats:
