@@ -118,7 +118,9 @@ def wheel_rows(record: RunRecord) -> list[tuple[str, str]]:
         return []
     own, steady = wheels["prior_error_m"], wheels["constant_velocity_error_m"]
     if own is None:
-        return [("wheels", "no registered scan told their scale")]
+        return [
+            ("wheels", f"{'' if wheels['used'] else 'not '}used; no scan with surfaces along the way told their scale")
+        ]
     used = "used" if wheels["used"] else "refused on the way"
     parts = [f"scale {wheels['scale']:.4f} ({wheels['scale_sigma']:.4f})"]
     parts += [f"slip in {counted(wheels['scans_with_slip'], 'scan')}"] if wheels["scans_with_slip"] else []

@@ -59,7 +59,7 @@ def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
     if motion.refusal:
         part.problems.append(f"the wheels were refused on the way, the run went on without them: {motion.refusal}")
     facts = {
-        "used": errors is not None and not motion.refusal,
+        "used": not (motion.refusal or ignores_prior),
         "decisions": part.notes,
         "readings": len(motion.wheels),
         "scale": round(scale, 5),

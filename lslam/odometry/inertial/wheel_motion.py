@@ -22,6 +22,7 @@ from lslam.odometry.inertial.imu_cleaning import covers, gaps
 from lslam.odometry.inertial.imu_estimate import WORSE_RATIO
 from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelStep, by_axis, learnt, split
 from lslam.odometry.kernels import kalman
+from lslam.odometry.kernels.rotation import apart
 from lslam.registration.result import RegistrationResult
 
 log = logging.getLogger("lslam")
@@ -80,6 +81,7 @@ class WheelMotion(ConstantVelocity):
         "_acceleration",
         "_counts",
         "_agreed_ns",
+        "_was_bridged",
     )
     CLEARED: ClassVar[tuple[str, ...]] = (*ConstantVelocity.CLEARED, "_reckoned", "_learnt")
 
@@ -94,6 +96,8 @@ class WheelMotion(ConstantVelocity):
         self._acceleration, self._counts = np.square(USUAL_ACCELERATION[[0, 0, 3]]), np.ones(3)
         # When wheels last changed their speed by no more than tyres hold, ns.
         self._agreed_ns: int | None = None
+        # Whether the newest pose has no registration.
+        self._was_bridged = False
         # Until the next `correct`: the step to the scan, and what its registration told.
         self._reckoned: ReckonedStep | None = None
         self._learnt: LearntFromScan | None = None
@@ -105,6 +109,11 @@ class WheelMotion(ConstantVelocity):
         empty = other.state()
         other.restore({**self.state(), **{name: empty[name] for name in ConstantVelocity.STATE}})
         return other
+
+    @property
+    def is_inertial(self) -> bool:
+        """Whether wheels predicted the newest sweep: a denied or lost scan is searched near there."""
+        return self._reckoned is not None and self._step_s > 0
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """Poses over the `span` of the sweep; the one at the stamp when it takes no time."""
@@ -134,8 +143,14 @@ class WheelMotion(ConstantVelocity):
         P[3:, 3:] += UNTOLD * (np.eye(3) - np.outer(up, up))
         turn = so3.log(middle[:3, :3] @ reckoned.pose[:3, :3].T)
         rest = np.concatenate([middle[:3, 3] - reckoned.pose[:3, 3], turn])
-        # Beyond so many sigma one of both is wrong, and the registration was accepted.
-        P *= max(1.0, kalman.square(rest, P + 2 * C) / INNOVATION_SIGMAS**2)
+        excess = kalman.square(rest, P + 2 * C) / INNOVATION_SIGMAS**2
+        if excess > len(G.T) and self._is_denied(reckoned, middle):
+            pose = reckoned.pose @ se3.relative(middle, result.T_world_lidar)
+            metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
+            reason = f"registration is {metres:.2f} m and {degrees:.1f} deg from what the wheels told"
+            return result.rejected(reason, pose, C + G @ reckoned.covariance @ G.T)
+        # Beyond so many sigma one of both is wrong, and nothing tells which.
+        P *= max(1.0, excess)
         return result.moved(*kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age))
 
     def correct(
@@ -156,6 +171,7 @@ class WheelMotion(ConstantVelocity):
                 self._errors.append(learnt_now.errors)
                 self._judge()
         self._reckoned = self._learnt = None
+        self._was_bridged = not is_registered
         super().correct(stamp_ns, pose, prior, is_registered)
 
     def prior_errors(self) -> tuple[float, float] | None:
@@ -173,6 +189,16 @@ class WheelMotion(ConstantVelocity):
         """Go on where `state` was taken."""
         super().restore(state)
         self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
+
+    def _is_denied(self, reckoned: ReckonedStep, middle: Floats) -> bool:
+        """Whether constant velocity is nearer to the wheels than to a registration that contradicts them.
+
+        Never twice in a row, as with an IMU: a registration that insists is right.
+        """
+        if self._was_bridged or self._step_s <= 0:
+            return False
+        steady, registered = reckoned.steady, se3.relative(self._pose, middle)
+        return bool(apart(steady, reckoned.wheels.pose, LEVER_M) < apart(steady, registered, LEVER_M))
 
     def _judge(self) -> None:
         """Refuse wheels that predict scans clearly worse than constant velocity does, as an IMU is refused."""
@@ -196,7 +222,7 @@ class WheelMotion(ConstantVelocity):
         wheels = self.calibration.step(self.wheels, begin_ns, instant_ns, yaw_rate)
         steady = se3.relative(self._pose, self.predict(instant_ns))
         before, by_wheels = se3.log(steady), se3.log(wheels.pose)
-        apart = np.append(by_wheels[:3] - before[:3], up @ (by_wheels[3:] - before[3:]))
+        more = np.append(by_wheels[:3] - before[:3], up @ (by_wheels[3:] - before[3:]))
         noise, seconds = self.calibration.step_noise(wheels), wheels.seconds
         gain, is_slip, lost = np.eye(4), False, np.zeros((4, 4))
         if is_known:
@@ -205,13 +231,13 @@ class WheelMotion(ConstantVelocity):
             others[3, 3] = seconds**4 * self._acceleration[2]
             since = seconds if self._agreed_ns is None else max(seconds, 1e-9 * (instant_ns - self._agreed_ns))
             most = (GRAVITY * since * seconds) ** 2 + INNOVATION_SIGMAS**2 * float(u @ noise[:3, :3] @ u)
-            change = float(u @ apart[:3])
+            change = float(u @ more[:3])
             is_slip = change**2 > most
             noise[:3, :3] += is_slip * change**2 * np.outer(u, u)
             gain[:] = np.linalg.solve(others + noise, others).T
             # The less of the wheels is in the mean, the less it says: constant velocity is no measurement.
             lost = noise @ np.linalg.solve(others, noise)
-        part = gain @ apart
+        part = gain @ more
         twist = before + np.concatenate([part[:3], part[3] * up])
         pose = se3.normalise(self._pose @ se3.exp(twist))
         return ReckonedStep(pose, self.calibration.spread(wheels) + noise + lost, wheels, steady, is_slip)
