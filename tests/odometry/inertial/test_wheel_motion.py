@@ -70,9 +70,9 @@ def drive(
             C = COVARIANCE.copy()
             C[:3, :3] += np.outer(forward, forward)
             result = replace(result, T_world_lidar=pose, covariance=C, degenerate=np.append(forward, np.zeros(3))[None])
-        pose = motion.fuse(stamp, result, prior).T_world_lidar
-        motion.correct(stamp, pose, prior)
-        found.append(pose)
+        fused = motion.fuse(stamp, result, prior)
+        motion.correct(stamp, fused.T_world_lidar, prior, fused.is_accepted)
+        found.append(fused.T_world_lidar)
     return np.array(errors), np.stack(found)
 
 
@@ -176,11 +176,31 @@ def test_wheels_of_another_robot_get_no_weight() -> None:
     other = replace(wheels, speed=wheels.speed[::-1] / 0.3048, yaw_rate=-3 * wheels.yaw_rate)
     motion, alone = WheelMotion(other, 0.2), ConstantVelocity()
     (errors, found), (steady, without) = (drive(one, stamps, poses) for one in (motion, alone))
-    assert np.median(errors[40:]) < 2 * np.median(steady[40:])
+    assert "are they this robot's" in motion.refusal
+    np.testing.assert_allclose(np.median(errors[40:]), np.median(steady[40:]), rtol=0.2)
     off, usual = (float(np.sqrt(np.mean((p[40:, :3, 3] - poses[40:, :3, 3]) ** 2))) for p in (found, without))
     assert off < 1.1 * usual
     own, constant = motion.prior_errors() or (0.0, 0.0)
     assert own > 5 * constant
+
+
+def test_a_registration_that_both_deny_is_bridged_and_one_that_insists_is_not() -> None:
+    stamps, poses = truth(10.0)
+    motion = WheelMotion(readings(10.0), 0.2)
+    drive(motion, stamps[:80], poses[:80])
+    accepted = []
+    for k in (80, 81):
+        prior = motion.sweep(int(stamps[k]), Span())
+        wrong = poses[k] @ se3.make(np.eye(3), 0.6 * T_LIDAR_BASE[:3, 0])
+        fused = motion.fuse(int(stamps[k]), RegistrationResult(wrong, covariance=COVARIANCE), prior)
+        accepted.append(fused.is_accepted)
+        if not fused.is_accepted:
+            assert "from what the wheels told" in fused.reason
+            assert np.linalg.norm(se3.relative(fused.T_world_lidar, poses[k])[:3, 3]) < 0.05
+            assert fused.covariance is not None
+            assert np.sqrt(np.diag(fused.covariance)).max() < 0.1
+        motion.correct(int(stamps[k]), fused.T_world_lidar, prior, fused.is_accepted)
+    assert accepted == [False, True]
 
 
 def test_where_nothing_places_them_direction_and_arm_are_found() -> None:
