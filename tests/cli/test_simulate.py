@@ -37,7 +37,7 @@ def test_list_names_scenarios_and_sensors() -> None:
         "block", "carpark", "climbing", "climbing-hard", "closed", "closed-hard", "corridor", "forest-road", "identical",
         "large-eight", "large-eight-hard", "lights", "motorway", "open", "open-hard", "park", "quadrotor", "residential",
         "residential-hard", "room",
-        "small-eight", "small-eight-hard", "stairs", "street", "two-lidars", "urban", "urban-hard", "walk",
+        "small-eight", "small-eight-hard", "stairs", "street", "tunnel", "two-lidars", "urban", "urban-hard", "walk",
         "sample", "vlp16", "hdl64", "hdl64-kitti",
         "os1-16", "os1-32", "os1-64", "livox", "icm20948", "icm20948-calibrated", "phone", "phone-calibrated", "ideal",
     ]  # fmt: skip
