@@ -164,7 +164,7 @@ class WheelMotion(ConstantVelocity):
             self._agreed_ns = self._agreed_ns if reckoned.is_slip else instant_ns
         elif not self.refusal and self._instant_ns is not None and not covers(self._gaps, self._instant_ns, instant_ns):
             self.gap_scans += 1
-        if learnt_now is not None and learnt_now.instant_ns == instant_ns:
+        if is_registered and learnt_now is not None and learnt_now.instant_ns == instant_ns:
             self.calibration = learnt_now.calibration
             self._acceleration, self._counts = learnt_now.acceleration, learnt_now.counts
             if learnt_now.errors is not None:
