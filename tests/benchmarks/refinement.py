@@ -28,7 +28,7 @@ DRIVES: dict[str, tuple[str, str, int, bool, tuple[str, ...]]] = {
     "residential": ("residential", "vlp16", 300, True, ()),
     "residential + drift": ("residential", "vlp16", 300, True, DRIFT),
     "urban + drift": ("urban", "hdl64", 200, False, DRIFT),
-    "residential + drift, fixes": ("residential", "vlp16", 300, True, (*DRIFT, "gnss.mode=graph")),
+    "residential + drift + fixes": ("residential", "vlp16", 300, True, (*DRIFT, "gnss.mode=graph")),
     "corridor": ("corridor", "vlp16", 200, True, ()),
     "stairs": ("stairs", "vlp16", 200, True, ()),
     "room": ("room", "vlp16", 150, True, ()),
