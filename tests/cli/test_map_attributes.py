@@ -164,7 +164,7 @@ def test_what_cannot_be_is_said_in_one_sentence(ran: Path, tmp_path: Path) -> No
             "map.attributes needs labels of points",
         ),
         (("map", run, "--voxel", 0.001), 2, "must be 0.01 m or more, or 0 for every point"),
-        (("map", run, "--voxel", 0, "--mesh"), 2, "mesh and denoise need voxels"),
+        (("map", run, "--voxel", 0, "--mesh"), 2, "mesh, denoise and colour need voxels"),
         (
             ("map", run, "--against", run, "--changes", tmp_path / "c", "--attributes", "time"),
             2,

@@ -176,7 +176,7 @@ def _oxts(folder: Path) -> list[Files]:
     return [rows | {"timestamps.txt": stamps}, rows | {"timestamps.txt": b"9999-99-99 99:99:99\n"}]
 
 
-_IDENTITY = dict.fromkeys(("input", "reading", "imu", "gnss", "osm", "poses", "manual"), "x")
+_IDENTITY = dict.fromkeys(("input", "reading", "imu", "wheels", "gnss", "osm", "poses", "manual"), "x")
 _SCANS_CSV = "index,stamp_ns,status,posed_by\n" + "".join(f"{k},0,ok,\n" for k in range(5))
 _GEOREFERENCE = {
     "origin_lat_lon_height": [49.0, 8.4, 110.0],
