@@ -12,6 +12,7 @@ from lslam.core.printable import counted, metres
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import summed
 from lslam.evaluation.evaluate import shown_metrics
+from lslam.maps.colour import ColourCounts
 from lslam.reports.back_end import back_end_rows, before_and_after
 from lslam.reports.facts import Failure, RunFacts, run_facts
 
@@ -188,12 +189,14 @@ def _refined_rows(record: RunRecord) -> list[tuple[str, str]]:
 
 
 def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
-    """Names and values on the map's entropy, which compares methods without ground truth."""
-    score = record.crispness
+    """Names and values on the map's colours, and on its entropy, which compares methods without ground truth."""
+    score, colour = record.crispness, record.manifest.get("map_colour")
+    rows = [] if colour is None else [("colour", str(ColourCounts(**colour)))]
     if score is None or score.entropy is None or score.plane_variance is None:
-        return []
+        return rows
     thickness = f"planes {metres(score.plane_variance**0.5)} m thick (root of the mean plane variance)"
-    return [("crispness", f"map entropy {score.entropy:.3f}, {thickness}, within {score.radius:g} m; lower is crisper")]
+    said = f"map entropy {score.entropy:.3f}, {thickness}, within {score.radius:g} m; lower is crisper"
+    return [*rows, ("crispness", said)]
 
 
 def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:

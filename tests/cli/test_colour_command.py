@@ -20,6 +20,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     done = lslam("run", root / "town", "--colour", "--no-loops", "--out", root / "run", "-q")
     assert done.returncode == 0, done.stderr
+    (root / "said.txt").write_text(done.stdout)
     return root / "run"
 
 
@@ -31,9 +32,9 @@ def test_a_run_has_a_coloured_map_and_counts_what_is_grey(ran: Path) -> None:
     assert counts == {"points": len(colours), "unseen": unseen, "images": 5, "outside": 0, "unreadable": 0}
     assert 0 < unseen < len(colours)
     done = strict_json((ran / "map.json").read_text())["done"]
-    assert done == [
-        f"coloured: {len(colours) - unseen} of {len(colours)} points from 5 images; {unseen} that none shows are grey"
-    ]
+    said = f"{len(colours) - unseen} of {len(colours)} points from 5 images; {unseen} that none shows are grey"
+    assert done == [f"coloured: {said}"]
+    assert f"  colour       {said}\n" in (ran.parent / "said.txt").read_text()
 
 
 def test_a_map_built_anew_has_the_same_colours_in_every_format(ran: Path, tmp_path: Path) -> None:
