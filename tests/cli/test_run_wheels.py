@@ -43,7 +43,7 @@ def test_they_carry_through_a_tunnel_and_threads_change_nothing(tunnel: Path, tm
     ("words", "code", "said"),
     [
         (("--wheels", "odometry.csv"), 3, "no such file"),
-        (("--wheels", "imu.csv"), 3, "no speed of wheels"),
+        (("--wheels", "imu.csv"), 3, "no line has a speed of wheels"),
         (("--wheels", "wheels.csv", "--set", "wheels.frame=axle"), 3, "nothing says where frame axle sits"),
         (("--wheels", "wheels.csv", "--imu"), 2, "not weighed together yet"),
         (("--wheels", "wheels.csv", "--method", "fast-lio2"), 2, "the IMU of fast-lio2"),

@@ -155,7 +155,7 @@ def read_wheels_csv(path: Path, wheelbase_m: float | None = None, notes: list[st
     if np.isnan(speed).all():
         speed = 0.5 * (left + right)
     if not len(stamps) or np.isnan(speed).all():
-        raise InputError(f"{path}: no speed of wheels; a column speed, in m/s, is needed, or left and right")
+        raise InputError(f"{path}: no line has a speed of wheels: column speed, in m/s, or left and right")
     if np.isnan(yaw_rate).all() and not np.isnan(steering).all():
         if wheelbase_m is None:
             raise InputError(

@@ -21,6 +21,8 @@ BASE = "base_link"
 WHEELS = Companion("wheels", "--wheels", "Odometry or TwistStamped", read_twists, "--wheels")
 # Fewer readings tell no motion.
 LEAST_READINGS = 2
+# m/s, of what has mass, and rad/s of its parts a metre apart: beyond, and NaN, is no reading.
+LIGHT_M_S = 299_792_458.0
 
 
 def read_wheels(
@@ -36,7 +38,9 @@ def read_wheels(
         wheels, own = _of_bag(sequence, bag, source, Voice(notes, problems))
     else:
         wheels, own = _of_file(sequence, source, wheelbase_m, notes), BASE
-    finite = np.isfinite(wheels.speed) & (True if wheels.yaw_rate is None else np.isfinite(wheels.yaw_rate))
+    finite = np.abs(wheels.speed) < LIGHT_M_S
+    if wheels.yaw_rate is not None:
+        finite &= np.abs(wheels.yaw_rate) < LIGHT_M_S
     ahead = np.append(True, wheels.stamps_ns[1:] > np.maximum.accumulate(wheels.stamps_ns)[:-1])
     used = finite & ahead
     if used.sum() < LEAST_READINGS:

@@ -117,9 +117,9 @@ def test_two_wheels_and_a_steering_angle(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("t,torque\n0.0,1.0\n", "no speed of wheels"),
+        ("t,torque\n0.0,1.0\n", "no line has a speed of wheels"),
         ("t,speed\n0.0,1.0\n", "has 1 readings"),
-        ("t,speed\n0.0,nan\n0.1,nan\n", "no speed of wheels"),
+        ("t,speed\n0.0,nan\n0.1,nan\n", "no line has a speed of wheels"),
         ("t,speed\n5000.0,1.0\n5000.1,1.0\n5000.2,1.0\n", "no scan lies there"),
     ],
 )
@@ -140,8 +140,8 @@ def test_readings_that_cannot_be_used_are_left_out_and_said(tmp_path: Path) -> N
     path.mkdir()
     for k in range(3):
         np.zeros((50, 4), np.float32).tofile(path / f"{k:06d}.bin")
-    (path / "wheels.csv").write_text("t,speed\n0.0,1.0\n0.1,nan\n0.2,1.0\n0.3,2.0\n")
+    (path / "wheels.csv").write_text("t,speed\n0.0,1.0\n0.1,nan\n0.2,1.0\n0.25,-1e300\n0.3,2.0\n")
     problems: list[str] = []
     wheels = read_wheels(open_sequence(path), "wheels.csv", "", None, [], problems)
     assert wheels.speed.tolist() == [1.0, 1.0, 2.0]
-    assert any("1 of 4 readings" in problem for problem in problems)
+    assert any("2 of 5 readings" in problem for problem in problems)
