@@ -204,16 +204,16 @@ def _corrections(
     numbers, means, covariances = plane_adjustment.sums(sighting, int(sighting[-1]) + 1, swept.points[order])
     shares = np.bincount(sighting, swept.shares[order]) / numbers
     seen = planes[is_first]
-    starts = np.searchsorted(seen, np.arange(int(seen[-1]) + 2))
+    starts, first = np.searchsorted(seen, np.arange(int(seen[-1]) + 2)), at[is_first]
     H, beside, g, coupling, own = plane_adjustment.equations(
-        starts, at[is_first], shares, means, covariances, np.ascontiguousarray(poses[:, :3, 3]), FLOOR_M**2
+        starts, first, shares, means, covariances, np.ascontiguousarray(poses[:, :3, 3]), FLOOR_M**2
     )
 
     stiffness = np.repeat([level.step_m**-2, (level.step_m / LEVER_M) ** -2], 3)
 
     def product(x: Floats) -> Floats:
         out = np.empty_like(x)
-        plane_adjustment.product(x, H, beside, starts, at[is_first], coupling, own, stiffness, out)
+        plane_adjustment.product(x, H, beside, starts, first, coupling, own, stiffness, out)
         return out if prior is None else out + prior.product(x)
 
     diagonal = H + np.diag(2.0 * stiffness) + (0.0 if prior is None else prior.blocks(len(H)))

@@ -35,15 +35,26 @@ def build_finished_map(
     should_stop: Callable[[], bool],
     spool: Path | None = None,
     checkpoints: MapCheckpoints | None = None,
+    problems: list[str] | None = None,
 ) -> BuiltMap:
-    """The map of `build_map`, coloured if the configuration says so. Raises as `build_map` and `colour_map`."""
+    """The map of `build_map`, coloured if the configuration says so. Raises as `build_map` and `colour_map`.
+
+    problems : takes why no image colours the map, which stays as it is then; None where that raises
+    """
     if not config.map.colour:
         return build_map(sequence, results, config, on_step, should_stop, spool, checkpoints)
     cameras_of(sequence)  # what is wrong with them is said before the work
     built = build_map(sequence, results, config, on_step, should_stop, spool, checkpoints)
     log.info("colouring the map")
-    with asking(should_stop, INTERRUPTED):
-        coloured, counts = colour_map(built.merged, sequence, results, config, should_stop, spool)
+    try:
+        with asking(should_stop, INTERRUPTED):
+            coloured, counts = colour_map(built.merged, sequence, results, config, should_stop, spool)
+    except InputError as error:
+        if problems is None:
+            raise
+        problems.append(f"{error}; it is written without")
+        log.warning("%s", problems[-1])
+        return built
     return replace(built, merged=coloured, colour=counts, done=(*built.done, f"coloured: {counts}"))
 
 

@@ -104,6 +104,7 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
             watch.should_stop,
             folder.path,
             map_checkpoints(folder, config),
+            manifest.problems,
         )
         score = crispness(built.merged) if config.map.voxel else None
         outputs.write_map(folder, built, config.map, record)

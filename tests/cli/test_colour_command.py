@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import laspy
@@ -93,3 +94,20 @@ def test_a_merge_says_that_it_has_no_colours(ran: Path, tmp_path: Path) -> None:
     assert "merged maps have no colours; those of their runs have, by lslam map RUN --colour" in done.stderr
     assert_one_sentence(done.stderr)
     assert not (tmp_path / "town").exists()
+
+
+def test_a_run_whose_images_are_broken_ends_with_a_map_and_says_so(ran: Path, tmp_path: Path) -> None:
+    shutil.copytree(ran.parent / "town", tmp_path / "town")
+    images = sorted((tmp_path / "town").rglob("*.png"))
+    assert images
+    for image in images:
+        image.write_bytes(image.read_bytes()[:60])
+    done = lslam("run", tmp_path / "town", "--colour", "--no-loops", "--out", tmp_path / "run", "-q")
+    assert done.returncode == 0, done.stderr
+    assert "can colour its map" in done.stdout
+    manifest = strict_json((tmp_path / "run" / "manifest.json").read_text())
+    assert manifest["status"] == "degraded"
+    assert "map_colour" not in manifest
+    columns = ply_columns(tmp_path / "run" / "map.ply")
+    assert "red" not in columns
+    assert len(columns["x"]) == len(ply_columns(ran / "map.ply")["x"])
