@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lslam.backend.graph.held_poses import HeldPoses
+from lslam.backend.graph.pose_prior import PosePrior
 from lslam.backend.kernels import plane_adjustment
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.stopping import checking
@@ -103,11 +103,11 @@ class Adjusted:
 
 
 def adjust(
-    poses: Floats, swept: SweptPoints, used: Bools, held: HeldPoses | None = None, numbers: Longs = NO_NUMBERS
+    poses: Floats, swept: SweptPoints, used: Bools, prior: PosePrior | None = None, numbers: Longs = NO_NUMBERS
 ) -> Adjusted:
     """Correct the `poses` (K, 4, 4) for the planes in the `used` (N,) part of the points; the rest moves with them.
 
-    held : what else is known of some poses, of which these are the `numbers`, -1 for none
+    prior : what else is known of some poses, of which these are the `numbers`, -1 for none
     Where nothing holds the run as a whole, the mean correction is about zero.
     """
     rounds = 0
@@ -117,8 +117,8 @@ def adjust(
         total = np.zeros((len(knots), 6))
         for _ in checking(range(level.rounds)):
             seen = swept.on_knots(knots)
-            prior = None if held is None else _knot_prior(held, numbers, poses, places, poses[knots])
-            corrections = _corrections(poses[knots], seen.select(used), level, total, prior)
+            on_knots = None if prior is None else _knot_prior(prior, numbers, poses, places, poses[knots])
+            corrections = _corrections(poses[knots], seen.select(used), level, total, on_knots)
             if corrections is None:
                 break
             if not level.is_free:
@@ -144,10 +144,10 @@ class _KnotPrior:
     """What is known of some poses, in terms of the corrections of the two knots round each.
 
     knots : (2, K) their numbers, J : (2, K, 6, 6) effect of their corrections; changes : (K, 6) of the poses so far
-    which : (K,) numbers of these poses among those of `held`
+    which : (K,) numbers of these poses among those of `of_poses`
     """
 
-    held: HeldPoses
+    of_poses: PosePrior
     which: Longs
     knots: Longs
     J: Floats
@@ -164,19 +164,19 @@ class _KnotPrior:
     def blocks(self, count: int) -> Floats:
         """(count, 6, 6) on the diagonal, but for what eliminated unknowns take from it."""
         out = np.zeros((count, 6, 6))
-        np.add.at(out, self.knots, np.swapaxes(self.J, -1, -2) @ self.held.blocks[self.which] @ self.J)
+        np.add.at(out, self.knots, np.swapaxes(self.J, -1, -2) @ self.of_poses.blocks[self.which] @ self.J)
         return out
 
     def _back(self, changes: Floats, count: int) -> Floats:
-        everywhere = np.zeros((len(self.held.poses), 6))
+        everywhere = np.zeros((len(self.of_poses.poses), 6))
         everywhere[self.which] = changes
-        force = self.held.product(everywhere)[self.which]
+        force = self.of_poses.product(everywhere)[self.which]
         out = np.zeros((count, 6))
         np.add.at(out, self.knots, np.einsum("skji,kj->ski", self.J, force))
         return out
 
 
-def _knot_prior(held: HeldPoses, numbers: Longs, poses: Floats, places: SweptPoints, knots: Floats) -> _KnotPrior:
+def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPoints, knots: Floats) -> _KnotPrior:
     """The prior by what is known of the poses with `numbers` (-1 for none), which now lie at `places` between the `knots`."""
     which = np.flatnonzero(numbers >= 0)
     own = numbers[which]
@@ -185,7 +185,7 @@ def _knot_prior(held: HeldPoses, numbers: Longs, poses: Floats, places: SweptPoi
     J = np.zeros((2, len(own), 6, 6))
     J[:] = np.eye(6)
     J[..., :3, 3:] = -so3.hat(poses[own, :3, 3] - knots[at, :3, 3])
-    return _KnotPrior(held, which, at, shares[..., None, None] * J, noise.changes(held.poses[which], poses[own]))
+    return _KnotPrior(prior, which, at, shares[..., None, None] * J, noise.changes(prior.poses[which], poses[own]))
 
 
 def _corrections(
@@ -218,10 +218,10 @@ def _corrections(
 
     diagonal = H + np.diag(2.0 * stiffness) + (0.0 if prior is None else prior.blocks(len(H)))
     preconditioner = plane_adjustment.inverses(diagonal)
-    held = stiffness * np.diff(total, axis=0)
+    force = stiffness * np.diff(total, axis=0)
     pull = np.zeros_like(g)
-    pull[1:] += held
-    pull[:-1] -= held
+    pull[1:] += force
+    pull[:-1] -= force
     if prior is not None:
         pull += prior.gradient(len(g))
     return _conjugate_gradients(product, -g - pull, preconditioner)

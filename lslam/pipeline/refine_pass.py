@@ -10,8 +10,8 @@ import numpy as np
 
 from lslam.backend.adjustment import SweptPoints, adjust
 from lslam.backend.control_points import control_facts, control_residuals
-from lslam.backend.graph.held_poses import HeldPoses
 from lslam.backend.graph.odometry_constraints import bent
+from lslam.backend.graph.pose_prior import PosePrior
 from lslam.backend.outcome import BackEnd
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
@@ -59,9 +59,9 @@ def refine_poses(job: PreparedRun, record: RunRecord, done: BackEnd) -> BackEnd:
             if not len(swept.points):
                 manifest.refinement = {"is_taken": False, "why": "no point lies within the range of the map"}
                 return done
-            held = None if done.solution is None else done.solution.held
+            prior = None if done.solution is None else done.solution.pose_prior
             with asking(watch.should_stop, INTERRUPTED):
-                manifest.refinement, adjustment = _adjustment(results, nodes, swept, held, record.keyframe_scans)
+                manifest.refinement, adjustment = _adjustment(results, nodes, swept, prior, record.keyframe_scans)
         except InterruptedRunError as error:
             manifest.interrupt(str(error))
             return done
@@ -116,17 +116,17 @@ def _poser(config: Config, registered: list[ScanResult], count: int) -> Callable
 
 
 def _adjustment(
-    results: list[ScanResult], nodes: Longs, swept: SweptPoints, held: HeldPoses | None, keyframes: Longs
+    results: list[ScanResult], nodes: Longs, swept: SweptPoints, prior: PosePrior | None, keyframes: Longs
 ) -> tuple[dict[str, Any], list[ScanResult] | None]:
     """What the manifest says, and the results with refined poses; None where these are not better.
 
-    keyframes : numbers of the scans of which `held` tells
+    keyframes : numbers of the scans of which the `prior` tells
     """
     before = np.stack([results[k].T_world_lidar for k in nodes])
     is_used = np.floor(swept.points / CELL_M).astype(np.int64).sum(axis=1) % 2 == 0
     places = np.full(len(results), -1, np.int64)
     places[nodes] = np.arange(len(nodes))
-    found = adjust(before, swept, is_used, held, places[keyframes])
+    found = adjust(before, swept, is_used, prior, places[keyframes])
     kept_out = swept.select(~is_used)
     step = max(1, -(-len(kept_out.points) // JUDGES))
     queries = slice(0, None, step)
@@ -139,7 +139,7 @@ def _adjustment(
     if not is_taken.any():
         return {**facts, "why": "planes of the points kept out do not get thinner"}, None
     # The world begins at the first pose, unless it is the Earth's.
-    after = found.poses if held is not None else se3.normalise(before[0] @ se3.inverse(found.poses[0]) @ found.poses)
+    after = found.poses if prior is not None else se3.normalise(before[0] @ se3.inverse(found.poses[0]) @ found.poses)
     anchors = [
         Keyframe(number, int(k), results[k].stamp_ns, before[i])
         for number, (i, k) in enumerate((i, nodes[i]) for i in np.flatnonzero(is_taken).tolist())

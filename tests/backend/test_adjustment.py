@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.adjustment import SweptPoints, adjust, find_planes
-from lslam.backend.graph.held_poses import HeldPoses
+from lslam.backend.graph.pose_prior import PosePrior
 from lslam.backend.kernels import plane_adjustment
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
@@ -100,8 +100,8 @@ def test_what_is_known_of_some_poses_gives_the_place(seed: int) -> None:
     information = np.diag([0.005**-2] * 3 + [0.0] * 3)
     surveyed = truth[known].copy()
     surveyed[:, :3, 3] += 0.005 * rng.normal(size=(len(known), 3))
-    held = HeldPoses(surveyed, lambda x: x @ information, np.tile(information, (len(known), 1, 1)))
-    found = adjust(drifted, swept, np.ones(len(world), bool), held, known)
+    prior = PosePrior(surveyed, lambda x: x @ information, np.tile(information, (len(known), 1, 1)))
+    found = adjust(drifted, swept, np.ones(len(world), bool), prior, known)
     away = np.linalg.norm(found.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert away.max() < 0.015
 

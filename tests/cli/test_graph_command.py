@@ -127,6 +127,26 @@ def test_control_points_give_the_place_and_hold_the_poses(drives: Path, tmp_path
         assert len(list(csv.DictReader(stream))) == 5
 
 
+def test_residuals_of_control_points_are_those_of_the_refined_poses(drives: Path, tmp_path: Path) -> None:
+    control = points(tmp_path / "points.csv", (0, 20, 45, 70, 94))
+    before = again(drives / "lost", tmp_path / "before", "--control", control, "--only-known")
+    document = again(drives / "lost", tmp_path / "out", "--control", control, "--only-known", "--refine")
+    assert document["manifest"]["refinement"]["is_taken"]
+    assert ate(document) < 0.8 * ate(before)
+    poses = read_trajectory(tmp_path / "out" / "trajectory.tum", "tum").poses[[0, 20, 45, 70, 94], :3, 3]
+    place = document["manifest"]["georeference"]
+    origin, T = np.array(place["origin_lat_lon_height"]), np.array(place["T_enu_world"])
+    with control.open(newline="") as stream:
+        surveyed = np.array([[float(row[axis]) for axis in "xyz"] for row in csv.DictReader(stream)])
+    solved = Projection(Georeference(origin, T, 25832)).apply(poses)
+    with (tmp_path / "out" / "control.csv").open(newline="") as stream:
+        said = np.array([[float(row[name]) for name in ("east_m", "north_m")] for row in csv.DictReader(stream)])
+    # East and north of the grid and of the place differ by its convergence, under 0.5 deg there.
+    np.testing.assert_allclose(said, (surveyed - solved)[:, :2], atol=5e-4)
+    rms = document["manifest"]["graph"]["control_points"]["rms_horizontal_m"]
+    assert rms == pytest.approx(np.sqrt(np.mean(np.sum(said**2, axis=1))), abs=2e-4)
+
+
 def test_a_wrong_control_point_is_named(drives: Path, tmp_path: Path) -> None:
     control = points(tmp_path / "points.csv", (0, 20, 45, 70, 94), off=3.0)
     said = again(drives / "plain", tmp_path / "out", "--control", control)["manifest"]["problems"]

@@ -14,7 +14,7 @@ import lslam
 from lslam.backend.adjustment import Adjusted, SweptPoints
 from lslam.core.config import load_config
 from lslam.core.errors import InterruptedRunError
-from lslam.core.geometry import geodesy, se3
+from lslam.core.geometry import geodesy
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.pipeline import refine_pass
@@ -60,23 +60,22 @@ def test_poses_that_no_plane_contradicts_do_not_get_worse(drive: Sequence) -> No
     assert ate(after.trajectory.poses, truth) < 1.02 * ate(before.trajectory.poses, truth) + 1e-4
 
 
-def test_fixes_hold_the_place_while_planes_undo_the_drift() -> None:
-    model = GnssModel()
-    drive = simulate("small-eight", seed=33, lidar="vlp16", count=120, gnss=model)
+@pytest.mark.parametrize("seed", [33, 34])
+def test_fixes_hold_the_place_while_planes_undo_the_drift(seed: int) -> None:
+    """Odometry drifts by 4 %, fixes err by a centimetre: planes alone would leave it farther off than it was."""
+    drive = simulate("small-eight", seed=seed, lidar="vlp16", count=120, gnss=GnssModel(white=0.01, slow=0.01))
     assert drive.ground_truth is not None
-    truth = drive.ground_truth.poses[:, :3, 3]
-    found = []
+    truth = (drive.T_city_world @ drive.ground_truth.poses)[:, :3, 3]
+    far = ("input.count=120", "debug.drift_percent=4", "debug.drift_deg_per_100m=4")
+    errors = []
     for refine in ("false", "true"):
-        record = made(drive, "input.count=120", "gnss.mode=graph", *DRIFT, f"graph.refine={refine}").record
+        record = made(drive, "gnss.mode=graph", *DRIFT, *far, f"graph.refine={refine}").record
         assert record.georeference is not None
         places = geodesy.from_local(record.trajectory.poses[:, :3, 3], record.georeference.origin)
-        T, _, _ = se3.umeyama(record.trajectory.poses[:, :3, 3], truth)
-        off = se3.apply(T, record.trajectory.poses[:, :3, 3]) - truth
-        found.append((float(np.sqrt(np.mean(off**2))), geodesy.to_local(places, ORIGIN).mean(axis=0)))
+        off = (geodesy.to_local(places, ORIGIN) - truth)[:, :2]
+        errors.append(float(np.sqrt(np.mean(np.sum(off**2, axis=1)))))
     assert record.manifest["refinement"]["is_taken"]
-    assert found[1][0] < 0.3 * found[0][0]
-    moved = np.abs(found[1][1] - found[0][1])
-    assert (moved < 0.2 * model.sigma * np.array([1.0, 1.0, model.vertical])).all()
+    assert errors[1] < 0.85 * errors[0]
 
 
 def test_without_points_in_range_the_run_says_so(drive: Sequence) -> None:
@@ -110,7 +109,7 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     nodes, better = np.array([0, 1, 4, 5]), poses.copy()
     better[:, 1, 3] = 0.1 * np.arange(6)
     monkeypatch.setattr(
-        refine_pass, "adjust", lambda before, swept, used, held, numbers: Adjusted(better[nodes], swept.points, 1)
+        refine_pass, "adjust", lambda before, swept, used, prior, numbers: Adjusted(better[nodes], swept.points, 1)
     )
     monkeypatch.setattr(refine_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))

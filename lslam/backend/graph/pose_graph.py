@@ -11,7 +11,7 @@ import numpy as np
 from lslam.backend.graph import factors
 from lslam.backend.graph.consistency import judge_loops
 from lslam.backend.graph.drift import drift_factor, with_drift
-from lslam.backend.graph.held_poses import held_poses
+from lslam.backend.graph.pose_prior import pose_prior
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.graph.solve import (
     GncResult,
@@ -83,11 +83,11 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     ]
     for i, rejection in zip(accepted, rejections, strict=False):
         reasons[i] = reasons[i] or rejection
-    held = None
+    prior = None
     if config.refine and is_placed:
         known = zip(candidates[len(loops) :], solved.weights[len(loops) :], strict=True)
         inliers = [candidate.make(1.0, None) for candidate, weight in known if weight >= 0.5]
-        held = held_poses(
+        prior = pose_prior(
             joined(factors.fixed_part(graph, may_tilt, with_lidar=False), inliers), solved.values, len(graph)
         )
     rest = len(loops) + len(fixes)
@@ -106,7 +106,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         drift=drift,
         rounds=solved.rounds,
         error=float(solved.factors.error(solved.values)),
-        held=held,
+        pose_prior=prior,
     )
 
 

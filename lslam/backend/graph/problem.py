@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
-from lslam.backend.graph.held_poses import HeldPoses
+from lslam.backend.graph.pose_prior import PosePrior
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.constraint import Constraint, LoopStage, Turn
 from lslam.core.types.imu import InertialChain
@@ -169,7 +169,7 @@ class Solution:
     shift, shift_sigma : (2,) m, common shift of the map (true minus map), and its sigma
     drift : factor on `graph.drift.drift_covariance` added to odometry's covariances, 0 when they are consistent
     rounds : solutions it took; error : half the sum of squared whitened residuals at the end
-    held : what all but LiDAR knows of the poses, where they have a place on the Earth and `graph.refine` asks for it
+    pose_prior : what all but LiDAR knows of the poses, where they have a place on the Earth and `graph.refine` asks for it
     """
 
     poses: Floats
@@ -183,4 +183,4 @@ class Solution:
     drift: float
     rounds: int
     error: float
-    held: HeldPoses | None = None
+    pose_prior: PosePrior | None = None

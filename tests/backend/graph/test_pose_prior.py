@@ -7,8 +7,8 @@ import numpy as np
 
 from lslam.backend.graph import factors
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
-from lslam.backend.graph.held_poses import held_poses
 from lslam.backend.graph.pose_graph import optimise
+from lslam.backend.graph.pose_prior import pose_prior
 from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
@@ -54,25 +54,25 @@ def test_it_is_the_information_of_all_with_the_other_unknowns_eliminated() -> No
     reduced = H[own, own] - H[own, rest] @ np.linalg.solve(H[rest, rest], H[rest, own])
     seen = [0, 2, 4]  # of the others nothing is known
     J = noise.into_body(made.poses[seen])
-    held = held_poses(parts, values, COUNT)
+    prior = pose_prior(parts, values, COUNT)
     x = np.random.default_rng(1).normal(size=(COUNT, 6))
     body = np.einsum("kij,kj->ki", J, x[seen]).ravel()
     expected = np.zeros((COUNT, 6))
     expected[seen] = np.einsum("kji,kj->ki", J, (reduced @ body).reshape(-1, 6))
-    np.testing.assert_allclose(held.product(x), expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
-    np.testing.assert_allclose(held.blocks[2], J[1].T @ H[6:12, 6:12] @ J[1], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(prior.product(x), expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(prior.blocks[2], J[1].T @ H[6:12, 6:12] @ J[1], rtol=1e-6, atol=1e-6)
 
 
 def test_a_wandering_error_holds_the_shape_and_not_the_place() -> None:
     """All poses moved as one cost as much as the wandering error may be; one moved by itself costs its fix."""
     made = graph()
-    held = optimise(made, GraphConfig(refine=True)).held
-    assert held is not None
+    prior = optimise(made, GraphConfig(refine=True)).pose_prior
+    assert prior is not None
     whole, one = np.zeros((COUNT, 6)), np.zeros((COUNT, 6))
     whole[:, 0], one[2, 0] = 1.0, 1.0
-    assert float(np.sum(whole * held.product(whole))) < 1.01 / 0.8**2
-    assert float(np.sum(one * held.product(one))) > 5.0
+    assert float(np.sum(whole * prior.product(whole))) < 1.01 / 0.8**2
+    assert float(np.sum(one * prior.product(one))) > 5.0
 
 
 def test_it_is_made_where_it_is_asked_for_alone() -> None:
-    assert optimise(graph(), GraphConfig()).held is None
+    assert optimise(graph(), GraphConfig()).pose_prior is None

@@ -14,7 +14,7 @@ from lslam.core.types.arrays import Floats
 
 
 @dataclass(frozen=True)
-class HeldPoses:
+class PosePrior:
     """Poses with the joint information of measurements that agree on them.
 
     poses : (K, 4, 4) of the keyframes
@@ -27,7 +27,7 @@ class HeldPoses:
     blocks: Floats
 
 
-def held_poses(factors: Any, values: Any, count: int) -> HeldPoses:
+def pose_prior(factors: Any, values: Any, count: int) -> PosePrior:
     """Information that gtsam's `factors` give of the poses with the keys 0..count-1 at `values`; other unknowns are eliminated.
 
     Raises GraphError where the factors do not determine the other unknowns.
@@ -69,4 +69,4 @@ def held_poses(factors: Any, values: Any, count: int) -> HeldPoses:
     at = np.arange(len(mine)).reshape(-1, 6)
     diagonal = np.stack([inside[i][:, i].toarray() for i in at]) if len(at) else np.zeros((0, 6, 6))
     blocks[own] = np.swapaxes(J, -1, -2) @ diagonal @ J
-    return HeldPoses(poses, product, blocks)
+    return PosePrior(poses, product, blocks)
