@@ -7,6 +7,8 @@ Elementary functions are those of fdlibm (Ng 1993), within one unit in the last 
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_right
 from typing import Any
 
 import numpy as np
@@ -60,6 +62,9 @@ _KNOT_LOW = np.array(
     ]
 )
 _KNOT_EDGES = np.array([0.4375, 0.6875, 1.1875, 2.4375])
+_HIGHS: list[float] = _KNOT_HIGH.tolist()
+_LOWS: list[float] = _KNOT_LOW.tolist()
+_KNOTS: list[float] = _KNOT_EDGES.tolist()
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _EXPONENTIAL = (
     1.66666666666666019037e-01,
@@ -137,7 +142,7 @@ def sine_cosine(x: Any) -> tuple[Any, Any]:
     """Sine and cosine at once, for half of the cost of both."""
     angle = np.asarray(x, np.float64)
     if angle.size <= _FEW:
-        both = np.array([_sine_cosine_of(float(value)) for value in angle.ravel()]).reshape(-1, 2)
+        both = np.array([sine_cosine_of(float(value)) for value in angle.ravel()]).reshape(-1, 2)
         s, c = both[:, 0].reshape(angle.shape), both[:, 1].reshape(angle.shape)
     else:
         s, c = _sine_cosine(angle)
@@ -157,6 +162,13 @@ def arctan2(y: Any, x: Any) -> Any:
     angle = np.where(np.signbit(right), np.pi - (angle - 1.2246467991473531772e-16), angle)
     kind = np.result_type(_kind_of(y), _kind_of(x))
     return np.copysign(angle, up).astype(kind)[()]
+
+
+def arctan2_of(y: float, x: float) -> float:
+    """`arctan2` of two numbers that are not negative."""
+    if x == 0:
+        return 0.0 if y == 0 else _arctangent_of(math.inf)
+    return _arctangent_of(y / x)
 
 
 def arcsin(x: Any) -> Any:
@@ -219,7 +231,7 @@ def _sine_cosine_block(x: Array) -> tuple[Array, Array]:
     return np.where(quarter >= 2, -sine, sine), np.where((quarter == 1) | (quarter == 2), -cosine, cosine)
 
 
-def _sine_cosine_of(x: float) -> tuple[float, float]:
+def sine_cosine_of(x: float) -> tuple[float, float]:
     """The same operations on plain floats, with the same results."""
     if x - x != 0:
         return np.nan, np.nan
@@ -271,7 +283,7 @@ def _arctangent(x: Array) -> Array:
 
 def _arctangent_of(x: float) -> float:
     """The same operations on a plain float, with the same result."""
-    knot = int(np.searchsorted(_KNOT_EDGES, x, side="right"))
+    knot = bisect_right(_KNOTS, x)
     match knot:
         case 0:
             t = x
@@ -284,7 +296,7 @@ def _arctangent_of(x: float) -> float:
         case _:
             t = -1 / x
     p = float(_horner(t * t, _ARCTANGENT))
-    return float(_KNOT_HIGH[knot]) - ((t * p - float(_KNOT_LOW[knot])) - t)
+    return _HIGHS[knot] - ((t * p - _LOWS[knot]) - t)
 
 
 def _horner(z: Any, coefficients: tuple[float, ...]) -> Any:

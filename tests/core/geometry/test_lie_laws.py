@@ -114,3 +114,27 @@ def test_least_rotations() -> None:
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(R) == pytest.approx(1)
         assert so3.angle(R) == pytest.approx(np.arccos(a @ b), abs=1e-7)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 1e-3, 0.5, 3.0, np.pi])
+def test_a_single_pose_has_the_bytes_of_one_in_a_stack(size: float) -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(40):
+        phi = rng.normal(size=3)
+        phi *= size / np.linalg.norm(phi)
+        xi = np.concatenate([rng.normal(size=3), phi])
+        T, other = se3.exp(xi), se3.exp(rng.normal(size=6))
+        blurred = T[:3, :3] + rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-17, -1)
+        pairs = [
+            (T, se3.exp(xi[None])),
+            (se3.log(T), se3.log(T[None])),
+            (se3.relative(T, other), se3.relative(T[None], other[None])),
+            (so3.exp(phi), so3.exp(phi[None])),
+            (so3.log(T[:3, :3]), so3.log(T[None, :3, :3])),
+            (so3.angle(T[:3, :3]), so3.angle(T[None, :3, :3])),
+            (so3.to_quaternion(T[:3, :3]), so3.to_quaternion(T[None, :3, :3])),
+            (so3.normalise(blurred), so3.normalise(blurred[None])),
+            (so3.is_rotation(blurred, 1e-3), so3.is_rotation(blurred[None], 1e-3)),
+        ]
+        for single, stacked in pairs:
+            assert np.array_equal(single, stacked[0])
