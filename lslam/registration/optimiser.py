@@ -49,13 +49,13 @@ class Correspondences:
         """The state of a residual's search in one map, see `kernels.linearisation`."""
         if target not in self._looked_up:
             count = len(self)
-            self._looked_up[target] = (*slots_of(count), np.full((count, 2), -1, np.int32), np.full((count, 4), -1.0))
+            self._looked_up[target] = (*slots_of(count), np.empty((count, 2), np.int32), np.empty((count, 4)))
         return *self._looked_up[target], self.is_done, self.away2
 
 
 def slots_of(count: int) -> tuple[Longs, NDArray[np.int32]]:
-    """Octant cells and slots of so many points, nothing looked up yet."""
-    return np.full(count, -1, np.int64), np.full((count, 8), -1, np.int32)
+    """Octant cells and slots of so many points, nothing looked up yet: what is not written is never paged in."""
+    return np.full(count, -1, np.int64), np.empty((count, 8), np.int32)
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ import math
 import numpy as np
 
 from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
-from lslam.core.kernels.gaussians import BLOB, find
+from lslam.core.kernels.gaussians import BLOB, EMPTY, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen
 from lslam.core.kernels.linearisation import Floats, Ints, Longs, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
-from lslam.core.kernels.voxel import index_of, pack
+from lslam.core.kernels.voxel import hash_key, index_of, pack
 
 # Rows of planes, keys and table, see `gaussians`.
 Voxels = tuple[Floats, Longs, Ints]
@@ -56,12 +56,15 @@ def octant_slots(
     if cells[i] == cell:
         return False
     cells[i] = cell
-    k = 0
-    for dx in range(2):
-        for dy in range(2):
-            for dz in range(2):
-                slots[i, k] = find(pack(ix + dx, iy + dy, iz + dz), keys, table)
-                k += 1
+    # All eight are fetched before any branch depends on one: mostly a voxel is found at once, or none is there.
+    mask = len(table) - 1
+    for k in range(8):
+        slots[i, k] = table[hash_key(pack(ix + (k >> 2), iy + ((k >> 1) & 1), iz + (k & 1)), mask)]
+    for k in range(8):
+        key = pack(ix + (k >> 2), iy + ((k >> 1) & 1), iz + (k & 1))
+        slot = slots[i, k]
+        if slot >= 0 and keys[slot] != key:
+            slots[i, k] = find(key, keys, table)
     return True
 
 
@@ -87,23 +90,20 @@ def nearest(
         return best, best_d, blob, blob_d
     best, blob = -1, -1
     next_d, next_blob_d = 1e300, 1e300
+    # Choices instead of branches: nobody can predict which of the eight is the nearest.
     for k in range(8):
         s = slots[i, k]
-        if s < 0:
-            continue
-        kind = planes[s, 7]
-        if kind < BLOB:
-            continue
-        d = (x - planes[s, 0]) ** 2 + (y - planes[s, 1]) ** 2 + (z - planes[s, 2]) ** 2
-        if kind >= 0.0:
-            if d < best_d:
-                next_d, best_d, best = best_d, d, s
-            elif d < next_d:
-                next_d = d
-        elif d < blob_d:
-            next_blob_d, blob_d, blob = blob_d, d, s
-        elif d < next_blob_d:
-            next_blob_d = d
+        at = max(s, 0)
+        kind = planes[at, 7] if s >= 0 else EMPTY
+        d = (x - planes[at, 0]) ** 2 + (y - planes[at, 1]) ** 2 + (z - planes[at, 2]) ** 2
+        plane_d = d if kind >= 0.0 else 1e300
+        next_d = min(next_d, max(best_d, plane_d))
+        best = s if plane_d < best_d else best
+        best_d = min(best_d, plane_d)
+        far_d = d if kind == BLOB else 1e300
+        next_blob_d = min(next_blob_d, max(blob_d, far_d))
+        blob = s if far_d < blob_d else blob
+        blob_d = min(blob_d, far_d)
     chosen[i, 0], chosen[i, 1] = best, blob
     asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
     margin = math.sqrt(next_d) - math.sqrt(best_d) if best >= 0 else math.sqrt(next_blob_d) - math.sqrt(blob_d)

@@ -232,7 +232,7 @@ def means(
     table = np.empty(table_size(n), np.int32)
     table[:] = -1
     keys = np.empty(n, np.int64)
-    # The first point of each voxel; sums relative to it, count, and sum of times, zeroed when the voxel is opened.
+    # The first point of each voxel; sums relative to it, count, and sum of times.
     first, sums = np.empty((n, 3), np.float32), np.empty((n, 5))
     is_timed = len(times) == n
     half = np.float32(0.0)
@@ -243,6 +243,9 @@ def means(
     count = 0
     last_key = -1
     slot = 0
+    # Those of the voxel at hand, which most points share with the one before: in registers while it stays the same.
+    ax = ay = az = float(np.float32(0.0))
+    sx, sy, sz, sn, st = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
@@ -251,22 +254,28 @@ def means(
         # A coordinate beyond all voxels can give any key, the initial one too.
         if count == 0 or key != last_key:
             last_key = key
+            if count > 0:
+                sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3], sums[slot, 4] = sx, sy, sz, sn, st
             h = place_of(key, keys, table)
             slot = int(table[h])
             if slot < 0:
                 slot = count
                 table[h] = slot
                 keys[slot] = key
-                for k in range(5):
-                    sums[slot, k] = 0.0
                 first[slot, 0], first[slot, 1], first[slot, 2] = x, y, z
+                sx, sy, sz, sn, st = 0.0, 0.0, 0.0, 0.0, 0.0
                 count += 1
-        sums[slot, 0] += x - first[slot, 0]
-        sums[slot, 1] += y - first[slot, 1]
-        sums[slot, 2] += z - first[slot, 2]
-        sums[slot, 3] += 1.0
+            else:
+                sx, sy, sz, sn, st = sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3], sums[slot, 4]
+            ax, ay, az = float(first[slot, 0]), float(first[slot, 1]), float(first[slot, 2])
+        sx += x - ax
+        sy += y - ay
+        sz += z - az
+        sn += 1.0
         if is_timed:
-            sums[slot, 4] += times[i]
+            st += times[i]
+    if count > 0:
+        sums[slot, 0], sums[slot, 1], sums[slot, 2], sums[slot, 3], sums[slot, 4] = sx, sy, sz, sn, st
     out = np.empty((count, 3), np.float32)
     mean_times = np.empty(count if is_timed else 0, np.float32)
     counts = np.empty(count, np.int32)
