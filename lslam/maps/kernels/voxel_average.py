@@ -115,12 +115,11 @@ def accumulate(
     mask = slots.shape[0] - 1
     gated = 0
     outside = 0
-    last_key = -1
-    row = 0
-    keys, offsets = np.empty(AHEAD, np.int64), np.empty((AHEAD, 3), np.int64)
+    # Neighbouring points of a ring mostly share a voxel: they are added up as one run, which is looked up once.
+    keys, sums, bright = np.empty(AHEAD, np.int64), np.empty((AHEAD, 4), np.int64), np.empty(AHEAD, np.int64)
     numbers, likely = np.empty(AHEAD, np.int64), np.empty(AHEAD, np.int64)
     for begin in range(0, points.shape[0], AHEAD):
-        count = 0
+        run, last_key = -1, -1
         for i in range(begin, min(begin + AHEAD, points.shape[0])):
             px, py, pz = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
             r2 = px * px + py * py + pz * pz
@@ -139,36 +138,38 @@ def accumulate(
             if key < 0:
                 outside += 1
                 continue
-            keys[count], numbers[count] = key, i
-            offsets[count, 0] = np.int64(np.rint((x - fx - 0.5) * UNITS))
-            offsets[count, 1] = np.int64(np.rint((y - fy - 0.5) * UNITS))
-            offsets[count, 2] = np.int64(np.rint((z - fz - 0.5) * UNITS))
-            count += 1
+            if key != last_key:
+                run, last_key = run + 1, key
+                keys[run], numbers[run], bright[run] = key, i, 0
+                sums[run, 0], sums[run, 1], sums[run, 2], sums[run, 3] = 0, 0, 0, 0
+            sums[run, 0] += np.int64(np.rint((x - fx - 0.5) * UNITS))
+            sums[run, 1] += np.int64(np.rint((y - fy - 0.5) * UNITS))
+            sums[run, 2] += np.int64(np.rint((z - fz - 0.5) * UNITS))
+            sums[run, 3] += 1
+            if with_intensity and np.isfinite(intensity[i]):
+                brightness = min(max(np.float64(intensity[i]), -_BRIGHTEST), _BRIGHTEST)
+                bright[run] += np.int64(np.rint(brightness * INTENSITY_UNITS))
+            if with_tags and tags[i, 0] < tags[numbers[run], 0]:
+                numbers[run] = i
         # Table and rows are far larger than the processor's caches: a batch of rows is fetched before a branch depends on one.
-        for k in range(count):
+        for k in range(run + 1):
             likely[k] = slots[slot_of(keys[k], mask)]
-        for k in range(count):
+        for k in range(run + 1):
             if rows[max(likely[k], 0), 0] != keys[k]:
                 likely[k] = -1
-        for k in range(count):
-            # Neighbouring points of a ring mostly share a voxel, which is then not looked up again.
-            if keys[k] != last_key:
-                row = likely[k]
-                if row < 0:
-                    row = row_of(keys[k], slots, rows, used)
-                    if row == used:
-                        used += 1
-                        rows[row, 1:] = 0
-                        if with_tags:
-                            rows[row, SUMS] = _NO_TAG
-                last_key = keys[k]
-            rows[row, 1] += offsets[k, 0]
-            rows[row, 2] += offsets[k, 1]
-            rows[row, 3] += offsets[k, 2]
-            rows[row, 4] += 1
-            if with_intensity and np.isfinite(intensity[numbers[k]]):
-                brightness = min(max(np.float64(intensity[numbers[k]]), -_BRIGHTEST), _BRIGHTEST)
-                rows[row, brightnesses] += np.int64(np.rint(brightness * INTENSITY_UNITS))
+        for k in range(run + 1):
+            row = likely[k]
+            if row < 0:
+                row = row_of(keys[k], slots, rows, used)
+                if row == used:
+                    used += 1
+                    rows[row, 1:] = 0
+                    if with_tags:
+                        rows[row, SUMS] = _NO_TAG
+            for n in range(4):
+                rows[row, 1 + n] += sums[k, n]
+            if with_intensity:
+                rows[row, brightnesses] += bright[k]
             if with_tags and tags[numbers[k], 0] < rows[row, SUMS]:
                 for n in range(tags.shape[1]):
                     rows[row, SUMS + n] = tags[numbers[k], n]
