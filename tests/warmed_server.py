@@ -12,4 +12,4 @@ from lslam.pipeline import precompile
 
 compile_once()
 create_odometry(Config()).warm_up()
-precompile.main(["method", "loops", "map"])
+precompile.compile_ahead(Config(), ["method", "loops", "map"])

@@ -19,8 +19,6 @@ from lslam.core.config import Config
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
-from lslam.core.kernels import jit
-from lslam.core.machine import one_at_a_time
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import ScanResult
@@ -111,7 +109,7 @@ def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config)
     for number, result in enumerate(results):
         if result.status != "ok" or result.frame:
             continue
-        with suppress(InputError), jit.announced(log), one_at_a_time(jit.lock_file(), "compiles kernels"):
+        with suppress(InputError):
             tolerance, up = config.preprocess.ground_tolerance, up_of(config.preprocess)
             R, height = levelling(sequence.scan(number).points, tolerance, CELLS, up)
             return np.asarray(result.T_world_lidar[:3, :3] @ R[2]) if np.isfinite(height) else None

@@ -7,6 +7,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ import click
 from lslam.cli import options
 from lslam.cli.console import log, progress, setup_logging, show
 from lslam.core.errors import RunFinishedError, UsageError
+from lslam.core.machine import rarely_collecting
 from lslam.core.stopping import Stop, heeded
 from lslam.core.untrusted import parse_json
 from lslam.registration.residuals import RESIDUALS, residual_named
@@ -91,14 +93,17 @@ def command(sequence: str, **given: Any) -> None:
     """
     setup_logging(given["verbose"], given["quiet"])
     from lslam.core.types.warned import hearing
+    from lslam.pipeline.precompile import helped, start_helper
 
-    with hearing():
+    with hearing(), helped():
         _check_folder(given)
-        opened, config = opened_with({**given, "sequence": sequence})
-        truth = read_truth(given["gt"], opened)
-        from lslam.pipeline.run import plan, run
-        from lslam.pipeline.run_folder import default_folder
+        ahead = None if given["dry_run"] else partial(start_helper, if_cold=True)
+        with rarely_collecting():
+            opened, config = opened_with({**given, "sequence": sequence}, ahead)
+            from lslam.pipeline.run import plan, run
+            from lslam.pipeline.run_folder import default_folder
 
+        truth = read_truth(given["gt"], opened)
         out = given["out"] or default_folder(opened.name, _variant(config))
         if given["dry_run"]:
             _print_plan(plan(opened, config, truth), config, out, given["as_json"])
@@ -129,10 +134,10 @@ def arguments_of(out: Path, given: dict[str, Any]) -> Iterator[dict[str, Any]]:
         _print_finished(out, given["as_json"])
 
 
-def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
+def opened_with(given: dict[str, Any], meanwhile: Callable[[Config], None] | None = None) -> tuple[Sequence, Config]:
     """Sequence and configuration that the options describe. Raises the errors in them.
 
-    Cheap checks come first: words, then the configuration, then the sequence.
+    Cheap checks come first: words, then the configuration, then the sequence. `meanwhile` begins what takes long beside the last.
     """
     from lslam.io.readers.lookup import find_folder
 
@@ -141,6 +146,8 @@ def opened_with(given: dict[str, Any]) -> tuple[Sequence, Config]:
     options.require_there(given["gt"], given["poses"], extract, given["loops_file"], given["control"])
     find_folder(given["sequence"], given["data_root"])
     config = _resolve(given, flags)
+    if meanwhile is not None:
+        meanwhile(config)
     from lslam.io.readers import open_sequence
 
     opened = open_sequence(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import platform
@@ -68,3 +69,14 @@ def one_at_a_time(path: Path | None, doing: str) -> Iterator[None]:
             log.info("waiting for another process that %s", doing)
             lock(stream, wait=True)
         yield
+
+
+@contextlib.contextmanager
+def rarely_collecting() -> Iterator[None]:
+    """Collect garbage rarely: compiling and importing make millions of objects that stay; scanning them is a tenth of it."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)

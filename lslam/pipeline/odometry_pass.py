@@ -12,7 +12,7 @@ from lslam.backend.keyframes.store import KeyframeStore
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.kernels import jit
-from lslam.core.machine import one_at_a_time
+from lslam.core.machine import rarely_collecting
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Turn
 from lslam.core.types.imu import InertialChain
@@ -44,7 +44,7 @@ from lslam.odometry.stationary import StationaryDetector
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.lost_scans import mark_lost
 from lslam.pipeline.manifest import Manifest
-from lslam.pipeline.precompile import helped, load_kernels
+from lslam.pipeline.precompile import COUNTS, load_kernels
 from lslam.pipeline.run_folder import CHECKPOINT, REPLIES, RunFolder
 from lslam.pipeline.segments import checks_within, join_segments
 from lslam.registration.local_map import surroundings_m
@@ -52,7 +52,7 @@ from lslam.registration.local_map import surroundings_m
 log = logging.getLogger("lslam")
 
 _FAULTS_NAMED = 10  # scans
-# Sections that choose no kernel; of buildings it is enough whether there are any.
+# Sections that choose no kernel of scans; of buildings it is enough whether there are any.
 _WITHOUT_KERNELS = {"input", "keyframes", "graph", "gnss", "osm", "eval", "report"}
 _warmed: set[tuple[object, ...]] = set()
 
@@ -200,16 +200,11 @@ def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: I
     What this process has loaded stays: a worker of a study does it once for all its runs alike.
     """
     config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
-    alike = type(job.odometry), is_over, bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
-    with (
-        job.manifest.timed("compile_s"),
-        one_at_a_time(jit.lock_file(), "compiles kernels"),
-        helped(config) as start_helper,
-        jit.announced(log, start_helper),
-    ):
-        if alike not in _warmed:
-            trackers = [one for one in (job.odometry, stationary, monitor) if one is not None]
-            load_kernels(config, trackers, is_over=is_over)
+    alike = type(job.odometry), bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
+    count = COUNTS.get(config.odometry.method)
+    with job.manifest.timed("compile_s"), rarely_collecting(), jit.counted(log, count):
+        if alike not in _warmed and not is_over:
+            load_kernels(config, [one for one in (job.odometry, stationary, monitor) if one is not None])
             _warmed.add(alike)
         with suppress(InputError):
             measurable(job.sequence.scan(0))  # the reader's kernels; what is wrong with the scan is said in its turn

@@ -1,28 +1,27 @@
-"""Kernels of a run, compiled or loaded before its first scan, by a table of kernels per part of a run.
+"""Kernels of a run, compiled or loaded by a table of kernels per part of a run.
 
-At a cold start a second process compiles the kernels that the first needs last, on an idle core. A process is needed since
-the compiler has one lock for all threads. Both share one cache.
+At a cold start a second process compiles ahead what the first needs later, on an idle core: a process, since the compiler has
+one lock for all threads. Both share one cache, and no kernel is compiled twice. The modules that have kernels are imported when
+these are, so that the second process begins before its parent has imported them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from lslam.backend.loops import find_loops
-from lslam.core.config import Config
-from lslam.core.kernels import jit
-from lslam.core.machine import available_cores
-from lslam.maps import colour, crispness, merge
-from lslam.odometry.frontend import inertial_start
-from lslam.odometry.inertial import wheel_motion
-from lslam.osm import wall_match
-from lslam.registration import optimiser
-from lslam.registration.preprocessing import ground
+from lslam.core.kernels.cache import is_cold, kernel_folder
+from lslam.core.machine import available_cores, lock, rarely_collecting
+
+if TYPE_CHECKING:
+    from lslam.core.config import Config
+
+# Kernels, by method, that are ready before the first scan as configured by default; for the line that counts them.
+COUNTS = {"icp": 10}
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Kernels:
 
     is_called : whether a run as configured calls them
     warm_up : compiles or loads them; ahead : those of them that a second process compiles
-    is_of_scans : not called where all scans are registered
+    is_of_scans : called before all scans are registered, and then no more; the others are called after that only
     """
 
     is_called: Callable[[Config], bool]
@@ -40,31 +39,65 @@ class Kernels:
     is_of_scans: bool = False
 
 
-def _of_map(config: Config) -> None:
+def _last_of_method(config: Config) -> None:
+    from lslam.odometry import create_odometry
+    from lslam.registration import optimiser
+    from lslam.registration.preprocessing import ground
+    from lslam.registration.voxel_target import VoxelTarget
+
+    optimiser.warm_up()
+    target = getattr(getattr(create_odometry(config), "registration", None), "target", None)
+    if isinstance(target, VoxelTarget):
+        target.warm_up()
+    ground.warm_up()
+
+
+def _loops(config: Config) -> None:
+    from lslam.backend.loops import find_loops
+
+    find_loops.warm_up(config.loops)
+
+
+def _walls(config: Config) -> None:
+    from lslam.osm import wall_match
+
+    wall_match.warm_up()
+
+
+def _map(config: Config) -> None:
+    from lslam.maps import crispness, merge
+
     merge.warm_up()
     crispness.warm_up()
 
 
-def _last_of_method(config: Config) -> None:
-    optimiser.warm_up()
-    ground.warm_up()
+def _colours(config: Config) -> None:
+    from lslam.maps import colour
+
+    colour.warm_up()
+
+
+def _imu(config: Config) -> None:
+    from lslam.odometry.frontend import inertial_start
+
+    inertial_start.warm_up()
+
+
+def _wheels(config: Config) -> None:
+    from lslam.odometry.inertial import wheel_motion
+
+    wheel_motion.warm_up()
 
 
 KERNELS = {
     # A method has a `warm_up` of its own.
     "method": Kernels(lambda config: True, ahead=_last_of_method, is_of_scans=True),
-    "loops": Kernels(
-        lambda config: config.loops.use or bool(config.localize.map),
-        lambda config: find_loops.warm_up(config.loops),
-        lambda config: find_loops.warm_up_candidates(config.loops),
-    ),
-    "walls": Kernels(lambda config: bool(config.osm.extract), lambda config: wall_match.warm_up()),
-    "map": Kernels(lambda config: config.map.write, _of_map, _of_map),
-    "colours": Kernels(lambda config: config.map.write and config.map.colour, lambda config: colour.warm_up()),
-    "imu": Kernels(lambda config: config.imu.use, lambda config: inertial_start.warm_up(), is_of_scans=True),
-    "wheels": Kernels(
-        lambda config: bool(config.wheels.source), lambda config: wheel_motion.warm_up(), is_of_scans=True
-    ),
+    "imu": Kernels(lambda config: config.imu.use, _imu, is_of_scans=True),
+    "wheels": Kernels(lambda config: bool(config.wheels.source), _wheels, is_of_scans=True),
+    "loops": Kernels(lambda config: config.loops.use or bool(config.localize.map), _loops, _loops),
+    "walls": Kernels(lambda config: bool(config.osm.extract), _walls),
+    "map": Kernels(lambda config: config.map.write, _map, _map),
+    "colours": Kernels(lambda config: config.map.write and config.map.colour, _colours),
 }
 
 
@@ -76,52 +109,75 @@ class Warmed(Protocol):
         ...
 
 
-def load_kernels(config: Config, trackers: Iterable[Warmed], *, is_over: bool = False) -> None:
-    """Compile or load the kernels that a run calls.
-
-    trackers : those that process its scans; is_over : all of these are registered
-    """
-    for tracker in () if is_over else trackers:
+def load_kernels(config: Config, trackers: Iterable[Warmed]) -> None:
+    """Compile or load the kernels that registering scans calls; trackers : those that do it."""
+    for tracker in trackers:
         tracker.warm_up()
-    for part in KERNELS.values():
-        if part.is_called(config) and not (is_over and part.is_of_scans):
-            part.warm_up(config)
+    load_parts(config, [name for name, part in KERNELS.items() if part.is_of_scans])
 
 
-@contextmanager
-def helped(config: Config) -> Iterator[Callable[[], None]]:
-    """Context with a function that starts the second process once; the process ends with the block.
+def load_parts(config: Config, names: Iterable[str]) -> None:
+    """Compile or load the kernels of these parts, as far as a run as configured calls them."""
+    for name in names:
+        if KERNELS[name].is_called(config):
+            KERNELS[name].warm_up(config)
+
+
+_helpers: list[subprocess.Popen[bytes]] = []
+
+
+def start_helper(config: Config, *, if_cold: bool = False) -> None:
+    """Start the second process, once; if_cold : only where no kernel is compiled yet.
 
     Without a second core, or a shared cache, nothing starts.
     """
-    started: list[subprocess.Popen[bytes]] = []
+    if (
+        _helpers
+        or available_cores() < 2
+        or not sys.executable
+        or kernel_folder() is None
+        or (if_cold and not is_cold())
+    ):
+        return
+    words = [name for name, part in KERNELS.items() if part.ahead and part.is_called(config)]
+    command = [sys.executable, "-P", "-m", "lslam.pipeline.precompile", config.model_dump_json(), *words]
+    nowhere = subprocess.DEVNULL
+    with contextlib.suppress(OSError):  # the first process compiles everything then
+        _helpers.append(subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere))
 
-    def start() -> None:
-        if started or available_cores() < 2 or jit.lock_file() is None or not sys.executable:
-            return
-        words = [name for name, part in KERNELS.items() if part.ahead and part.is_called(config)]
-        command = [sys.executable, "-P", "-m", "lslam.pipeline.precompile", *words]
-        nowhere = subprocess.DEVNULL
-        try:
-            started.append(subprocess.Popen(command, stdin=nowhere, stdout=nowhere, stderr=nowhere))
-        except OSError:  # the first process compiles everything then
-            return
 
+@contextlib.contextmanager
+def helped() -> Iterator[None]:
+    """Context at whose end the second process, if one was started, ends."""
     try:
-        yield start
+        yield
     finally:
-        for process in started:
+        while _helpers:
+            process = _helpers.pop()
             process.kill()
             process.wait()
 
 
-def main(names: list[str]) -> None:
+def main(config: Config, names: Iterable[str]) -> None:
+    """Compile the second process's share of the kernels of the named parts, unless another process does."""
+    folder = kernel_folder()
+    if folder is None:
+        return
+    with (folder / "compile.lock").open("a") as stream:
+        if lock(stream):
+            compile_ahead(config, names)
+
+
+def compile_ahead(config: Config, names: Iterable[str]) -> None:
     """Compile the second process's share of the kernels of the named parts."""
-    for name in names:
-        ahead = KERNELS[name].ahead
-        if ahead is not None:
-            ahead(Config())
+    with rarely_collecting():
+        for name in names:
+            ahead = KERNELS[name].ahead
+            if ahead is not None:
+                ahead(config)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    from lslam.core.config import Config
+
+    main(Config.model_validate_json(sys.argv[1]), sys.argv[2:])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,17 +12,21 @@ import numpy as np
 
 from lslam.core.config import Config
 from lslam.core.errors import InputError
+from lslam.core.kernels import jit
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.types.warned import hearing
 from lslam.io.remote import as_path
 from lslam.pipeline.job import announce, prepare
 from lslam.pipeline.odometry_pass import estimate_poses
+from lslam.pipeline.precompile import helped, start_helper
 from lslam.pipeline.stages import finalise_poses, in_folder, raise_outcome, score, write_results
 from lslam.pipeline.watch import RunOutcome, Watch
 
 if TYPE_CHECKING:
     from lslam.pipeline.rebuild import EarlierRun
+
+log = logging.getLogger("lslam")
 
 
 def run(
@@ -56,8 +62,9 @@ def run(
         there is written. InputError, OutputError, UsageError : as named.
     """
     watch = watch or Watch()
-    with hearing() as heard:
-        job = prepare(sequence, config or Config(), ground_truth, command, watch)
+    config = config or Config()
+    with hearing() as heard, helped(), jit.announced(log, partial(start_helper, config)):
+        job = prepare(sequence, config, ground_truth, command, watch)
         if earlier is not None and not np.array_equal(job.sequence.stamps_ns, earlier.trajectory.stamps_ns):
             count = len(job.sequence)
             raise InputError(f"{job.sequence.path} does not fit {earlier.folder}: its {count} scans have other stamps")

@@ -23,6 +23,8 @@ from lslam.core.errors import (
     RunFailedError,
     RunFinishedError,
 )
+from lslam.core.kernels import jit
+from lslam.core.machine import rarely_collecting
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.sequence import Sequence
 from lslam.evaluation.evaluate import Evaluation, evaluate
@@ -39,6 +41,7 @@ from lslam.pipeline.localise_pass import localise_poses
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import map_checkpoints
 from lslam.pipeline.odometry_pass import odometry_checkpoints
+from lslam.pipeline.precompile import load_parts
 from lslam.pipeline.refine_pass import refine_poses
 from lslam.pipeline.resume import may_go_on, run_identity
 from lslam.pipeline.run_folder import KEYFRAMES, RunFolder, check_place, spool_of, upload
@@ -51,6 +54,7 @@ log = logging.getLogger("lslam")
 
 def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
     """Put the final poses into the record: of the pose graph, made level, or of localisation in a prior map."""
+    _load(job, "loops", "walls")
     if job.config.localize.map:
         localise_poses(job, record)
         if record.georeference is not None:
@@ -61,6 +65,14 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, job.store)
     return done
+
+
+def _load(job: PreparedRun, *parts: str) -> None:
+    """After a cold start, compile or load the kernels of these parts. At others each is loaded when it is called."""
+    if not jit.has_compiled():
+        return
+    with job.manifest.timed("compile_s"), rarely_collecting():
+        load_parts(job.config, parts)
 
 
 def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation | None:
@@ -229,6 +241,7 @@ def write_results(job: PreparedRun, record: RunRecord, done: BackEnd, evaluation
     outputs.write_scans(folder, record)
     if record.map_fixes:
         outputs.write_localization(folder, record)
+    _load(job, "map", "colours")
     try:
         make_map(folder, job, record)
     finally:  # with the map's crispness, and whatever becomes of the map

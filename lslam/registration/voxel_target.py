@@ -106,6 +106,14 @@ class VoxelTarget(MapAlignment, Target):
         """Aligned with the coarse planes, then with the fine ones, and judged."""
         return attempt.judge(self.coarse_to_fine(attempt.points, attempt.T_prior))
 
+    def warm_up(self) -> None:
+        """Compile or load the residual's kernel alone, on the map as it is, which may be empty."""
+        points = PreparedPoints(np.zeros((1, 3), np.float32), np.zeros((1, 3)), np.zeros((1, 6)), 1)
+        covariance = np.zeros((1, 6)) if self.kind.needs_covariance else None
+        gaps = np.zeros(1) if self.kind.needs_gaps else None
+        points = replace(points, covariance=covariance, gaps=gaps)
+        optimise(*self.problem(points, np.eye(4), self.config.kernel_min, 1))
+
     def enter(self, result: RegistrationResult) -> None:
         """Insert a scan at its pose."""
         self.scans.enter(self.map, result.points, result.T_world_lidar)

@@ -5,14 +5,20 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from lslam.core.config import Config
+import lslam
+from lslam.core.config import Config, load_config
 from lslam.odometry import create_odometry
 from lslam.pipeline import precompile
+
+SAMPLE = Path(lslam.__file__).parents[1] / "sample_data"
 
 
 def signatures() -> set[tuple[str, str]]:
@@ -25,9 +31,40 @@ def signatures() -> set[tuple[str, str]]:
 def test_it_compiles_nothing_that_the_run_does_not_need() -> None:
     config = Config()
     precompile.load_kernels(config, [create_odometry(config)])
+    precompile.load_parts(config, precompile.KERNELS)
     of_run = signatures()
-    precompile.main([name for name, part in precompile.KERNELS.items() if part.is_called(config)])
+    precompile.compile_ahead(config, [name for name, part in precompile.KERNELS.items() if part.is_called(config)])
     assert signatures() == of_run
+
+
+def test_before_the_first_scan_only_what_registers_scans_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[str] = []
+    for name, part in precompile.KERNELS.items():
+        note = partial(lambda name, config: loaded.append(name), name)
+        monkeypatch.setitem(precompile.KERNELS, name, replace(part, warm_up=note))
+    config = load_config(settings=["imu.use=true", "wheels.source=/odometry"])
+    precompile.load_kernels(config, [])
+    assert loaded == ["method", "imu", "wheels"]
+    precompile.load_parts(config, ["loops", "walls", "map"])
+    assert loaded[3:] == ["loops", "map"]
+
+
+COUNTING = """
+import functools, logging, sys
+from lslam.core.kernels import jit
+logging.basicConfig(level="INFO", format="%(message)s")
+jit.counted = functools.partial(jit.counted, every_s=0.0)
+from lslam.core.config import load_config
+from lslam.pipeline.run import run
+run(sys.argv[1], load_config(settings=["input.count=2", "loops.use=false"]))
+"""
+
+
+def test_all_kernels_of_scans_are_counted() -> None:
+    done = subprocess.run([sys.executable, "-c", COUNTING, SAMPLE], capture_output=True, text=True, check=True)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("compiling kernels, once: ")]
+    total = precompile.COUNTS["icp"]
+    assert lines == [f"compiling kernels, once: {k + 1} of {total}" for k in range(total)]
 
 
 @pytest.fixture
@@ -47,18 +84,18 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
 
 
 def test_it_starts_once_and_ends_with_the_block(started: list[subprocess.Popen[bytes]]) -> None:
-    with precompile.helped(Config()) as start:
+    with precompile.helped():
         assert not started
-        start()
-        start()
+        precompile.start_helper(Config())
+        precompile.start_helper(Config())
         assert [process.poll() for process in started] == [None]
     assert started[0].poll() is not None
 
 
 def test_it_ends_when_the_first_process_is_interrupted(started: list[subprocess.Popen[bytes]]) -> None:
     def interrupted() -> None:
-        with precompile.helped(Config()) as start:
-            start()
+        with precompile.helped():
+            precompile.start_helper(Config())
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -70,8 +107,8 @@ def test_a_single_core_has_no_second_process(
     started: list[subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(precompile, "available_cores", lambda: 1)
-    with precompile.helped(Config()) as start:
-        start()
+    with precompile.helped():
+        precompile.start_helper(Config())
     assert not started
 
 
@@ -81,5 +118,5 @@ def test_a_process_that_cannot_be_started_is_done_without(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     monkeypatch.setattr(precompile, "available_cores", lambda: 2)
-    with precompile.helped(Config()) as start:
-        start()
+    with precompile.helped():
+        precompile.start_helper(Config())

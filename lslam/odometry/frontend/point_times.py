@@ -15,7 +15,6 @@ from lslam.core.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError
 from lslam.core.kernels import jit
-from lslam.core.machine import one_at_a_time
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence, SequenceView, StatedTimes, select
 from lslam.odometry import create_odometry
@@ -103,9 +102,7 @@ def _by_agreement(
 def _decided(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
     """As `choose_clock`, with the kernels compiled before."""
     with jit.announced(log):
-        # Other processes wait while this one compiles, not while it registers.
-        with one_at_a_time(jit.lock_file(), "compiles kernels"):
-            create_odometry(Config()).warm_up()
+        create_odometry(Config()).warm_up()
         return choose_clock(sequence, proposal, sample, preprocess)
 
 
