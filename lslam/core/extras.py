@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from lslam.core.errors import InputError
 from lslam.core.untrusted import parse_json
@@ -44,6 +43,8 @@ def _requirement(extra: str) -> str:
         url = ""
     if url and not url.startswith("file:"):
         return f"{named} @ {url}"
+    from urllib.request import url2pathname  # with what speaks to servers
+
     path = Path(url2pathname(urlsplit(url).path)) if url else _SOURCES
     is_there = path.exists() if url else (path / "pyproject.toml").is_file()
     return f"{path}[{extra}]" if is_there else named

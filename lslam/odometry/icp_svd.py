@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
@@ -25,6 +25,9 @@ from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_poi
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
 # Distances beyond the median plus this many median deviations are outliers (the X84 rule, Hampel et al. 1986).
 X84 = 5.2
 
@@ -39,6 +42,8 @@ class Partners:
     @cached_property
     def tree(self) -> cKDTree:
         """Of the points, to be asked for neighbours."""
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from lslam.core.kernels import gaussians
 from lslam.core.kernels.voxel import MASK, OFFSET
@@ -16,6 +14,10 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.odometry import closest_point
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LEAST_BREADTH
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+    from scipy.spatial import cKDTree
 
 # m, edge of the voxels: at 15 m two rings of a 16-beam sensor fall into one.
 VOXEL_M = 1.0
@@ -189,6 +191,9 @@ class _Cells:
 
     @classmethod
     def of(cls, voxels: GaussianMap, slots: Longs) -> _Cells:
+        from scipy.sparse import csr_matrix
+        from scipy.spatial import cKDTree
+
         s = voxels.moments[slots]
         key, count = voxels.keys[slots], s[:, 0]
         cell = np.stack([key >> 42, (key >> 21) & MASK, key & MASK], axis=1) - OFFSET
@@ -217,6 +222,8 @@ class _Cells:
         at = np.flatnonzero(region == seed)
         if len(at) == 0 or len(region) < LEAST_VOXELS:
             return alone
+        from scipy.sparse.csgraph import connected_components
+
         _, label = connected_components(self.touching[region][:, region], directed=False)
         return np.asarray(region[label == label[at[0]]])
 

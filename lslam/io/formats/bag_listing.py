@@ -21,6 +21,12 @@ _NUMBER = re.compile(r"(?:(.*?)[_-])?(\d{1,4})$")
 _COMPANIONS = ("-wal", "-shm", "-journal")
 
 
+def holds_recording(path: Path) -> bool:
+    """Whether the path, or a file in this folder, ends as bags or captures do, whatever it may be."""
+    names = [p.name for p in path.iterdir()] if path.is_dir() else [path.name]
+    return any(suffix_of(Path(name)) or name.lower().endswith(CAPTURES) for name in names)
+
+
 def list_bag_files(path: Path) -> list[Path]:
     """The file itself, or the bag files of a folder in natural order; empty when there are none.
 

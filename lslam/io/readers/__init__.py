@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from lslam.core.errors import InputError, LslamError, UsageError, cause
 from lslam.core.plugins import load, registered
+from lslam.io.formats.bag_listing import holds_recording
 from lslam.io.readers.lookup import find_folder
 from lslam.io.remote import RemotePath
 
@@ -139,7 +140,10 @@ def _merge_lidars(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
 
 
 def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
-    for dotted in READERS.values():
+    has_recording = holds_recording(folder)
+    for kind, dotted in READERS.items():
+        if kind in ("bag", "pcap") and not has_recording:  # their modules are many
+            continue
         sequence = _opened_by(import_module(dotted), folder, overrides)
         if sequence is not None:
             return sequence
