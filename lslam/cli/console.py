@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, Protocol
 
 from lslam.core.printable import lasting
@@ -24,15 +25,16 @@ if TYPE_CHECKING:
 class TimeLeft:
     """Estimate of the remaining time; `at_once` steps are made together, and one begins when another ends.
 
-    A running step counts with the mean duration less its elapsed time. Steps are taken to end in the order they began, since
-    a swap leaves the sum of their times unchanged.
+    A running step counts with the usual duration less its elapsed time. Steps are taken to end in the order they began, since
+    a swap leaves the sum of their times unchanged. The first ones wait for kernels that are compiled: once there are others, they
+    do not count.
     """
 
     def __init__(self, total: int, at_once: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
         self.at_once = max(1, min(at_once, total))
         self._total, self._clock = total, clock
         self._done = 0
-        self._took = 0.0
+        self._took: list[float] = []
         self._begun = [clock()] * self.at_once
 
     def step(self) -> None:
@@ -40,18 +42,18 @@ class TimeLeft:
         now = self._clock()
         self._done += 1
         if self._begun:
-            self._took += now - self._begun.pop(0)
+            self._took.append(now - self._begun.pop(0))
         if self._done + len(self._begun) < self._total:
             self._begun.append(now)
 
     @property
-    def mean(self) -> float:
+    def usual(self) -> float:
         """Mean duration of a step, s; nan before the first is done."""
-        return self._took / self._done if self._done else float("nan")
+        return fmean(self._took[self.at_once :] or self._took or [float("nan")])
 
     @property
     def seconds(self) -> float:
-        """Remaining time of all steps, s, if the others take the mean; nan before the first is done.
+        """Remaining time of all steps, s, if the others take the usual one; nan before the first is done.
 
         >>> now = [0.0]
         >>> left = TimeLeft(5, 2, lambda: now[0])
@@ -60,17 +62,17 @@ class TimeLeft:
         >>> left.seconds  # two now, and then the fifth
         20.0
         """
-        now, mean = self._clock(), self.mean
-        rest = sorted(max(mean - (now - began), 0.0) for began in self._begun)
+        now, usual = self._clock(), self.usual
+        rest = sorted(max(usual - (now - began), 0.0) for began in self._begun)
         if not rest:
             return 0.0
         rounds, last = divmod(self._total - self._done - len(rest), len(rest))
-        return rest[last - 1] + (rounds + 1) * mean if last else rest[-1] + rounds * mean
+        return rest[last - 1] + (rounds + 1) * usual if last else rest[-1] + rounds * usual
 
     @property
     def pace(self) -> str:
         """Text of the time per step, and of the number at once."""
-        return f"{self.mean:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
+        return f"{self.usual:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
 
     @property
     def text(self) -> str:
@@ -145,22 +147,26 @@ def progress(title: str, total: int, unit: str = "scans", left: TimeLeft | None 
         with _bar(title, total, unit, left) as advance:
             yield advance
         return
-    began = last = time.monotonic()
+    began = first = last = time.monotonic()
     done = 0
 
     def plain(note: str = "") -> None:
-        nonlocal done, last
+        nonlocal done, first, last
         done += 1
         if left is not None:
             left.step()
         now = time.monotonic()
+        first = now if done == 1 else first
         if now - last < 10 and done < total:
             return
         last = now
         rate = done / max(now - began, 1e-9)
         end = f"{now - began:.1f} s"
-        if done < total:
-            end = f"{(total - done) / rate:.0f} s left" if left is None else left.text
+        if done < total and left is not None:
+            end = left.text
+        elif done < total:  # the first may have waited for kernels: it is not the rate
+            rate = (done - 1) / max(now - first, 1e-9) if done > 1 else rate
+            end = f"{(total - done) / rate:.0f} s left" if done > 1 else "compiling"
         pace = _pace(rate, unit) if left is None else left.pace
         log.info("%s %d/%d, %s, %s%s", title, done, total, pace, end, note and f", {note}")
 

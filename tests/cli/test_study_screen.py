@@ -79,7 +79,15 @@ def test_the_time_left_of_runs_that_take_as_long_is_exact(total: int, at_once: i
         left.step()
         if made.count(end) == 1:  # else others of this instant are not told yet
             assert left.seconds == pytest.approx(made[-1] - end)
-    assert (left.mean, left.seconds) == (60.0, 0.0)
+    assert (left.usual, left.seconds) == (60.0, 0.0)
+
+
+def test_a_first_run_that_compiles_is_not_the_pace() -> None:
+    now = [0.0]
+    left = TimeLeft(100, 1, lambda: now[0])
+    for now[0] in (40.0, 45.0, 50.0):
+        left.step()
+    assert (left.usual, left.seconds) == (5.0, 97 * 5.0)
 
 
 def test_the_time_left_of_unlike_runs_is_never_far_off() -> None:
@@ -92,7 +100,22 @@ def test_the_time_left_of_unlike_runs_is_never_far_off() -> None:
         left.step()
         if k >= 20:
             assert left.seconds == pytest.approx(made[-1] - end, abs=80)
-    assert left.mean == pytest.approx(60, abs=5)
+    assert left.usual == pytest.approx(60, abs=5)
+
+
+def test_the_first_of_many_scans_is_not_the_rate(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr(console.log, "propagate", True)
+    monkeypatch.setattr(console.log, "handlers", [])
+    with caplog.at_level(logging.INFO, "lslam"), console.progress("odometry", 200) as advance:
+        for now[0] in [30.0, *(30.0 + 0.1 * k for k in range(1, 200))]:
+            advance()
+    assert caplog.messages[0] == "odometry 1/200, 30.0 s each, compiling"
+    assert caplog.messages[1] == "odometry 101/200, 10.0 scans/s, 10 s left"
+    assert caplog.messages[-1] == "odometry 200/200, 4.0 scans/s, 49.9 s"
 
 
 def test_a_plain_line_says_how_long_is_left(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
