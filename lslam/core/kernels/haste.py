@@ -1,7 +1,7 @@
 """Work of numba's compiler that has no effect on kernels, left out: they are compiled in half the time, to the same code.
 
-Three quarters of the time to compile are Python's, and LLVM's a quarter. A release of numba with other parts inside compiles
-as it is.
+Three quarters of the time to compile are Python's, and LLVM's a quarter. A release of numba that is newer than those this was
+tried with, or with other parts inside, compiles as it is.
 """
 
 from __future__ import annotations
@@ -10,12 +10,23 @@ import contextlib
 from importlib import import_module
 from typing import Any
 
+# Of numba: tried with each from 0.61 on.
+NEWEST_RELEASE = (0, 68)
+
 
 def hasten() -> None:
     """Leave that work out from now on, for all functions of this process."""
+    if not is_known():
+        return
     for leave_out in (compare_set_flags, remember_signatures, emit_entry_points, find_lifetimes_late):
         with contextlib.suppress(AttributeError, ImportError):
             leave_out()
+
+
+def is_known() -> bool:
+    """Whether the release of numba is one that this was tried with."""
+    release: tuple[int, int] = import_module("numba").version_info.short
+    return release <= NEWEST_RELEASE
 
 
 def _numba(module: str) -> Any:
