@@ -1,4 +1,4 @@
-"""Cells of a bird's-eye view that the points of a cloud fall into, counted or marked."""
+"""Bird's-eye views: cells that the points of a cloud fall into, counted and marked, and scores of their correlations."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 from lslam.core.kernels.jit import inline, kernel
 
 Floats = NDArray[np.float64]
+Longs = NDArray[np.int64]
+Image = NDArray[np.float32]
+Row = NDArray[np.float32]
 OUTSIDE = -1
 
 
@@ -17,7 +20,8 @@ OUTSIDE = -1
 def cell_of(x: float, y: float, R: Floats, size: int, edge: float) -> tuple[int, int]:
     """Row and column of the position x, y, m, rotated by R (2, 2), among size x size cells of `edge` m about the origin.
 
-    Both are OUTSIDE for a position beyond the cells."""
+    Both are OUTSIDE for a position beyond the cells.
+    """
     row = math.floor((R[0, 0] * x + R[0, 1] * y) / edge) + size // 2
     column = math.floor((R[1, 0] * x + R[1, 1] * y) / edge) + size // 2
     if 0 <= row < size and 0 <= column < size:
@@ -25,18 +29,9 @@ def cell_of(x: float, y: float, R: Floats, size: int, edge: float) -> tuple[int,
     return OUTSIDE, OUTSIDE
 
 
-@kernel
-def count(points: Floats, R: Floats, edge: float, most: float, counts: NDArray[np.float32]) -> None:
-    """Add the points (N, k), rotated by R (2, 2), to the counts (S, S) of cells of `edge` m, up to `most` each."""
-    for i in range(len(points)):
-        row, column = cell_of(points[i, 0], points[i, 1], R, len(counts), edge)
-        if row != OUTSIDE and counts[row, column] < most:
-            counts[row, column] += np.float32(1.0)
-
-
-@kernel
-def mark(points: Floats, R: Floats, edge: float, seen: NDArray[np.float32]) -> None:
-    """Set the cells (S, S), of `edge` m, of the points (N, k) rotated by R (2, 2), and those round them, to 1."""
+@inline
+def mark(points: Floats, R: Floats, edge: float, seen: Image) -> None:
+    """Set the cells (S, S) of the points (N, k), rotated by R (2, 2), and those round them, to 1."""
     size = len(seen)
     for i in range(len(points)):
         row, column = cell_of(points[i, 0], points[i, 1], R, size, edge)
@@ -45,3 +40,66 @@ def mark(points: Floats, R: Floats, edge: float, seen: NDArray[np.float32]) -> N
         for r in range(max(row - 1, 0), min(row + 2, size)):
             for c in range(max(column - 1, 0), min(column + 2, size)):
                 seen[r, c] = np.float32(1.0)
+
+
+@kernel
+def view(points: Floats, ground: Floats, R: Floats, edge: float, most: float, images: Image) -> None:
+    """Fill three zero images (3, S, S) of cells of `edge` m with points rotated by R (2, 2).
+
+    First the points (N, k) per cell, up to `most`; second its square; third 1 in the cells of both clouds and round them.
+    """
+    size = images.shape[1]
+    for i in range(len(points)):
+        row, column = cell_of(points[i, 0], points[i, 1], R, size, edge)
+        if row != OUTSIDE and images[0, row, column] < most:
+            images[0, row, column] += np.float32(1.0)
+            images[1, row, column] = images[0, row, column] * images[0, row, column]
+    mark(points, R, edge, images[2])
+    mark(ground, R, edge, images[2])
+
+
+@kernel
+def improve(sums: Image, cells: Longs, least: np.float32, yaw: np.float32, best: Row, turn: Row) -> None:
+    """Where sums (3, C) at the cells (K,) give a better score than `best` (K,), put it there, and `yaw` into `turn` (K,).
+
+    The score is the first sum by the root of the product of the others, 0 where the second is below `least`.
+    """
+    for k in range(len(cells)):
+        cell = cells[k]
+        match, own = sums[0, cell], sums[1, cell]
+        if not (match > np.float32(0.0) and own >= least):
+            continue
+        product = max(own * sums[2, cell], np.float32(1.0))
+        # Most cells have had a better score: the root is taken where rounding might tell.
+        if match * match < np.float32(0.999) * best[k] * best[k] * product:
+            continue
+        score = match / np.sqrt(product)
+        if score > best[k]:
+            best[k], turn[k] = score, yaw
+
+
+@kernel
+def fit(
+    image: Image, cells: Longs, structure: Row, least: float, row: int, column: int, reach: int
+) -> tuple[float, int, int]:
+    """The best score of structure (K,) in cells (K, 2) shifted onto an image (S, S), NaN where not observed, and its shift.
+
+    row, column : of the first cell; shifts of up to `reach` cells more or less are tried. The score is normalised over the
+    cells that both observed, and 0 where the sum of the squares of the structure there is below `least`.
+    """
+    best, best_row, best_column = 0.0, 0, 0
+    for r in range(row - reach, row + reach + 1):
+        for c in range(column - reach, column + reach + 1):
+            match = own = other = 0.0
+            for k in range(len(cells)):
+                i, j = cells[k, 0] + r, cells[k, 1] + c
+                if not (0 <= i < len(image) and 0 <= j < len(image)):
+                    continue
+                here, there = structure[k], image[i, j]
+                if there == there:
+                    match += here * there
+                    own += here * here
+                    other += there * there
+            if own >= least and match > best * math.sqrt(own * other):
+                best, best_row, best_column = match / math.sqrt(own * other), r - row, c - column
+    return best, best_row, best_column

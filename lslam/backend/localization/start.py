@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,11 +12,13 @@ from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.keyframes.submaps import mounted_up, submap
 from lslam.backend.localization.place_search import GUESSES_APART_M, PlaceSearch, Region
 from lslam.backend.localization.prior_map import MAP_MIN_INLIERS
+from lslam.backend.loops.gating import LoopThrottle
 from lslam.backend.loops.level_submap import LevelSubmap, find_up, level_rotation, make_level_submap
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats
+from lslam.core.types.constraint import Verdict
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
@@ -25,7 +27,7 @@ from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 
-# m between two keyframes that are tried.
+# m between two keyframes that are tried, at least.
 SPACING_M = 6.0
 # Keyframes that must agree on the start, so that one look-alike does not decide.
 AGREEING_STARTS = 2
@@ -105,11 +107,15 @@ class PlaceFinder:
         """The start; None, with `reasons`, when no keyframe finds a place or they do not agree."""
         votes: list[Vote] = []
         tried = 0
-        for b in self._spaced():
+        throttle = LoopThrottle(SPACING_M)
+        for b, way in enumerate(self._distances):
+            if not throttle.is_due(way):
+                continue
             if should_stop():
                 return None
             tried += 1
             vote = self.vote(b, self._region(b, prior))
+            throttle.observe(way, Verdict.REJECTED if vote is None else Verdict.ACCEPTED)
             if vote is not None:
                 votes.append(vote)
             agreed = self._agreed(votes, AGREEING_STARTS)
@@ -159,14 +165,6 @@ class PlaceFinder:
         level = np.empty_like(points)
         transform(points, se3.make(self._R_level @ self._poses[b, :3, :3], np.zeros(3)), level)
         return level
-
-    def _spaced(self) -> Iterator[int]:
-        """Keyframes to try."""
-        last = -np.inf
-        for b, way in enumerate(self._distances):
-            if way - last >= SPACING_M:
-                last = float(way)
-                yield b
 
     def _region(self, b: int, prior: StartPrior | None) -> Region | None:
         """Where keyframe `b` may be by the prior of the first scan and odometry."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lslam.backend.loops.bev_correlation import CELL_M, BevGrid, Image, blurred, correlate, spectrum
+from lslam.backend.loops.bev_correlation import CELL_M, BestShifts, BevGrid, blurred, correlate, peaks, spectra, turning
 from lslam.backend.loops.level_submap import LevelSubmap
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
@@ -20,7 +20,7 @@ from lslam.registration.result import RegistrationResult
 from lslam.registration.robust import Annealing
 from lslam.registration.solver import solve
 
-# Cells; the smaller image serves where the search is short.
+# Cells, at least and at most; the least image serves where the search is short.
 SMALL, LARGE = BevGrid(128), BevGrid(256)
 # m, radius of the compared window, at most and at least; the rest of the image is room for the shift.
 WIDEST, NARROWEST = 60.0, 40.0
@@ -43,47 +43,36 @@ def find_initial_guesses(
 ) -> list[InitialGuess]:
     """Maxima of the correlation of b in a within `reach` m of `expected` (3,), for yaws (rad) of b in a, best first.
 
-    The correlation is normalised over the cells that both observed, or else the shift with most overlap would win. All
-    shifts of one heading are correlated by FFT. Empty without non-ground points.
+    All shifts of one heading are correlated by FFT. Empty without non-ground points.
     """
     far = float(np.linalg.norm(expected[:2])) + reach
-    grid = SMALL if far + NARROWEST <= SMALL.size * CELL_M / 2 else LARGE
+    grid = _grid(far)
     window = min(grid.size * CELL_M / 2 - far, WIDEST)
-    image = blurred(grid.heights(a.non_ground))
-    A, A2, A_seen = spectrum(image), spectrum(image**2), spectrum(grid.cover(a.non_ground, a.ground))
+    there = grid.view(a.non_ground, a.ground)
+    image = blurred(there[0])
+    seen = spectra(np.stack([image, there[2], image**2]))
     near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.non_ground, b.ground))
-    best, turn = np.zeros_like(image), np.zeros_like(image)
+    away2 = ((grid.shifts(np.arange(grid.size**2)) - expected[:2]) ** 2).sum(axis=1)
+    best = BestShifts(np.flatnonzero(away2 <= max(reach, CELL_M) ** 2))
+    shifts = grid.shifts(best.cells)
     for yaw in yaws:
-        R = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        turned = grid.heights(near, R)
-        own = correlate(A_seen, spectrum(turned**2), grid.size)
-        other = correlate(A2, spectrum(grid.cover(near, floor, R=R)), grid.size)
-        score = correlate(A, spectrum(turned), grid.size) / np.sqrt(np.maximum(own * other, 1.0))
-        score[own < SHARED_SHARE * max(float((turned**2).sum()), 1.0)] = 0.0
-        better = score > best
-        best, turn = np.where(better, score, best), np.where(better, np.float32(yaw), turn)
+        view = grid.view(near, floor, turning(yaw))
+        best.observe(correlate(seen, spectra(view)), SHARED_SHARE * max(float(view[1].sum()), 1.0), yaw)
     return [
-        InitialGuess(_pose(grid, a, b, shift, yaw, float(expected[2])), score)
-        for shift, yaw, score in _peaks(grid.shifts(), best, turn, expected, reach)
+        InitialGuess(_pose(grid, a, b, shifts[k], float(best.heading[k]), float(expected[2])), float(best.score[k]))
+        for k in peaks(shifts, best.score, STARTS_APART_M, STARTS, NEARLY)
     ]
 
 
-def _peaks(
-    shifts: Floats, score: Image, turn: Image, expected: Floats, reach: float
-) -> list[tuple[Floats, float, float]]:
-    """Shift (2,) m, yaw and score of the best cells within reach, none near another.
+def _grid(far: float) -> BevGrid:
+    """Cells that have room for the window at shifts of up to `far` m: the transforms are the work of the search."""
+    from scipy import fft
 
-    Not only local maxima: along a ridge, as of a street, other cells score as well as the maximum.
-    """
-    away2 = (shifts[:, None] - expected[0]) ** 2 + (shifts[None, :] - expected[1]) ** 2
-    rest = np.where(away2 <= max(reach, CELL_M) ** 2, score, np.float32(0))
-    best = float(rest.max())
-    peaks: list[tuple[Floats, float, float]] = []
-    while len(peaks) < STARTS and rest.max() > NEARLY * best:
-        r, c = np.unravel_index(int(rest.argmax()), rest.shape)
-        peaks.append((np.array([shifts[r], shifts[c]]), float(turn[r, c]), float(score[r, c])))
-        rest[(shifts[:, None] - shifts[r]) ** 2 + (shifts[None, :] - shifts[c]) ** 2 < STARTS_APART_M**2] = 0
-    return peaks
+    if far + NARROWEST <= SMALL.size * CELL_M / 2:
+        return SMALL
+    # Cells round the window are observed, too.
+    half = int(np.ceil((far + WIDEST) / CELL_M)) + 2
+    return min(BevGrid(2 * int(fft.next_fast_len(half, real=True))), LARGE, key=lambda grid: grid.size)
 
 
 def _pose(grid: BevGrid, a: LevelSubmap, b: LevelSubmap, shift: Floats, yaw: float, expected_z: float) -> Floats:
@@ -134,7 +123,7 @@ class Verifier:
         starts = find_initial_guesses(a, b, expected, reach, yaws)
         if not starts:
             return Verification(LoopStage.OVERLAP, "nothing stands up there")
-        view = LARGE.cover(a.non_ground, a.ground).ravel() > 0
+        view = LARGE.view(a.non_ground, a.ground)[2].ravel() > 0
         tried = sorted((self._try(a, b, view, start.T_a_b) for start in starts), key=lambda found: -found[0])
         support, rough = tried[0]
         others = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]

@@ -10,10 +10,11 @@ from revisited import CONFIG, Revisited, error_of, revisit, town_map
 from turned_sensor import TURNS, turn, turned_pose, turned_store
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.localization.place_search import PlaceSearch
+from lslam.backend.localization.place_search import PlaceSearch, Region
 from lslam.backend.localization.prior_map import make_prior_map
 from lslam.backend.localization.sessions import Session, tie
-from lslam.backend.localization.start import PlaceFinder, Start, StartPrior
+from lslam.backend.localization.start import SPACING_M, PlaceFinder, Start, StartPrior, Vote
+from lslam.backend.loops.level_submap import make_level_submap
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.simulation.routes import Visit
@@ -64,6 +65,53 @@ def test_a_drive_in_another_town_is_refused(search: PlaceFinder, world: Revisite
     lost = PlaceFinder(PlaceSearch(other, REGISTRATION), world.store, CONFIG)
     assert lost.find() is None
     assert lost.reasons
+
+
+@pytest.mark.parametrize("inside", [(0.0, 24.0), (101.0, 126.0), (370.0, 400.0), None])
+def test_a_drive_that_enters_the_map_late_is_found_and_tries_grow_rare(
+    inside: tuple[float, float] | None, search: PlaceFinder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 400 m with a keyframe every two: a rejection like the last ones says little, and an agreement is looked for at once."""
+    ways = np.arange(0.0, 401.0, 2.0)
+    monkeypatch.setattr(search, "_distances", ways)
+    monkeypatch.setattr(search, "_poses", np.tile(np.eye(4), (len(ways), 1, 1)))
+    tried: list[float] = []
+
+    def vote(b: int, region: None) -> Vote | None:
+        tried.append(ways[b])
+        is_inside = inside is not None and inside[0] <= ways[b] <= inside[1]
+        return Vote(b, np.eye(4), np.eye(6), 0.6) if is_inside else None
+
+    monkeypatch.setattr(search, "vote", vote)
+    start = search.find()
+    assert tried[: 1 + (inside is not None)] == ([0.0, 6.0][: 1 + (inside is not None)])
+    if inside is None:
+        assert start is None
+        assert len(tried) < 26
+        assert np.diff(tried).max() == SPACING_M * 3
+    else:
+        assert start is not None
+        assert (start.votes, start.tried) == (2, len(tried))
+        assert tried[-1] - tried[-2] == SPACING_M
+
+
+@pytest.mark.parametrize("degrees", [0.0, 64.0, 151.0, 238.0, 331.0])
+def test_a_place_is_guessed_whatever_the_heading(degrees: float, search: PlaceFinder) -> None:
+    place = search.search
+    around = place.whole.non_ground[:, :2]
+    centre = np.array([*np.median(around, axis=0), 0.0])
+    R = so3.exp(np.array([0.0, 0.0, np.deg2rad(degrees)]))
+    points = np.concatenate([place.whole.fine.planes[place.whole.fine.planes[:, 7] > -2, :3]]) - centre
+    near = points[np.linalg.norm(points[:, :2], axis=1) < 50.0] @ R
+    cloud = np.repeat(near, 8, axis=0) + np.random.default_rng(0).normal(0, 0.1, (8 * len(near), 3))
+    query = make_level_submap(cloud.astype(np.float32), REGISTRATION)
+    guesses = place.guesses(query)
+    best = se3.relative(se3.make(R, centre), guesses[0])
+    assert np.linalg.norm(best[:2, 3]) < 1.5
+    assert np.rad2deg(so3.angle(best[:3, :3])) < 1.6
+    # Where it cannot be it is not looked for.
+    away = Region(centre[:2] + 20.0, 5.0)
+    assert all(np.linalg.norm(T[:2, 3] - away.centre) < 8.0 for T in place.guesses(query, away))
 
 
 def test_a_given_start_is_searched_about(world: Revisited, search: PlaceFinder) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from lslam.backend.loops import verify
 from lslam.backend.loops.level_submap import LevelSubmap, make_level_submap
-from lslam.backend.loops.verify import LARGE, Verification, Verifier, _peaks, find_initial_guesses
+from lslam.backend.loops.verify import LARGE, NARROWEST, WIDEST, Verification, Verifier, _grid, find_initial_guesses
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
@@ -152,19 +152,27 @@ def test_bev_correlation_finds_shift_heading_and_climb() -> None:
     assert all(np.linalg.norm(found.T_a_b[:2, 3]) <= 3.0 for found in near)
 
 
-def test_starts_lie_four_metres_apart_fit_seven_tenths_as_well_and_are_five() -> None:
-    shifts = np.arange(-20.0, 20.0, 0.5)
+def test_starts_lie_four_metres_apart_fit_seven_tenths_as_well_and_are_five(monkeypatch: pytest.MonkeyPatch) -> None:
+    limits: list[tuple[float, ...]] = []
 
-    def starts(*tops: tuple[float, float]) -> list[float]:
-        score = np.zeros((len(shifts), len(shifts)), np.float32)
-        for x, height in tops:
-            score[np.searchsorted(shifts, x), len(shifts) // 2] = height
-        return [float(shift[0]) for shift, _, _ in _peaks(shifts, score, np.zeros_like(score), np.zeros(3), 18.0)]
+    def peaks(shifts: Floats, score: Floats, *given: float) -> list[int]:
+        limits.append((len(shifts), *given))
+        return []
 
-    assert starts((0.0, 1.0), (3.5, 0.9), (-4.0, 0.8)) == [0.0, -4.0]
-    assert starts((0.0, 1.0), (5.0, 0.72), (-5.0, 0.68)) == [0.0, 5.0]
-    assert starts(*[(6.0 * k, 1.0 - 0.01 * k) for k in range(-3, 4)]) == [-18.0, -12.0, -6.0, 0.0, 6.0]
-    assert starts((0.0, 0.5), (18.0, 0.5), (18.5, 1.0)) == [0.0, 18.0]
+    monkeypatch.setattr(verify, "peaks", peaks)
+    world = town()
+    a, b = place(world, pose(5, -45), 1), place(world, pose(11, -48, 8), 2)
+    assert find_initial_guesses(a, b, np.array([2.5, 0.0, 0.0]), 2.0, YAWS) == []
+    # Cells within two metres of a place in the middle between two.
+    assert limits == [(12, 4.0, 5, 0.7)]
+
+
+def test_a_grid_has_room_for_the_window_at_every_shift_where_it_can() -> None:
+    for far in (0.0, 23.9, 24.1, 30.0, 67.0, 200.0):
+        half = _grid(far).size / 2
+        assert half <= LARGE.size / 2
+        assert half >= min(far + (NARROWEST if far <= 24.0 else WIDEST + 1), LARGE.size / 2)
+    assert [_grid(far).size for far in (1.0, 36.0, 90.0)] == [128, 200, 256]
 
 
 def test_a_submap_has_its_vertical_surfaces() -> None:
@@ -199,7 +207,7 @@ def test_vertical_surfaces_support_a_start_within_two_kernels(metres: float, sup
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
     a, b = (make_level_submap(wall, RegistrationConfig()) for _ in range(2))
-    seen = LARGE.cover(a.non_ground, a.ground).ravel() > 0
+    seen = LARGE.view(a.non_ground, a.ground)[2].ravel() > 0
     T = se3.make(np.eye(3), np.array([0.0, metres, 0.0]))
     found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, T)
     assert found == pytest.approx(support, abs=0.05)
@@ -211,6 +219,6 @@ def test_a_start_is_supported_when_a_quarter_of_its_vertical_surfaces_was_seen(m
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
     a, b = (make_level_submap(part, RegistrationConfig()) for part in (wall[along < metres - 12], wall))
-    seen = LARGE.cover(a.non_ground, a.ground).ravel() > 0
+    seen = LARGE.view(a.non_ground, a.ground)[2].ravel() > 0
     found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, np.eye(4))
     assert found == pytest.approx(support, abs=0.2)
