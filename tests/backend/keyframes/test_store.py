@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from lslam.backend.keyframes.store import INDEX, KeyframeStore
 from lslam.core.errors import InputError, OutputError
 from lslam.core.types.trajectory import Keyframe
+from lslam.io.formats.bag_chunks import zstd
+from lslam.io.formats.state_files import write_npz
 
 FLOATS = st.floats(width=32, allow_nan=True, allow_infinity=True)
 CLOUDS = st.lists(
@@ -83,6 +85,31 @@ def test_clouds_that_are_not_packed_are_larger_and_the_same(tmp_path: Path) -> N
         store.add(keyframe(0), points)
         assert np.array_equal(store.points(0), points)
     assert packed.size < points.nbytes < plain.size == in_memory.size
+
+
+@pytest.mark.parametrize("packing", [0, 1])
+def test_classes_are_packed_with_their_cloud(tmp_path: Path, packing: int) -> None:
+    points, labels = cloud(3), np.arange(len(cloud(3)), dtype=np.uint16)
+    store = KeyframeStore(tmp_path / "keyframes", cached=0, deflate=packing)
+    store.add(keyframe(0), points, labels)
+    np.testing.assert_array_equal(store.points(0), points)
+    np.testing.assert_array_equal(np.asarray(store.labels(0)), labels)
+
+
+def test_clouds_of_an_older_version_are_read(tmp_path: Path) -> None:
+    """Their planes are deflated as a member of the archive."""
+    filled(tmp_path, 2).save()
+    planes = np.ascontiguousarray(cloud(1).T).view(np.uint8).reshape(3, -1, 4).transpose(2, 0, 1)
+    write_npz(tmp_path / "000001.npz", {"planes": planes}, 1)
+    np.testing.assert_array_equal(KeyframeStore(tmp_path, cached=0).points(1), cloud(1))
+
+
+@pytest.mark.parametrize("data", [b"", b"no zstd", bytes(zstd().compress(b"x" * 25))])
+def test_a_cloud_that_was_packed_otherwise_is_damaged(tmp_path: Path, data: bytes) -> None:
+    filled(tmp_path, 2).save()
+    write_npz(tmp_path / "000001.npz", {"planes.zst": np.frombuffer(data, np.uint8)}, 0)
+    with pytest.raises(InputError, match=r"000001\.npz is damaged"):
+        KeyframeStore(tmp_path, cached=0).points(1)
 
 
 def test_few_clouds_stay_in_memory(tmp_path: Path) -> None:
