@@ -90,8 +90,7 @@ class PlaceSearch:
         cells, headings, quarters = np.arange(self.coarse.size**2), range(0, QUARTER, COARSE), 4
         if region is not None:
             count = int(np.ceil(min(region.turn, np.pi) / turned.step))
-            away2 = ((self.coarse.shifts(cells) - region.centre[:2]) ** 2).sum(axis=1)
-            cells = np.flatnonzero(away2 <= max(region.radius, self.coarse.cell) ** 2)
+            cells = self.coarse.within(region.centre, region.radius)
             headings, quarters = range(-count, count + 1, COARSE), 1
         best = [BestShifts(cells) for _ in range(quarters)]
         for n in headings:

@@ -52,8 +52,18 @@ class BevGrid:
 
     def shifts(self, cells: Longs) -> Floats:
         """(K, 2) m that the flat cells (K,) of a correlation stand for."""
-        along = np.fft.fftfreq(self.size, 1 / (self.size * self.cell))
+        along = self._along()
         return np.column_stack([along[part] for part in np.divmod(cells, self.size)])
+
+    def within(self, centre: Floats, radius: float) -> Longs:
+        """Flat cells of a correlation whose shifts lie within `radius` m, or a cell, of `centre` (2,), increasing."""
+        along = self._along()
+        away2 = (along[:, None] - centre[0]) ** 2 + (along[None, :] - centre[1]) ** 2
+        return np.flatnonzero(away2 <= max(radius, self.cell) ** 2)
+
+    def _along(self) -> Floats:
+        """(size,) m that row or column k of a correlation stands for."""
+        return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * self.cell)))
 
 
 def blurred(image: Image) -> Image:

@@ -52,8 +52,7 @@ def find_initial_guesses(
     image = blurred(there[0])
     seen = spectra(np.stack([image, there[2], image**2]))
     near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.non_ground, b.ground))
-    away2 = ((grid.shifts(np.arange(grid.size**2)) - expected[:2]) ** 2).sum(axis=1)
-    best = BestShifts(np.flatnonzero(away2 <= max(reach, CELL_M) ** 2))
+    best = BestShifts(grid.within(expected[:2], reach))
     shifts = grid.shifts(best.cells)
     for yaw in yaws:
         view = grid.view(near, floor, turning(yaw))
