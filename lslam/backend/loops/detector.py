@@ -114,7 +114,8 @@ class Detector:
                     if not throttle.is_due(keyframe.distance):
                         candidates.append(self._thinned(older, b, throttle.wait))
                         continue
-                    for n in (b, *islice(self._due_after(b, gated, throttle), threads - 1)):
+                    # A thread that is done goes on with what waits, although an older keyframe is not.
+                    for n in (b, *islice(self._due_after(b, gated, throttle), 2 * (threads - 1))):
                         # What was begun with another memory is begun again.
                         if n not in ahead or (n == b and not np.array_equal(ahead[n][0], older)):
                             compared = gated.get(n)
@@ -125,10 +126,11 @@ class Detector:
                     for closed in examined:
                         if closed.is_accepted:
                             self.memory.close(closed.a, b)
-                    throttle.observe(
-                        keyframe.distance,
-                        Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED,
-                    )
+                    verdict = Verdict.ACCEPTED if any(c.is_accepted for c in examined) else Verdict.REJECTED
+                    if verdict != throttle.last:
+                        # Others are due then; what has begun may be among them.
+                        ahead = {n: kept for n, kept in ahead.items() if not kept[1].cancel()}
+                    throttle.observe(keyframe.distance, verdict)
             finally:
                 pool.shutdown(cancel_futures=True)
         return candidates
