@@ -7,6 +7,7 @@ planes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.kernels import voxel
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.kernels.feature_grid import build
+from lslam.odometry.kernels.feature_grid import Counterparts, build
 from lslam.odometry.kernels.feature_residuals import add_normals
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LastKeyframes, LocalMap
@@ -41,11 +42,47 @@ class FeatureScan:
 
     features: Features
     T_world_lidar: Floats
-    edges: Grid
-    planes: Grid
-    normals: Floats
-    size: float
     reach: float
+
+    @property
+    def size(self) -> float:
+        """Edge of a cell, m."""
+        return self.reach / 2
+
+    @cached_property
+    def edges(self) -> Grid:
+        """The less sharp edges."""
+        return self._grid(self.features.less_edges)
+
+    @cached_property
+    def planes(self) -> Grid:
+        """The less planar points."""
+        return self._grid(self.features.less_planes)
+
+    @cached_property
+    def normals(self) -> Floats:
+        """(N, 3) of the surfaces around the less planar points, in the order of their grid."""
+        return _normals(self.planes[0])
+
+    def _grid(self, part: FeaturePoints) -> Grid:
+        R, t = np.ascontiguousarray(self.T_world_lidar[:3, :3]), np.ascontiguousarray(self.T_world_lidar[:3, 3])
+        return build(part.points, part.rings, R, t, self.size)
+
+    @cached_property
+    def _searched(self) -> dict[tuple[str, int], Counterparts]:
+        return {}
+
+    def searched(self, kind: str, count: int) -> Counterparts:
+        """Counterparts of so many edges or planar points, as the last alignment with this scan left them.
+
+        They save a search wherever a point lies near where one was before, whichever alignment it belongs to.
+        """
+        return self._searched.setdefault((kind, count), no_counterparts(count))
+
+
+def no_counterparts(count: int) -> Counterparts:
+    """What a search of so many points begins with."""
+    return np.full((count, 3), -1, np.int32), np.full((count, 3, 4), -1.0)
 
 
 def surface_size(size: float, grid_step: float) -> float:
@@ -54,16 +91,13 @@ def surface_size(size: float, grid_step: float) -> float:
 
 
 def feature_scan(features: Features, T_world_lidar: Floats, grid_step: float = 0.0) -> FeatureScan:
-    """Index the features of a scan, thinned by a grid of `grid_step`, m, at its pose (4, 4)."""
-    R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
-    reach = surface_size(MATCH_REACH_M, grid_step)
-    size = reach / 2
+    """The features of a scan, thinned by a grid of `grid_step`, m, at its pose (4, 4): indexed where one registers on them."""
+    return FeatureScan(features, T_world_lidar, surface_size(MATCH_REACH_M, grid_step))
 
-    def grid(part: FeaturePoints) -> Grid:
-        return build(part.points, part.rings, R, t, size)
 
-    planes = grid(features.less_planes)
-    return FeatureScan(features, T_world_lidar, grid(features.less_edges), planes, _normals(planes[0]), size, reach)
+def settled(features: Features) -> Features:
+    """The features as plain arrays, which checkpoints can hold: no part of them waits to be deskewed."""
+    return features.each(lambda part: FeaturePoints(part.points, part.rings, part.times))
 
 
 def _normals(points: Floats) -> Floats:
@@ -71,7 +105,8 @@ def _normals(points: Floats) -> Floats:
 
     Voxels of half the reach tell them, and before these voxels twice as large, for two rings of a sparse sensor.
     """
-    fine, normals = GaussianMap(MATCH_REACH_M / 2, capacity=1 << 12), np.zeros_like(points)
+    capacity = 1 << max(8, int(np.ceil(np.log2(len(points) + 1))))
+    fine, normals = GaussianMap(MATCH_REACH_M / 2, capacity=capacity), np.zeros_like(points)
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(

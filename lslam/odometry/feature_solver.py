@@ -66,8 +66,14 @@ def solve_on_scan(
         return float(target.size), float(target.reach), float(sigma) ** 2, bool(one_to_many)
 
     terms = [
-        Term(linearise_edges, (edges,), target.edges, settings(noise.edge)),
-        Term(linearise_planes, (planes,), (*target.planes, target.normals), settings(noise.plane)),
+        Term(linearise_edges, (edges,), target.edges, settings(noise.edge), target.searched("edges", len(edges))),
+        Term(
+            linearise_planes,
+            (planes,),
+            (*target.planes, target.normals),
+            settings(noise.plane),
+            target.searched("planes", len(planes)),
+        ),
     ]
     limits = Limits(
         noise.weak_share,

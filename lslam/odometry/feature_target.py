@@ -11,7 +11,15 @@ from lslam.core.config.odometry import LoamConfig, RegistrationConfig
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.odometry.all_points import AllPoints
-from lslam.odometry.feature_map import FeatureKeyframes, FeatureMap, FeatureScan, feature_scan, surface_size, thinned
+from lslam.odometry.feature_map import (
+    FeatureKeyframes,
+    FeatureMap,
+    FeatureScan,
+    feature_scan,
+    settled,
+    surface_size,
+    thinned,
+)
 from lslam.odometry.feature_solver import NONE, FeatureNoise, ScanStep, map_problem, remap_solution
 from lslam.registration.attempt import Attempt, Target
 from lslam.registration.history import History
@@ -171,7 +179,7 @@ class FeatureTarget(Target):
 
     def enter(self, result: RegistrationResult) -> None:
         """Into the feature map, and as what the next scan is registered on."""
-        features, T_world_lidar = result.points, result.T_world_lidar
+        features, T_world_lidar = settled(result.points), result.T_world_lidar
         if self.map is not None and self._keyframes is not None:
             self._keyframes.enter(self.map, features, T_world_lidar)
         elif self.map is not None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
 from lslam.core.config.config import Config
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
@@ -15,7 +17,7 @@ from lslam.odometry.feature_solver import joint_step
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
 from lslam.odometry.map_method import MapMethod
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.features import Features, extract_features
+from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features
 from lslam.registration.preprocessing.ground import up_of
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
@@ -88,9 +90,51 @@ class Loam(MapMethod):
             trial.update(scan, prior, trial.register(scan, prepared, prior))
 
 
+# What is registered, and what is entered into the map where that went well: deskewed together, once either is asked for.
+_TOGETHER = (("edges", "planes"), ("less_edges", "less_planes", "neither"))
+
+
 def deskewed(features: Features, prior: MotionPrior) -> Features:
-    """The features as seen from the pose at the stamp."""
-    return features.each(lambda part: replace(part, points=deskew_points(part.points, part.times, prior)))
+    """The features as seen from the pose at the stamp, each when it is asked for: a scan that is registered twice enters once."""
+    parts: dict[str, FeaturePoints] = {}
+    for names in _TOGETHER:
+        swept = _Swept([getattr(features, name) for name in names], prior)
+        parts.update({name: _SweptPart(swept, k) for k, name in enumerate(names)})
+    return Features(**parts, labels=features.labels)
+
+
+class _Swept:
+    """Parts of a scan's features, and the motion that displaces them."""
+
+    def __init__(self, parts: list[FeaturePoints], prior: MotionPrior) -> None:
+        self.parts, self._prior = parts, prior
+
+    @cached_property
+    def points(self) -> list[Floats]:
+        """Points (M, 3), m, of each part, as seen from the pose at the stamp."""
+        times = [part.times for part in self.parts if part.times is not None]
+        points = np.concatenate([part.points for part in self.parts])
+        moved = deskew_points(points, np.concatenate(times), self._prior)
+        return np.split(moved, np.cumsum([len(part) for part in self.parts])[:-1])
+
+
+class _SweptPart(FeaturePoints):
+    """One of the parts."""
+
+    _swept: _Swept
+    _k: int
+
+    def __init__(self, swept: _Swept, k: int) -> None:
+        own = swept.parts[k]
+        self.__dict__.update(rings=own.rings, times=own.times, _swept=swept, _k=k)
+
+    def __len__(self) -> int:
+        return len(self.rings)
+
+    @cached_property
+    def points(self) -> Floats:
+        """(M, 3) m, as seen from the pose at the stamp."""
+        return self._swept.points[self._k]
 
 
 def _room() -> Scan:

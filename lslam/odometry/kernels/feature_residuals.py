@@ -18,7 +18,7 @@ from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linearisation import Pose, Sums, Width
 from lslam.core.kernels.residuals import add_facts, add_row, add_surface, place
 from lslam.core.kernels.voxel import index_of, pack
-from lslam.odometry.kernels.feature_grid import nearest
+from lslam.odometry.kernels.feature_grid import Counterparts, counterparts
 from lslam.odometry.kernels.lines import add_line
 
 Floats = NDArray[np.float64]
@@ -31,8 +31,6 @@ Grid = tuple[Floats, Rings, Ints, Longs, Ints]
 SurfaceGrid = tuple[Floats, Rings, Ints, Longs, Ints, Floats]
 Reach = tuple[float, float, float, bool]
 
-# Two rings up or down, as in LOAM. (Rings are unsigned, also after int() in a kernel: their difference would wrap.)
-NEARBY_RINGS = 2
 # Three points that are nearly in line define no plane: least sine of the angle at the nearest point.
 LEAST_SINE = 0.1
 # Largest variance, rad2, of a normal of three points that counts as observing a direction: four degrees.
@@ -97,11 +95,11 @@ def _add_plane(
 
 @kernel
 def linearise_edges(
-    points: tuple[Floats], grid: Grid, settings: Reach, search: tuple[()], pose: Pose, width: Width, sums: Sums
+    points: tuple[Floats], grid: Grid, settings: Reach, search: Counterparts, pose: Pose, width: Width, sums: Sums
 ) -> None:
     """Add all edges (S, 3), LiDAR frame, to H, S, g and facts, see `linearisation`. Both H and S take all of them."""
     (source,) = points
-    edges, rings, starts, keys, table = grid
+    edges = grid[0]
     size, limit, variance, with_lines = settings
     R, t = pose
     scale, _, _ = width
@@ -110,7 +108,8 @@ def linearise_edges(
     c2 = scale * scale
     for i in range(len(source)):
         rx, ry, rz, x, y, z = place(source, i, R, t)
-        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, edges, rings, starts, keys, table)
+        counterparts(x, y, z, i, False, 2 if with_lines else 1, (size, limit), grid, search)
+        j, k = search[0][i, 0], search[0][i, 1]
         if j < 0:
             continue
         p = edges[j]
@@ -118,7 +117,6 @@ def linearise_edges(
         if not with_lines:
             _add_point(E, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
             continue
-        k, _ = nearest(x, y, z, size, limit, np.int64(rings[j]), NEARBY_RINGS, -1, edges, rings, starts, keys, table)
         if k < 0:
             continue
         ux, uy, uz = edges[k, 0] - p[0], edges[k, 1] - p[1], edges[k, 2] - p[2]
@@ -158,7 +156,13 @@ def add_normals(
 
 @kernel
 def linearise_planes(
-    points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: tuple[()], pose: Pose, width: Width, sums: Sums
+    points: tuple[Floats],
+    grid: SurfaceGrid,
+    settings: Reach,
+    search: Counterparts,
+    pose: Pose,
+    width: Width,
+    sums: Sums,
 ) -> None:
     """As `linearise_edges`, for planar points (S, 3). S takes the planes alone whose normal is known well.
 
@@ -177,7 +181,10 @@ def linearise_planes(
     unused = np.zeros(6)
     for i in range(len(source)):
         rx, ry, rz, x, y, z = place(source, i, R, t)
-        j, _ = nearest(x, y, z, size, limit, 0, -1, -1, surface, rings, starts, keys, table)
+        counterparts(
+            x, y, z, i, True, 3 if with_planes else 1, (size, limit), (surface, rings, starts, keys, table), search
+        )
+        j, k, m = search[0][i, 0], search[0][i, 1], search[0][i, 2]
         if j < 0:
             continue
         p = surface[j]
@@ -185,11 +192,6 @@ def linearise_planes(
         if not with_planes:
             _add_point(H, g, facts, ex, ey, ez, rx, ry, rz, variance, c2)
             continue
-        ring = np.int64(rings[j])
-        k, _ = nearest(x, y, z, size, limit, ring, 0, j, surface, rings, starts, keys, table)
-        if k < 0:
-            continue
-        m, _ = nearest(x, y, z, size, limit, ring, NEARBY_RINGS, -1, surface, rings, starts, keys, table)
         if m < 0:
             continue
         ax, ay, az = surface[k, 0] - p[0], surface[k, 1] - p[1], surface[k, 2] - p[2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.kernels import facts as at
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.voxel import OFFSET
+from lslam.odometry.feature_map import no_counterparts
 from lslam.odometry.kernels import feature_grid, feature_residuals
 from lslam.registration.gaussian_map import GaussianMap
 
@@ -32,6 +33,7 @@ class Scene:
     source: Floats
     R: Floats
     t: Floats
+    kept: feature_grid.Counterparts | None = None
 
     def matches(self, kind: str) -> list[Match]:
         x = self.source @ self.R.T + self.t
@@ -42,13 +44,17 @@ class Scene:
             found = [match(s, y, self.world, self.rings, REACH, VARIANCE) for s, y in zip(self.source, x, strict=True)]
         return [m for m in found if m is not None]
 
+    def search(self) -> feature_grid.Counterparts:
+        """A search that remembers nothing, or the one that is kept."""
+        return no_counterparts(len(self.source)) if self.kept is None else self.kept
+
     def linearise(self, kind: str, c: float) -> tuple[Floats, Floats, Floats]:
         if kind == "plane":
             return self.linearise_planes(c, np.zeros_like(self.world))[:3]
         H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         feature_residuals.linearise_edges(
-            (self.source,), self.grid, (SIZE, REACH, VARIANCE, kind != "point"), (), (self.R, self.t), (c, c, np.inf),
-            (H, S, g, facts),
+            (self.source,), self.grid, (SIZE, REACH, VARIANCE, kind != "point"), self.search(),
+            (self.R, self.t), (c, c, np.inf), (H, S, g, facts),
         )  # fmt: skip
         np.testing.assert_array_equal(S, H)
         return whole(H), g, facts
@@ -56,8 +62,8 @@ class Scene:
     def linearise_planes(self, c: float, normals: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
         feature_residuals.linearise_planes(
-            (self.source,), (*self.grid, normals), (SIZE, REACH, VARIANCE, True), (), (self.R, self.t), (c, c, np.inf),
-            (H, S, g, facts),
+            (self.source,), (*self.grid, normals), (SIZE, REACH, VARIANCE, True), self.search(), (self.R, self.t),
+            (c, c, np.inf), (H, S, g, facts),
         )  # fmt: skip
         return whole(H), g, facts, whole(S)
 
@@ -88,7 +94,7 @@ def scene() -> Scene:
 @kernel
 def search(x: Floats, size: float, limit: float, ring: int, nearby: int, skipped: int, points: Floats,
            rings: NDArray[np.uint16], starts: NDArray[np.int32], keys: NDArray[np.int64],
-           table: NDArray[np.int32]) -> tuple[int, float]:  # fmt: skip
+           table: NDArray[np.int32]) -> tuple[int, float, float]:  # fmt: skip
     return feature_grid.nearest(
         x[0], x[1], x[2], size, limit, ring, nearby, skipped, points, rings, starts, keys, table
     )
@@ -116,12 +122,15 @@ def test_nearest_is_that_of_brute_force(scene: Scene, limit: float) -> None:
         away = np.abs(scene.rings - ring)
         own = (away == 0) & (np.arange(len(away)) != j)
         for nearby, allowed in ((-1, away >= 0), (0, own), (2, (away > 0) & (away <= 2))):
-            k, d2 = search(x, SIZE, limit, ring, nearby, j, *scene.grid)
+            k, d2, next_d2 = search(x, SIZE, limit, ring, nearby, j, *scene.grid)
             expected = nearest(x, scene.world, allowed, limit)
             assert k == expected
             if k >= 0:
                 found += 1
                 assert d2 == pytest.approx(float(np.sum((scene.world[k] - x) ** 2)))
+                others = allowed & (np.arange(len(away)) != k)
+                second = np.sum((scene.world[others] - x) ** 2, axis=1).min(initial=limit**2)
+                assert next_d2 == pytest.approx(second)
     assert 0 < found < 3 * len(scene.source)
 
 
@@ -213,6 +222,23 @@ def test_points_in_line_make_no_plane_and_points_of_one_ring_no_line() -> None:
     one_ring = feature_grid.build(line, np.zeros(20, np.uint16), np.eye(3), np.zeros(3), SIZE)
     s = Scene(one_ring, one_ring[0], one_ring[1].astype(np.int64), source, np.eye(3), np.zeros(3))
     assert s.linearise("edge", 1.0)[2][at.MATCHED] == 0
+
+
+@pytest.mark.parametrize("kind", ["edge", "plane", "point"])
+def test_counterparts_that_are_remembered_are_those_of_a_new_search(kind: str) -> None:
+    """Steps from far below the gap between two points to far above it, and back, with another alignment in between."""
+    scene = make_scene(5)
+    kept = no_counterparts(len(scene.source))
+    remembering = replace(scene, kept=kept)
+    rng, reused = np.random.default_rng(6), 0
+    for step in (0.0, 1e-4, 1e-2, 0.05, 0.3, 2.0, 1e-2, 1e-3):
+        move = rng.normal(0, step, 3)
+        scene, remembering = replace(scene, t=scene.t + move), replace(remembering, t=remembering.t + move)
+        before = kept[1].copy()
+        for own, expected in zip(remembering.linearise(kind, 0.4), scene.linearise(kind, 0.4), strict=True):
+            np.testing.assert_array_equal(own, expected)
+        reused += int((kept[1][:, 0] == before[:, 0]).all(axis=1).sum()) if step else 0
+    assert reused > len(scene.source)
 
 
 def test_an_empty_scan_and_an_empty_target_match_nothing(scene: Scene) -> None:
