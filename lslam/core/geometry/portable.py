@@ -165,10 +165,11 @@ def arctan2(y: Any, x: Any) -> Any:
 
 
 def arctan2_of(y: float, x: float) -> float:
-    """`arctan2` of two numbers that are not negative."""
-    if x == 0:
-        return 0.0 if y == 0 else _arctangent_of(math.inf)
-    return _arctangent_of(y / x)
+    """The same operations on plain floats that are not both zero, with the same result."""
+    angle = _arctangent_of(math.inf if x == 0 else abs(y) / abs(x))
+    if math.copysign(1.0, x) < 0:
+        angle = math.pi - (angle - 1.2246467991473531772e-16)
+    return math.copysign(angle, y)
 
 
 def arcsin(x: Any) -> Any:

@@ -152,7 +152,11 @@ def poses_at(
     span = (stamps[left + 1] - stamps[left]).astype(np.float64)
     share = (query - stamps[left]).astype(np.float64) / span
     a, b = poses[left], poses[left + 1]
-    turn = turns_between(a, b) if turns is None else turns[left]
+    if turns is None:
+        # Once for each segment, where the queries are more than these.
+        turn = turns_between(poses[:-1], poses[1:])[left] if len(poses) <= len(query) else turns_between(a, b)
+    else:
+        turn = turns[left]
     t = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
     return make(portable.product(a[:, :3, :3], so3.exp(share[:, None] * turn)), t)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.core.geometry import portable, so3
+from lslam.core.geometry import portable, se3, so3
 
 RNG = np.random.default_rng(5)
 ANGLES = np.concatenate([RNG.uniform(-10, 10, 20_000), RNG.uniform(-1e5, 1e5, 20_000), [0.0, np.pi / 2, np.pi, 1e-300]])
@@ -82,4 +82,16 @@ def test_one_matrix_and_many_have_the_same_bytes() -> None:
     assert all((portable.product(a, b) == c).all() for a, b, c in zip(A, B, many, strict=True))
     phi = RNG.normal(size=(100, 3))
     assert all((so3.exp(v) == R).all() for v, R in zip(phi, so3.exp(phi), strict=True))
-    assert all((so3.log(R) == v).all() for v, R in zip(so3.log(so3.exp(phi)), so3.exp(phi), strict=True))
+    # No turn, hardly one, half a turn about each axis, and all between.
+    halves = [np.diag(signs) for signs in ([1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
+    turns = np.concatenate(
+        [so3.exp(phi), so3.exp(3.14 * phi / portable.norm(phi)[:, None]), so3.exp(1e-10 * phi), halves]
+    )
+    assert all((so3.log(R) == v).all() for v, R in zip(so3.log(turns), turns, strict=True))
+
+
+def test_poses_between_few_and_many_have_the_same_bytes() -> None:
+    poses, stamps = se3.exp(RNG.normal(size=(3, 6))), np.array([0, 40, 100])
+    query = np.arange(-10, 120, 7)
+    one_by_one = np.concatenate([se3.poses_at(stamps, poses, query[k : k + 1]) for k in range(len(query))])
+    np.testing.assert_array_equal(se3.poses_at(stamps, poses, query), one_by_one)
