@@ -11,7 +11,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.base import Deskewing, Odometry
+from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.tracker import Loaded, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.registration.robust import UsualAgreement
@@ -80,7 +80,7 @@ class SegmentTracker(Stateful):
     @property
     def has_middles(self) -> bool:
         """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
-        return isinstance(self.odometry, Deskewing) and isinstance(self.present.motion, ConstantVelocity)
+        return isinstance(self.present.motion, ConstantVelocity) and self.present.is_deskewing
 
     def decide(self, loaded: Loaded | None, result: ScanResult | None) -> list[Tracked]:
         """The scans that are decided with the next one, in order: none while two hypotheses are open, all at the end, None.

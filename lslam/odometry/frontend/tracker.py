@@ -57,6 +57,9 @@ class Tracker(Stateful):
         self, odometry: Odometry, stationary: StationaryDetector | None = None, motion: MotionModel | None = None
     ) -> None:
         self.odometry, self.stationary = odometry, stationary
+        # Asked for in each scan, and a tenth of a millisecond each time that a protocol is.
+        self._deskewing = odometry if isinstance(odometry, Deskewing) else None
+        self._windowed = odometry if isinstance(odometry, Windowed) else None
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
@@ -79,7 +82,8 @@ class Tracker(Stateful):
         trial = None
         if scan is None:
             result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
-        elif isinstance(odometry, Deskewing):
+        elif self._deskewing is not None:
+            odometry = self._deskewing
             if motion.coasting is not None and motion.is_compared(loaded.stamp_ns, span):
                 # For comparison alone: the map and the motion model are not updated.
                 without = motion.coasting.sweep(scan.stamp_ns, span)
@@ -108,6 +112,11 @@ class Tracker(Stateful):
                 self.stationary.observe(scan, result)
         self._keep(result)
         return self._recorded(result, expected, steady, trial, clock)
+
+    @property
+    def is_deskewing(self) -> bool:
+        """Whether the method takes the motion within a sweep from the prior."""
+        return self._deskewing is not None
 
     @property
     def is_settled(self) -> bool:
@@ -178,12 +187,12 @@ class Tracker(Stateful):
     def _correct(self, result: ScanResult, prior: MotionPrior, clock: StageClock) -> None:
         """Update the motion model and the motion within the sweep."""
         pose, is_ok = result.T_world_lidar, result.status == "ok"
-        is_blind = is_ok and not isinstance(self.odometry, Deskewing)
+        is_blind = is_ok and self._deskewing is None
         with clock.stage("imu"):
             self.sweep = self.motion.refine(prior, result.stamp_ns, pose) if is_blind else prior
             self.motion.correct(result.stamp_ns, pose, prior, is_ok)
-            if isinstance(self.odometry, Windowed):
-                self.odometry.settle(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
+            if self._windowed is not None:
+                self._windowed.settle(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
         middle, instant_ns = middle_of(prior, result.stamp_ns, pose)
         self.middle = (instant_ns, middle)
 
@@ -298,7 +307,7 @@ def _fuse(
     odometry: Deskewing, motion: MotionModel, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
 ) -> RegistrationResult:
     """The registration fused with the motion model; of a window, once more where that moves its scans."""
-    if not (isinstance(odometry, Windowed) and isinstance(motion, WindowMotion)):
+    if not (isinstance(motion, WindowMotion) and isinstance(odometry, Windowed)):
         return motion.fuse(stamp_ns, result, prior)
     motion.take(odometry.equations(stamp_ns, result))
     fused = motion.fuse(stamp_ns, result, prior)

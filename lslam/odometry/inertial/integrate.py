@@ -20,7 +20,7 @@ class Increments:
     instants_ns : (K,) increasing; rotations : (K, 3, 3) from the IMU then to the IMU at the first instant
     velocities (K, 3), positions (K, 3) : the specific force integrated once and twice, m/s and m
     velocity_arms, position_arms : (K, 3, 3) likewise of the rotations: what a constant force in IMU axes adds
-    readings : (2, 3) rad/s of the gyroscope at the first and the last instant
+    imu, offset_ns : the stream, and what was added to its stamps
     hidden : (6,) one sigma of the mean force and rate, to the last instant, that the range of the IMU cut off; None for none
     """
 
@@ -30,8 +30,14 @@ class Increments:
     positions: Floats
     velocity_arms: Floats
     position_arms: Floats
-    readings: Floats
+    imu: ImuStream
+    offset_ns: int
     hidden: Floats | None = None
+
+    @property
+    def readings(self) -> Floats:
+        """(2, 3) rad/s of the gyroscope at the first and the last instant."""
+        return _readings(self.imu, self.instants_ns[[0, -1]] - self.offset_ns)
 
     @property
     def seconds(self) -> Floats:
@@ -103,7 +109,7 @@ def integrate(
         stamps, gyro, first = stamps[used], gyro[used], first - used.start
         accel, accel_bias = accel[used] @ mounting.T, mounting @ accel_bias
     increments = strapdown.integrate(stamps, gyro, accel, first, at, gyro_bias, accel_bias, axes)
-    return Increments(instants_ns, *increments, _readings(imu, at[[0, -1]]), _hidden(imu, int(at[0]), int(at[-1])))
+    return Increments(instants_ns, *increments, imu, offset_ns, _hidden(imu, int(at[0]), int(at[-1])))
 
 
 def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:
