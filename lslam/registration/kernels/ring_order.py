@@ -24,9 +24,9 @@ def follow(
     sense of rotation, which is that of most steps.
     """
     n = points.shape[0]
-    azimuth = np.empty(n, np.float32)
+    steps = np.zeros(n)
     slope = np.empty(n, np.float32)
-    last = -1
+    before_x, before_y = 0.0, 0.0
     left, right, total = 0, 0, 0
     for i in range(n):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -34,17 +34,25 @@ def follow(
         if not (flat > np.float32(0) and np.isfinite(flat) and np.isfinite(z)):
             slope[i] = np.nan
             continue
-        azimuth[i] = np.arctan2(y, x)
         slope[i] = z / flat
-        if last >= 0:
-            step = np.float64(azimuth[i]) - np.float64(azimuth[last])
-            step -= _FULL * np.rint(step / _FULL)
+        ahead_x, ahead_y = np.float64(x), np.float64(y)
+        if before_x != 0.0 or before_y != 0.0:
+            across = before_x * ahead_y - before_y * ahead_x
+            along = before_x * ahead_x + before_y * ahead_y
+            t = across / along
+            # Four terms of the series are exact to a float64 up to half a degree: most steps.
+            if along > 0.0 and abs(t) < 0.01:
+                t2 = t * t
+                step = t * (1.0 - t2 * (1.0 / 3.0 - t2 * (1.0 / 5.0 - t2 / 7.0)))
+            else:
+                step = np.arctan2(across, along)
+            steps[i] = step
             total += 1
             if 0 < step < backward:
                 left += 1
             elif -backward < step < 0:
                 right += 1
-        last = i
+        before_x, before_y = ahead_x, ahead_y
     sense = 1.0 if left >= right else -1.0
     turned = np.empty(n)
     jumps = np.empty(n, np.int64)
@@ -54,8 +62,7 @@ def follow(
     for i in range(n):
         if not np.isnan(slope[i]):
             if last >= 0:
-                step = sense * (np.float64(azimuth[i]) - np.float64(azimuth[last]))
-                step -= _FULL * np.rint(step / _FULL)
+                step = sense * steps[i]
                 at += step + _FULL if step < -backward else step
                 if abs(slope[i] - slope[last]) > tilt:
                     jumps[used] = i
