@@ -37,7 +37,7 @@ class Dlo(Icp):
         """Align with the last scan, then with the submap."""
         clock = StageClock()
         with clock.stage("deskew"):
-            points = self.registration.target.covered(deskew(prepared, prior))
+            points = self.with_surfaces(deskew(prepared, prior), prepared)
         with clock.stage("scan"):
             step = self.pairwise.locate(points, prior.pose, is_near)
         with clock.stage("map"):

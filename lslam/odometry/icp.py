@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.core.errors import UsageError
+from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.odometry.elastic import SweepPoints, register_elastic
@@ -58,12 +59,15 @@ class Icp(MapMethod):
     """Points on the local map."""
 
     deskew = "by the motion prior, and again by the motion that registration finds"
+    CLEARED: ClassVar[tuple[str, ...]] = ("_surfaces",)
 
     def __init__(self, registration: Registration) -> None:
         c = registration.config
         super().__init__(registration, is_scan_to_scan=c.target in ("scan", "sample"))
         # Point to plane, on a map of many scans.
         self.follows_course = registration.preprocess.deskew and c.target == "map" and c.residual in (None, "plane")
+        # Of the scan that was registered last.
+        self._surfaces: tuple[PreparedPoints, Floats] | None = None
 
     def prepare(self, scan: Scan) -> PreparedPoints:
         """Range gate and down-sampling."""
@@ -79,11 +83,24 @@ class Icp(MapMethod):
         began = time.perf_counter()
         points = deskew(prepared, prior)
         deskewed = time.perf_counter()
-        result = self.registration.locate(points, prior.pose, is_near, self.information_of(prior))
+        known = self.with_surfaces(points, prepared)
+        result = self.registration.locate(known, prior.pose, is_near, self.information_of(prior))
         stages = {"register": time.perf_counter() - deskewed}
         if points is not prepared:
             stages = {"deskew": deskewed - began, **stages}
         return replace(result, map_age=self.map_age, stages=stages)
+
+    def with_surfaces(self, points: PreparedPoints, prepared: PreparedPoints) -> PreparedPoints:
+        """The deskewed points with the covariances of the surfaces that they lie on, where the residual takes them.
+
+        A sweep that is deskewed again keeps those of the first time: what is left of its motion moves neighbours alike.
+        """
+        target = self.registration.target
+        if not target.kind.needs_covariance:
+            return points
+        if self._surfaces is None or self._surfaces[0] is not prepared:
+            self._surfaces = prepared, target.covered(points).covariance
+        return replace(points, covariance=self._surfaces[1])
 
     def is_elastic(self, prepared: PreparedPoints, prior: MotionPrior) -> bool:
         """Whether both ends of a sweep can be told: by points with times, on a map, when the speed is known."""
