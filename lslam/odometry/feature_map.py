@@ -16,7 +16,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.kernels import voxel
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.kernels.feature_grid import Counterparts, build
+from lslam.odometry.kernels.feature_grid import Matches, build
 from lslam.odometry.kernels.feature_residuals import add_normals
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LastKeyframes, LocalMap
@@ -69,18 +69,18 @@ class FeatureScan:
         return build(part.points, part.rings, R, t, self.size)
 
     @cached_property
-    def _searched(self) -> dict[tuple[str, int], Counterparts]:
+    def _searched(self) -> dict[tuple[str, int], Matches]:
         return {}
 
-    def searched(self, kind: str, count: int) -> Counterparts:
-        """Counterparts of so many edges or planar points, as the last alignment with this scan left them.
+    def searched(self, kind: str, count: int) -> Matches:
+        """Matches of so many edges or planar points, as the last alignment with this scan left them.
 
         They save a search wherever a point lies near where one was before, whichever alignment it belongs to.
         """
         return self._searched.setdefault((kind, count), no_counterparts(count))
 
 
-def no_counterparts(count: int) -> Counterparts:
+def no_counterparts(count: int) -> Matches:
     """What a search of so many points begins with."""
     return np.full((count, 3), -1, np.int32), np.full((count, 3, 4), -1.0)
 

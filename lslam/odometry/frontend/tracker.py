@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
 from lslam.core.types.scan_result import ScanResult, StageClock, Status
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.base import Deskewing, Odometry, Resumable, Windowed
+from lslam.odometry.base import Deskewing, Odometry, Registering, Resumable, Windowed
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
 from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.odometry.scan_outcome import fault, plausible
@@ -105,7 +105,8 @@ class Tracker(Stateful):
             located, prior = self._fused(odometry, scan, loaded.prepared, located, prior, expected, clock)
             result = odometry.update(scan, prior, located)
         else:
-            result = plausible(odometry.register(scan, loaded.prepared, prior), prior.pose, self._last)
+            registering = cast(Registering, odometry)
+            result = plausible(registering.register(scan, loaded.prepared, prior), prior.pose, self._last)
         self._correct(result, prior, clock)
         if self.stationary is not None and scan is not None:
             with clock.stage("standing"):

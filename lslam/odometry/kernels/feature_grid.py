@@ -22,7 +22,7 @@ Ints = NDArray[np.int32]
 Rings = NDArray[np.uint16]
 # Indices of the counterparts of each point (S, 3); for each where the point was, world, m, and the squared distance, m2, within
 # which it stays the same (S, 3, 4).
-Counterparts = tuple[Ints, Floats]
+Matches = tuple[Ints, Floats]
 
 # Two rings up or down, as in LOAM. (Rings are unsigned, also after int() in a kernel: their difference would wrap.)
 NEARBY_RINGS = 2
@@ -160,7 +160,7 @@ def counterparts(
     count: int,
     reach: tuple[float, float],
     grid: tuple[Floats, Rings, Ints, Longs, Ints],
-    search: Counterparts,
+    search: Matches,
 ) -> None:
     """Fill in the indices of the `count` counterparts of point i at x, y, z, world, -1 from the first on that there is none of.
 

@@ -18,7 +18,7 @@ from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linearisation import Pose, Sums, Width
 from lslam.core.kernels.residuals import add_facts, add_row, add_surface, place
 from lslam.core.kernels.voxel import index_of, pack
-from lslam.odometry.kernels.feature_grid import Counterparts, counterparts
+from lslam.odometry.kernels.feature_grid import Matches, counterparts
 from lslam.odometry.kernels.lines import add_line
 
 Floats = NDArray[np.float64]
@@ -95,7 +95,7 @@ def _add_plane(
 
 @kernel
 def linearise_edges(
-    points: tuple[Floats], grid: Grid, settings: Reach, search: Counterparts, pose: Pose, width: Width, sums: Sums
+    points: tuple[Floats], grid: Grid, settings: Reach, search: Matches, pose: Pose, width: Width, sums: Sums
 ) -> None:
     """Add all edges (S, 3), LiDAR frame, to H, S, g and facts, see `linearisation`. Both H and S take all of them."""
     (source,) = points
@@ -156,13 +156,7 @@ def add_normals(
 
 @kernel
 def linearise_planes(
-    points: tuple[Floats],
-    grid: SurfaceGrid,
-    settings: Reach,
-    search: Counterparts,
-    pose: Pose,
-    width: Width,
-    sums: Sums,
+    points: tuple[Floats], grid: SurfaceGrid, settings: Reach, search: Matches, pose: Pose, width: Width, sums: Sums
 ) -> None:
     """As `linearise_edges`, for planar points (S, 3). S takes the planes alone whose normal is known well.
 

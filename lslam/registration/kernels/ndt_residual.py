@@ -12,8 +12,9 @@ from lslam.core.kernels.gaussians import BLOB, FREE
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import invert_symmetric, plane_of
 from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
-from lslam.core.kernels.residuals import Voxels, add_information, add_surface, octant_slots, place
+from lslam.core.kernels.residuals import Voxels, octant_slots, place
 from lslam.registration.kernels.discs import disc
+from lslam.registration.kernels.point_sums import add_gradient, add_matrix, keep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -109,22 +110,23 @@ def linearise_ndt(
     widening = (scale / scale_end) ** 2
     H, S, g, facts = sums
     inverse = 1.0 / size
-    unused = np.zeros(6)
     c2 = scale * scale
     d1, d2 = mixture(size)
     for i in range(len(source)):
         if is_done[i]:
             continue
         rx, ry, rz, x, y, z = place(source, i, R, t)
-        octant_slots(x, y, z, i, inverse, cells, slots, keys, table)
+        if octant_slots(x, y, z, i, inverse, cells, slots, keys, table):
+            keep(i, slots, shapes, 9, 0.0)
         best, best_score = 1e300, 0.0
+        hxx, hxy, hxz, hyy, hyz, hzz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        sxx, sxy, sxz, syy, syz, szz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        gx, gy, gz = 0.0, 0.0, 0.0
         for k in range(8):
             s = slots[i, k]
             if s < 0:
-                continue
+                break
             q = shapes[s]
-            if q[9] <= 0.0:
-                continue
             ex, ey, ez = x - q[0], y - q[1], z - q[2]
             m2 = (
                 q[3] * ex * ex
@@ -139,12 +141,21 @@ def linearise_ndt(
             if away > gate2:
                 continue
             w = d1 * d2 * weight
-            add_information(H, g, w, q[3], q[4], q[5], q[6], q[7], q[8], ex, ey, ez, rx, ry, rz)
-            trace = w * (q[3] + q[6] + q[8])
-            add_surface(S, unused, w / q[9], q[11], q[12], q[13], rx, ry, rz)
-            facts[INFORMATION] += trace
-            facts[LEVER] += trace * (rx * rx + ry * ry + rz * rz)
+            mxx, mxy, mxz, myy, myz, mzz = w * q[3], w * q[4], w * q[5], w * q[6], w * q[7], w * q[8]
+            hxx, hxy, hxz, hyy, hyz, hzz = hxx + mxx, hxy + mxy, hxz + mxz, hyy + myy, hyz + myz, hzz + mzz
+            gx += mxx * ex + mxy * ey + mxz * ez
+            gy += mxy * ex + myy * ey + myz * ez
+            gz += mxz * ex + myz * ey + mzz * ez
+            thin = w / q[9]
+            nx, ny, nz = q[11], q[12], q[13]
+            sxx, sxy, sxz = sxx + thin * nx * nx, sxy + thin * nx * ny, sxz + thin * nx * nz
+            syy, syz, szz = syy + thin * ny * ny, syz + thin * ny * nz, szz + thin * nz * nz
         if best < 1e300:
+            add_matrix(H, hxx, hxy, hxz, hyy, hyz, hzz, rx, ry, rz)
+            add_matrix(S, sxx, sxy, sxz, syy, syz, szz, rx, ry, rz)
+            add_gradient(g, gx, gy, gz, rx, ry, rz)
+            facts[INFORMATION] += hxx + hyy + hzz
+            facts[LEVER] += (hxx + hyy + hzz) * (rx * rx + ry * ry + rz * rz)
             is_done[i] = True
             away2[i] = best
             facts[MATCHED] += 1.0

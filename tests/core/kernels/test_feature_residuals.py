@@ -33,7 +33,7 @@ class Scene:
     source: Floats
     R: Floats
     t: Floats
-    kept: feature_grid.Counterparts | None = None
+    kept: feature_grid.Matches | None = None
 
     def matches(self, kind: str) -> list[Match]:
         x = self.source @ self.R.T + self.t
@@ -44,7 +44,7 @@ class Scene:
             found = [match(s, y, self.world, self.rings, REACH, VARIANCE) for s, y in zip(self.source, x, strict=True)]
         return [m for m in found if m is not None]
 
-    def search(self) -> feature_grid.Counterparts:
+    def search(self) -> feature_grid.Matches:
         """A search that remembers nothing, or the one that is kept."""
         return no_counterparts(len(self.source)) if self.kept is None else self.kept
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -90,15 +90,16 @@ def linearise(
     blob: float = BLOB,
     gap: float = 0.0,
     takes_all: bool = False,
+    matches: Correspondences | None = None,
 ) -> Sums:
-    n, kind, matches = len(s.source), TABLE[residual], Correspondences(len(s.source))
+    n, kind, matches = len(s.source), TABLE[residual], matches or Correspondences(len(s.source))
     H, S, g, facts = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     seen = PreparedPoints(
         s.source.astype(np.float32), s.source, np.zeros((n, 6)), n, covariance=s.covariance, gaps=np.full(n, gap)
     )
     kind.linearise(
         kind.points(seen, np.sqrt(SIGMA2)), kind.voxels(s.target), (s.target.size, SIGMA2, 1.0, blob, kind.along, takes_all),
-        matches.search(), (s.R, s.t), (c, 0.15, gate2), (H, S, g, facts),
+        matches.search(s.target), (s.R, s.t), (c, 0.15, gate2), (H, S, g, facts),
     )  # fmt: skip
     return Sums(np.triu(H) + np.triu(H, 1).T, g, facts, matches.away2, np.triu(S) + np.triu(S, 1).T)
 
@@ -213,6 +214,18 @@ def test_a_pose_far_off_matches_nothing(scene: Scene, residual: str, where: floa
     found = linearise(lost, residual, 1.0)
     for sums in (found.H, found.g, found.facts):
         np.testing.assert_array_equal(sums, 0.0)
+
+
+@pytest.mark.parametrize("residual", RESIDUALS)
+def test_a_search_goes_on_as_a_new_one_would(scene: Scene, residual: str) -> None:
+    """Steps within octant cells and out of them: what was looked up before changes nothing."""
+    matches, rng = Correspondences(len(scene.source)), np.random.default_rng(8)
+    for step in (0.0, 1e-3, 0.05, 0.5, 1e-3):
+        scene = replace(scene, t=scene.t + rng.normal(0, step, 3))
+        matches.clear()
+        went_on, new = (linearise(scene, residual, 0.4, matches=m) for m in (matches, None))
+        for name in ("H", "g", "facts", "away2", "S"):
+            np.testing.assert_array_equal(getattr(went_on, name), getattr(new, name))
 
 
 def test_ndt_ignores_voxels_whose_points_lie_on_a_line(scene: Scene) -> None:
