@@ -9,7 +9,7 @@ import numpy as np
 from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, EMPTY, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
-from lslam.core.kernels.linalg import eigen
+from lslam.core.kernels.linalg import add_gradient, add_matrix, eigen
 from lslam.core.kernels.linearisation import Floats, Ints, Longs, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
 from lslam.core.kernels.voxel import hash_key, index_of, pack
@@ -282,39 +282,9 @@ def add_information(
 ) -> None:
     """Upper triangle of H += w J^T M J and g += w J^T M e, with J = [I, -hat(r)] and M the symmetric matrix xx..zz."""
     xx, xy, xz, yy, yz, zz = w * xx, w * xy, w * xz, w * yy, w * yz, w * zz
-    H[0, 0] += xx
-    H[0, 1] += xy
-    H[0, 2] += xz
-    H[1, 1] += yy
-    H[1, 2] += yz
-    H[2, 2] += zz
-    # B = -M hat(r), the block between translation and rotation.
-    b00, b01, b02 = xz * ry - xy * rz, xx * rz - xz * rx, xy * rx - xx * ry
-    b10, b11, b12 = yz * ry - yy * rz, xy * rz - yz * rx, yy * rx - xy * ry
-    b20, b21, b22 = zz * ry - yz * rz, xz * rz - zz * rx, yz * rx - xz * ry
-    H[0, 3] += b00
-    H[0, 4] += b01
-    H[0, 5] += b02
-    H[1, 3] += b10
-    H[1, 4] += b11
-    H[1, 5] += b12
-    H[2, 3] += b20
-    H[2, 4] += b21
-    H[2, 5] += b22
-    # hat(r) B
-    H[3, 3] += ry * b20 - rz * b10
-    H[3, 4] += ry * b21 - rz * b11
-    H[3, 5] += ry * b22 - rz * b12
-    H[4, 4] += rz * b01 - rx * b21
-    H[4, 5] += rz * b02 - rx * b22
-    H[5, 5] += rx * b12 - ry * b02
+    add_matrix(H, xx, xy, xz, yy, yz, zz, rx, ry, rz)
     px, py, pz = xx * ex + xy * ey + xz * ez, xy * ex + yy * ey + yz * ez, xz * ex + yz * ey + zz * ez
-    g[0] += px
-    g[1] += py
-    g[2] += pz
-    g[3] += ry * pz - rz * py
-    g[4] += rz * px - rx * pz
-    g[5] += rx * py - ry * px
+    add_gradient(g, px, py, pz, rx, ry, rz)
 
 
 # The Gaussian of a plane voxel also has information within the plane, about the positions of the voxel's points. It is small,

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, EMPTY
 from lslam.core.kernels.jit import kernel
-from lslam.core.kernels.linalg import rotate_symmetric
+from lslam.core.kernels.linalg import add_gradient, add_matrix, rotate_symmetric
 from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import nearest, octant_slots, place, thin_information
 from lslam.registration.kernels.discs import EXTENT_M2
 from lslam.registration.kernels.gicp_residual import certainty_of_pair
-from lslam.registration.kernels.point_sums import add_gradient, add_matrix, keep
+from lslam.registration.kernels.point_sums import keep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
