@@ -106,7 +106,7 @@ def _normals(points: Floats) -> Floats:
     Voxels of half the reach tell them, and before these voxels twice as large, for two rings of a sparse sensor.
     """
     capacity = 1 << max(8, int(np.ceil(np.log2(len(points) + 1))))
-    fine, normals = GaussianMap(MATCH_REACH_M / 2, capacity=capacity), np.zeros_like(points)
+    fine, normals = GaussianMap(MATCH_REACH_M / 2, capacity=capacity, reach=np.inf), np.zeros_like(points)
     fine.insert(points.astype(np.float32), np.eye(4))
     for around in (fine.coarsen(2), fine):
         add_normals(

@@ -282,3 +282,10 @@ def test_no_features_at_all_keep_the_prior_and_its_covariance(step: ScanStep | N
     before = registration.target.scan
     registration.update(result)
     assert registration.target.scan is before
+
+
+def test_surfaces_are_known_however_far_from_the_start() -> None:
+    far = se3.make(np.eye(3), np.array([600.0, -400.0, 0.0]))
+    near, away = (feature_scan(features_at(np.eye(4)), pose) for pose in (np.eye(4), far))
+    known, known_away = (np.any(target.normals, axis=1).mean() for target in (near, away))
+    assert known_away == pytest.approx(known, abs=0.05)
