@@ -17,7 +17,7 @@ from lslam.reports.compare_html import style_of
 from lslam.reports.page_data import MapFigure, cloud_data, map_figure, packed
 from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
-from lslam.reports.shell import RUN, render
+from lslam.reports.shell import MAP, render
 from lslam.reports.svg import Track, plane_chart
 
 MOST_POSES = 5000  # of a session that the script draws
@@ -56,7 +56,7 @@ def write_page(
     found = "Each session moved as a whole to where it was found."
     page = render(
         "merge.html.j2",
-        RUN,
+        MAP,
         names=[s.name for s in sessions],
         problems=problems,
         figures=[*after, _figure("Before the pose graph, from above", found, sessions, [s.before for s in sessions])],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import re
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -14,9 +15,10 @@ from lslam.core.version import __version__
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
 
-# In the order in which they run; the map's are of a run's page only.
-CHARTS = ("page.js", "charts.js")
-RUN = ("page.js", "map.js", "overlay.js", "charts.js")
+# Modules of `scripts` that a page starts with.
+CHARTS, MAP = "chart_page.mjs", "map_page.mjs"
+_IMPORT = re.compile(r'^import (?:[^"]* from )?"\./([^"]+)";\n', re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(?:async function|class|const|function|let)\b)", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -27,8 +29,8 @@ class Script:
     digest: str
 
 
-def render(name: str, script: tuple[str, ...] = CHARTS, **shown: Any) -> str:
-    """Page of this package: the template `name`, which extends the shell, with the files of `script` inserted."""
+def render(name: str, script: str = CHARTS, **shown: Any) -> str:
+    """Page of this package: the template `name`, which extends the shell, with the module `script` inserted."""
     return template(name).render(version=__version__, script=_script(script), **shown)
 
 
@@ -38,10 +40,29 @@ def template(name: str) -> Template:
 
 
 @cache
-def _script(names: tuple[str, ...]) -> Script:
-    text = "\n" + "".join((files("lslam.reports") / name).read_text(encoding="utf-8") for name in names)
+def _script(entry: str) -> Script:
+    text = '\n"use strict";\n' + "\n".join(bundled(entry).values())
     digest = base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
     return Script(text, f"sha256-{digest}")
+
+
+def bundled(entry: str) -> dict[str, str]:
+    """Text of each module that `entry` imports, by name, each after those it imports, without `import` and `export`.
+
+    A page is one file, so its modules become one script and share their names.
+    """
+    found: dict[str, str] = {}
+
+    def add(name: str) -> None:
+        if name in found:
+            return
+        text = (files("lslam.reports") / "scripts" / name).read_text(encoding="utf-8")
+        for imported in _IMPORT.findall(text):
+            add(imported)
+        found[name] = _EXPORT.sub("", _IMPORT.sub("", text))
+
+    add(entry)
+    return found
 
 
 @cache

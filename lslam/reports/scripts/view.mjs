@@ -1,96 +1,17 @@
-"use strict";
 // The map as points that turn, with the trajectory over them. Without WebGL the drawing of the page stays.
+import { colourings } from "./colours.mjs";
+import { KEYS, make, read } from "./elements.mjs";
+import { gestures } from "./gestures.mjs";
+import { clamp, nearestBy } from "./numbers.mjs";
+import { drawOver } from "./overlay.mjs";
+import { pointDrawer } from "./points.mjs";
+import { mark, scans, watchers } from "./scans.mjs";
+import { sessionAt, sessions } from "./sessions.mjs";
 
-const VERTEX = `attribute vec3 q; attribute float shade; uniform vec3 low; uniform vec3 quantum; uniform mat4 M;
-uniform float size; varying float v;
-void main() { v = shade; gl_Position = M * vec4(low + quantum * q, 1.0); gl_PointSize = clamp(size / gl_Position.w, 1.0, 24.0); }`;
-const FRAGMENT = `precision mediump float; uniform sampler2D colours; varying float v;
-void main() { gl_FragColor = texture2D(colours, vec2((v * 255.0 + 0.5) / 256.0, 0.5)); }`;
 const LENS = 0.5; // tan of half the angle of view
 const STEEPEST = 1.45; // rad from straight down
 
-/** A program that draws the points of the cloud on `canvas`; null where that cannot be. */
-function pointDrawer(canvas, cloud) {
-  const gl = canvas.getContext("webgl", { antialias: false, alpha: true });
-  if (!gl) return null;
-  const program = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    gl.attachShader(program, shader);
-  }
-  gl.linkProgram(program);
-  if (!gl.getProgramParameter(program, gl.LINK_STATUS)) return null;
-  gl.useProgram(program);
-  const at = (name) => gl.getUniformLocation(program, name);
-  const uniforms = { low: at("low"), quantum: at("quantum"), M: at("M"), size: at("size") };
-  const buffers = {};
-  const fill = (name, array, size, kind, isShare) => {
-    buffers[name] = buffers[name] || gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
-    gl.bufferData(gl.ARRAY_BUFFER, array, gl.STATIC_DRAW);
-    const place = gl.getAttribLocation(program, name);
-    gl.enableVertexAttribArray(place);
-    gl.vertexAttribPointer(place, size, kind, isShare, 0, 0);
-  };
-  fill("q", unpack(cloud.points, Int16Array), 3, gl.SHORT, false);
-  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
-  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, ramp(cloud.colours));
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-  gl.enable(gl.DEPTH_TEST);
-  return {
-    shade: (values) => fill("shade", values, 1, gl.UNSIGNED_BYTE, true),
-    draw: (M, centre, size) => {
-      gl.viewport(0, 0, canvas.width, canvas.height);
-      gl.clearColor(0, 0, 0, 0);
-      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-      gl.uniform3fv(uniforms.low, cloud.low.map((value, k) => value + 32768 * cloud.step[k] - centre[k]));
-      gl.uniform3fv(uniforms.quantum, cloud.step);
-      gl.uniformMatrix4fv(uniforms.M, false, M);
-      gl.uniform1f(uniforms.size, size);
-      gl.drawArrays(gl.POINTS, 0, cloud.count);
-    },
-  };
-}
-
-/** 256 colours, RGBA, mixed from the ones given as hexadecimal. */
-function ramp(colours) {
-  const rgb = colours.map((text) => [0, 2, 4].map((i) => parseInt(text.slice(i, i + 2), 16)));
-  return Uint8Array.from({ length: 1024 }, (_, i) => {
-    if (i % 4 === 3) return 255;
-    const at = ((i >> 2) / 255) * (rgb.length - 1);
-    const k = Math.min(Math.floor(at), rgb.length - 2);
-    return Math.round(rgb[k][i % 4] + (at - k) * (rgb[k + 1][i % 4] - rgb[k][i % 4]));
-  });
-}
-
-/** Ways to colour the points: name -> what they say, and a share of 0 to 255 for each. */
-function colourings(cloud) {
-  const q = unpack(cloud.points, Int16Array);
-  const [low, high] = cloud.height;
-  const height = () => Uint8Array.from({ length: cloud.count }, (_, i) =>
-    clamp((255 * (cloud.low[2] + cloud.step[2] * (q[3 * i + 2] + 32768) - low)) / (high - low), 0, 255));
-  const known = { height: { said: "height z", range: [`${fixed(low, 1)} m`, `${fixed(high, 1)} m`], shades: height } };
-  if (cloud.intensity) {
-    known.intensity = { said: "intensity", range: cloud.values.map((value) => value.toPrecision(3)), shades: () => unpack(cloud.intensity, Uint8Array) };
-  }
-  if (!scans || !cloud.nearest) return known;
-  const nearest = unpack(cloud.nearest, scans.count <= 65535 ? Uint16Array : Uint32Array);
-  const byScan = (values, top) => () => Uint8Array.from(nearest, (k) => clamp((255 * values[k]) / top, 0, 255));
-  const end = scans.by.time[scans.count - 1];
-  if (end > 0) known.time = { said: "time of the nearest scan", range: ["0 s", `${fixed(end, 1)} s`], shades: byScan(scans.by.time, end) };
-  if (scans.error && scans.error.some(Number.isFinite)) {
-    const sorted = scans.error.filter(Number.isFinite).sort();
-    const top = Math.max(sorted[Math.floor(0.98 * (sorted.length - 1))], 1e-6);
-    known.error = { said: `position error of the nearest scan (${scans.alignment})`, range: ["0 m", `${fixed(top, 3)} m`], shades: byScan(scans.error, top) };
-  }
-  return known;
-}
-
-class MapView {
+export class MapView {
   constructor(figure, cloud) {
     this.figure = figure;
     this.cloud = cloud;
@@ -267,3 +188,6 @@ class MapView {
     if (k >= 0 && away[k] < 30) mark(k);
   }
 }
+
+const cloudOfMap = read("cloud");
+export const mapView = cloudOfMap && new MapView(document.getElementById("map"), cloudOfMap);

@@ -1,8 +1,10 @@
-"use strict";
 // What is drawn over the points of the map: ground truth, trajectory, loops, failed scans, the marked scan, scale and axes;
 // of merged runs the trajectory of each, and the loops between them.
+import { clamp } from "./numbers.mjs";
+import { marked, scans } from "./scans.mjs";
+import { sessions } from "./sessions.mjs";
 
-function drawOver(pen, view, axes) {
+export function drawOver(pen, view, axes) {
   const style = getComputedStyle(view.figure);
   const colour = (name) => style.getPropertyValue(`--${name}`).trim();
   pen.lineJoin = "round";
@@ -14,7 +16,7 @@ function drawOver(pen, view, axes) {
 }
 
 /** A line through px in pairs, with a rim that sets it off from the points. */
-function stroke(pen, seen, colour, rim, width, dashes = []) {
+export function stroke(pen, seen, colour, rim, width, dashes = []) {
   pen.beginPath();
   let isOn = false;
   let [lastX, lastY] = [NaN, NaN];
@@ -98,16 +100,6 @@ function drawSessions(pen, view, colour) {
   label(pen, text, clamp(x, pen.measureText(text).width / 2 + 4, view.width - pen.measureText(text).width / 2 - 4), y - 12, colour);
 }
 
-/** The scan of a merged run that is seen nearest to px; null further away than 30. */
-function sessionAt(x, y) {
-  let [found, least] = [null, 30];
-  for (const session of sessions.sessions) {
-    const k = nearestBy(Float32Array.from({ length: session.index.length }, (_, i) => Math.hypot(session.way[2 * i] - x, session.way[2 * i + 1] - y)), 0);
-    const away = k < 0 ? Infinity : Math.hypot(session.way[2 * k] - x, session.way[2 * k + 1] - y);
-    if (away < least) [found, least] = [{ session, k }, away];
-  }
-  return found;
-}
 
 /** A bar of a round length, which from above is true everywhere, in 3D at the centre. */
 function drawScale(pen, view, colour) {
@@ -120,7 +112,7 @@ function drawScale(pen, view, colour) {
   label(pen, text, x + width / 2, y - 7, colour);
 }
 
-function label(pen, text, x, y, colour) {
+export function label(pen, text, x, y, colour) {
   pen.textAlign = "center";
   [pen.strokeStyle, pen.lineWidth, pen.fillStyle] = [colour("paper"), 3, colour("ink")];
   pen.strokeText(text, x, y);
@@ -136,14 +128,3 @@ function drawAxes(pen, view, { right, up }, colour) {
     label(pen, name, x + 33 * dx, y + 33 * dy + 4, colour);
   });
 }
-
-/** Merged runs with their positions; null on the page of one. */
-const sessions = (() => {
-  const data = read("sessions");
-  if (!data) return null;
-  data.ties = unpack(data.ties, Float32Array);
-  for (const session of data.sessions) [session.positions, session.index] = [unpack(session.positions, Float32Array), unpack(session.index, Int32Array)];
-  return data;
-})();
-const cloudOfMap = read("cloud");
-const mapView = cloudOfMap && new MapView(document.getElementById("map"), cloudOfMap);

@@ -1,0 +1,23 @@
+// Merged runs with their positions; null on the page of one.
+import { read } from "./elements.mjs";
+import { nearestBy, unpack } from "./numbers.mjs";
+
+/** Merged runs with their positions; null on the page of one. */
+export const sessions = (() => {
+  const data = read("sessions");
+  if (!data) return null;
+  data.ties = unpack(data.ties, Float32Array);
+  for (const session of data.sessions) [session.positions, session.index] = [unpack(session.positions, Float32Array), unpack(session.index, Int32Array)];
+  return data;
+})();
+
+/** The scan of a merged run that is seen nearest to px; null further away than 30. */
+export function sessionAt(x, y) {
+  let [found, least] = [null, 30];
+  for (const session of sessions.sessions) {
+    const k = nearestBy(Float32Array.from({ length: session.index.length }, (_, i) => Math.hypot(session.way[2 * i] - x, session.way[2 * i + 1] - y)), 0);
+    const away = k < 0 ? Infinity : Math.hypot(session.way[2 * k] - x, session.way[2 * k + 1] - y);
+    if (away < least) [found, least] = [{ session, k }, away];
+  }
+  return found;
+}
