@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,16 +107,17 @@ def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 160
     Parameters
     ----------
     cloud : points in the world frame, m, or an array (M, 3) of them; those that are not finite are ignored
-    pixel : smallest edge of a pixel, m, not under the map's voxel (empty lines would appear); larger when the long side
-        would exceed `longest` pixels
+    pixel : smallest edge of a pixel, m, a multiple of the map's voxel; a multiple of it when the long side would exceed
+        `longest` pixels. Pixels hold whole columns of voxels: where some hold one and some two, the map is striped.
     trim : share of points that may fall off each side, so that a few far points do not shrink the rest
     """
     cloud = ArrayCloud.of(cloud) if isinstance(cloud, np.ndarray) else cloud
     low, high = _bounds(cloud, trim)
     if not np.all(np.isfinite([*low, *high])):
         return TopView(np.zeros((1, 1), np.float32), np.full((1, 1), np.nan, np.float32), (0.0, 1.0, 0.0, 1.0))
-    # One pixel to spare, because the upper edge belongs to the last pixel.
-    size = max(pixel, float(np.max(high - low)) / max(longest - 1, 1))
+    # Two pixels to spare: the lower edge goes down to a whole pixel, the upper edge belongs to the last one.
+    size = pixel * max(1, math.ceil(float(np.max(high - low)) / max(longest - 2, 1) / pixel))
+    low = np.floor(low / size) * size
     width, height = (int(n) + 1 for n in (high - low) / size)
     counts, sums = np.zeros(width * height, np.int64), np.zeros(width * height)
     for block in cloud.blocks():

@@ -17,11 +17,20 @@ from lslam.core.geometry.continuous_motion import ContinuousMotion
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Camera, cameras_of
-from lslam.core.types.cloud import Cloud
+from lslam.core.types.cloud import Cloud, thinned
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.maps.colour import ColourCounts, ColouredCloud, MapColourer
-from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap, MapCheckpoints, build_map, scan_poser, scans_again
+from lslam.pipeline.map_pass import (
+    INTERRUPTED,
+    SAMPLE,
+    SHOWN,
+    BuiltMap,
+    MapCheckpoints,
+    build_map,
+    scan_poser,
+    scans_again,
+)
 
 log = logging.getLogger("lslam")
 _NAMED = 3  # images that cannot be read, one by one
@@ -55,7 +64,8 @@ def build_finished_map(
         problems.append(f"{error}; it is written without")
         log.warning("%s", problems[-1])
         return built
-    return replace(built, merged=coloured, colour=counts, done=(*built.done, f"coloured: {counts}"))
+    sample = thinned(coloured, SAMPLE, SHOWN)
+    return replace(built, merged=coloured, sample=sample, colour=counts, done=(*built.done, f"coloured: {counts}"))
 
 
 def colour_map(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -43,7 +44,8 @@ from lslam.registration.preprocessing.ground import Z, world_up_of
 
 log = logging.getLogger("lslam")
 
-SAMPLE = 150_000  # points that a page shows in 3D: 12 bytes each in it
+SAMPLE = 150_000  # points that a page shows in 3D: 12 bytes each in it, and 4 of their colour
+SHOWN = ("red", "green", "blue", "class")
 INTERRUPTED = "interrupted while the map was built: nothing of it is written"
 
 
@@ -196,9 +198,10 @@ class MapMaker:
         if self._section.denoise:
             before, merged = len(merged), denoise(in_memory(merged))
             done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
-        view = top_view(merged, pixel=max(0.2, self._section.voxel))
+        voxel = self._section.voxel
+        view = top_view(merged, pixel=voxel * math.ceil(0.2 / voxel - 1e-9) if voxel else 0.2)
         occupancy = None if self._occupancy is None else self._occupancy.result()
-        return BuiltMap(merged, view, thinned(merged, SAMPLE), done, occupancy)
+        return BuiltMap(merged, view, thinned(merged, SAMPLE, SHOWN), done, occupancy)
 
     def state(self) -> State:
         """State for `restore`; voxels and cells are written to `keep`."""

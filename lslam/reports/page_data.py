@@ -28,6 +28,7 @@ STATUSES = ("registered", "standing", "bridged", "skipped", "not known")
 FLAGS = {"degenerate": 8, "lost": 16}  # beside the status in one byte
 MOST_TRUTH = 5000  # points of ground truth under the map
 LONGEST_REASON = 160  # characters
+MOST_KINDS = 8  # labels that have a colour of their own
 QUANTA = 65535  # of a coordinate over the extent of the cloud
 SIZE_M = 20.0
 MOST_CROPS = 3
@@ -94,12 +95,15 @@ def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -
     """Some points of the map for the script; None if the map is empty.
 
     points : (M, 3) int16 q, where a coordinate is `low` + `step` (q + 32768), m; nearest : (M,) the nearest pose
-    height, values : range of colours; intensity : (M,) 0 to 255 over their usual range, when the map has them
+    height : usual range of heights, m; intensity : (M,) 0 to 255 over the range `values`, when the map has them
+    rgb : (M, 3) colours; kind : (M,) index into `kinds`, the labels, most frequent first, when the map has them
+
+    Any first part of the points is spread over the whole map, so that a page can draw fewer while the map moves.
     """
     if cloud is None:
         return None
-    finite = np.isfinite(cloud.points).all(1)
-    points = cloud.points[finite]
+    order = np.random.default_rng(0).permutation(np.flatnonzero(np.isfinite(cloud.points).all(1)))
+    points = cloud.points[order]
     if not len(points):
         return None
     low = points.min(0)
@@ -113,14 +117,29 @@ def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -
         "height": usual_range(points[:, 2]),
         "colours": VIRIDIS,
     }
-    if cloud.intensity is not None and np.ptp(cloud.intensity[finite]) > 0:
-        values = cloud.intensity[finite].astype(np.float64)
-        least, most = usual_range(values)
+    if cloud.intensity is not None and np.ptp(cloud.intensity[order]) > 0:
+        values = cloud.intensity[order].astype(np.float64)
+        least, most = usual_range(values, 0.1)
         data["intensity"] = packed(np.rint(255 * np.clip((values - least) / (most - least), 0, 1)), "u1")
         data["values"] = [least, most]
+    if "red" in cloud.columns:
+        data["rgb"] = packed(np.column_stack([cloud.columns[name][order] for name in ("red", "green", "blue")]), "u1")
+    if "class" in cloud.columns:
+        data |= _kinds(cloud.columns["class"][order])
     if trajectory is not None and len(trajectory):
         data["nearest"] = packed(_nearest(points, trajectory.positions), "<u2" if len(trajectory) <= QUANTA else "<u4")
     return data
+
+
+def _kinds(labels: NDArray[Any]) -> dict[str, Any]:
+    """Labels as indices into their names; those beyond `MOST_KINDS` share the last one."""
+    known, which, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    rank = np.empty(len(known), np.int64)
+    rank[np.argsort(-counts, kind="stable")] = np.arange(len(known))
+    names = [str(label) for label in known[np.argsort(rank)]]
+    if len(names) > MOST_KINDS:
+        names = [*names[: MOST_KINDS - 1], "others"]
+    return {"kind": packed(np.minimum(rank, MOST_KINDS - 1)[which], "u1"), "kinds": names}
 
 
 def _nearest(points: Floats, positions: Floats) -> NDArray[np.intp]:

@@ -36,12 +36,12 @@ def palette() -> NDArray[np.uint8]:
     return np.array([[int(colour[i : i + 2], 16) for i in (0, 2, 4)] for colour in VIRIDIS], np.uint8)
 
 
-def usual_range(values: NDArray[np.floating]) -> tuple[float, float]:
-    """2nd and 98th percentile of the finite values (0, 1 without any), so that outliers do not compress the colours."""
+def usual_range(values: NDArray[np.floating], left_out: float = 2.0) -> tuple[float, float]:
+    """Range of the finite values (0, 1 without any) without `left_out` % at each end: outliers do not compress the colours."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return 0.0, 1.0
-    low, high = (float(v) for v in np.percentile(finite, [2, 98]))
+    low, high = (float(v) for v in np.percentile(finite, [left_out, 100 - left_out]))
     return low, max(high, low + 1e-3)
 
 

@@ -109,3 +109,13 @@ def test_a_map_of_any_size_is_seen_in_the_memory_of_a_few_blocks() -> None:
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
         assert peak < 10 * block, "24 blocks are not held"
+
+
+def test_pixels_hold_whole_columns_of_voxels_however_wide_the_map() -> None:
+    """A floor of one point a voxel has one density: pixels of one column and of two would draw stripes."""
+    x, y = np.meshgrid(np.arange(2300), np.arange(40), indexing="ij")
+    points = 0.2 * np.column_stack([x.ravel() + 0.5, y.ravel() + 0.5, np.zeros(x.size)]) - [31.4, 7.0, 0]
+    view = top_view(points, pixel=0.2, longest=1600, trim=0.0)
+    assert max(view.image.shape) <= 1600
+    inner = view.image[2:-2, 2:-2]
+    assert inner.min() == inner.max() == 4

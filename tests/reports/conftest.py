@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browsing import browser
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Trajectory
+
+__all__ = ["browser"]
 
 MakeRecord = Callable[..., RunRecord]
 

@@ -93,16 +93,36 @@ def test_the_cloud_comes_back_within_half_a_step(make_record: MakeRecord) -> Non
     assert data is not None
     quanta = unpack(data["points"], "<i2").reshape(-1, 3)
     back = np.array(data["low"]) + np.array(data["step"]) * (quanta + 32768.0)
-    assert (np.abs(back - points) <= 0.501 * np.array(data["step"])).all()
-    assert np.abs(back - points).max() < 0.011
-    distances = np.linalg.norm(points[:, None] - trajectory.positions, axis=2)
+    order = np.linalg.norm(back[:, None] - points, axis=2).argmin(axis=1)
+    assert sorted(order) == list(range(400))
+    assert np.abs(np.corrcoef(order, np.arange(400))[0, 1]) < 0.1  # any first part is spread over all
+    given = points[order]
+    assert (np.abs(back - given) <= 0.501 * np.array(data["step"])).all()
+    assert np.abs(back - given).max() < 0.011
+    distances = np.linalg.norm(given[:, None] - trajectory.positions, axis=2)
     assert np.array_equal(unpack(data["nearest"], "<u2"), distances.argmin(axis=1))
-    shades = unpack(data["intensity"], "u1")
+    shades = unpack(data["intensity"], "u1")[np.argsort(order)]
     assert (np.diff(shades.astype(int)) >= 0).all()
     assert (shades[0], shades[-1]) == (0, 255)
     low, high = data["height"]
     assert np.mean(points[:, 2] < low) == pytest.approx(0.02, abs=0.01)
     assert np.mean(points[:, 2] > high) == pytest.approx(0.02, abs=0.01)
+
+
+def test_colours_and_labels_stay_with_their_points() -> None:
+    rng = np.random.default_rng(8)
+    points, rgb = rng.uniform(0, 50, (300, 3)), rng.integers(0, 256, (300, 3)).astype(np.uint8)
+    labels = np.repeat(np.array([40, 10, 71, 1, 2, 3, 4, 5, 6, 7], np.uint16), [100, 80, 50, 20, 15, 10, 9, 8, 5, 3])
+    columns = {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2], "class": labels}
+    data = cloud_data(ArrayCloud(points, None, columns))
+    assert data is not None
+    back = np.array(data["low"]) + np.array(data["step"]) * (unpack(data["points"], "<i2").reshape(-1, 3) + 32768.0)
+    order = np.linalg.norm(back[:, None] - points, axis=2).argmin(axis=1)
+    assert np.array_equal(unpack(data["rgb"], "u1").reshape(-1, 3), rgb[order])
+    assert data["kinds"] == ["40", "10", "71", "1", "2", "3", "4", "others"]
+    named = np.array(data["kinds"])[unpack(data["kind"], "u1")]
+    expected = [str(label) if label not in (5, 6, 7) else "others" for label in labels[order]]
+    assert named.tolist() == expected
 
 
 def test_points_that_are_alike_have_no_intensity(make_record: MakeRecord) -> None:

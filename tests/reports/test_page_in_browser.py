@@ -5,16 +5,15 @@ Skipped without selenium, chromium and chromedriver (`pip install 'lslam[browser
 
 from __future__ import annotations
 
-import io
 import re
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from browsing import click, find, hover, load, picture, settle
 from comparisons import comparison, drawing
 from merged_sessions import sessions, write
 from reported_study import study_rows
@@ -31,34 +30,12 @@ from lslam.reports.png import palette
 from lslam.reports.study_html import write_study_files
 
 pytest.importorskip("selenium")
-image_module = pytest.importorskip("PIL.Image")
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
-if not (BROWSER and DRIVER):
-    pytest.skip("no chromium with chromedriver", allow_module_level=True)
 
-from selenium import webdriver  # noqa: E402
-from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
 
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--hide-scrollbars", "--force-device-scale-factor=1",
-)  # fmt: skip
 SCANS = 60
 MOVED = 0.04  # share of pixels that are others; the ring about what has the focus is 0.01
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for flag in FLAGS:
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    yield driver
-    driver.quit()
 
 
 @pytest.fixture
@@ -76,42 +53,6 @@ def run(make_record: Callable[..., RunRecord], tmp_path: Path) -> tuple[Path, Ru
     evaluation = evaluate(record.trajectory, record.ground_truth)
     write_report(tmp_path / "report.html", record, evaluation)
     return tmp_path / "report.html", record, evaluation
-
-
-def load(browser: Any, page: Path, width: int = 1600, *, dark: bool = False, media: str = "") -> None:
-    size = {"width": width, "height": 1300, "deviceScaleFactor": 1, "mobile": False}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media, "features": [scheme]})
-    browser.get(page.as_uri())
-    settle(browser)
-
-
-def settle(browser: Any) -> None:
-    """Until two more frames are drawn."""
-    browser.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
-
-
-def find(browser: Any, selector: str) -> Any:
-    return browser.find_element("css selector", selector)
-
-
-def picture(browser: Any, selector: str = ".stage") -> np.ndarray[Any, Any]:
-    settle(browser)
-    return np.asarray(image_module.open(io.BytesIO(find(browser, selector).screenshot_as_png)).convert("RGB"), int)
-
-
-def click(browser: Any, selector: str) -> None:
-    browser.execute_script("arguments[0].click()", find(browser, selector))
-
-
-def hover(browser: Any, element: Any, x: float, y: float) -> None:
-    """Move the pointer to px within an element."""
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", element)
-    box = element.rect
-    at = (round(x - box["width"] / 2), round(y - box["height"] / 2))
-    ActionChains(browser, duration=0).move_to_element_with_offset(element, *at).perform()
-    settle(browser)
 
 
 def said(browser: Any) -> str:

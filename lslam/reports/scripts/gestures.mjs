@@ -3,13 +3,14 @@ import { mark, marked } from "./scans.mjs";
 
 /**
  * Wheel, drag, pinch and keys on an element. `on` has zoom(factor, x, y, event), pan(dx, dy, event), reset() and, where
- * something is marked, hover(x, y), px within the element, and step(by) where that is no scan. The wheel scrolls the page
- * until the element was clicked.
+ * something is marked, hover(x, y), px within the element, and step(by) where that is no scan; click(x, y) where a click, or
+ * Enter for the middle, means something. The wheel scrolls the page until the element was clicked.
  */
 export function gestures(element, on) {
   const step = on.step || ((by) => mark(marked + by));
   const pointers = new Map();
   let spread = 0;
+  let [dragged, isOne] = [0, true]; // px of this gesture, and whether it has one pointer
   const at = (event) => {
     const box = element.getBoundingClientRect();
     return [event.clientX - box.left, event.clientY - box.top];
@@ -31,7 +32,9 @@ export function gestures(element, on) {
     on.zoom(Math.exp(-0.0015 * turned), ...at(event), event);
   }, { passive: false });
   element.addEventListener("pointerdown", (event) => {
+    if (!pointers.size) [dragged, isOne] = [0, true];
     pointers.set(event.pointerId, at(event));
+    isOne &&= pointers.size === 1;
     spread = width();
     element.setPointerCapture(event.pointerId);
     element.focus({ preventScroll: true });
@@ -44,6 +47,7 @@ export function gestures(element, on) {
     }
     pointers.set(event.pointerId, at(event));
     const now = middle();
+    dragged += Math.hypot(now[0] - before[0], now[1] - before[1]);
     on.pan(now[0] - before[0], now[1] - before[1], event);
     if (pointers.size > 1 && spread) on.zoom(width() / spread, ...now, event);
     spread = width();
@@ -51,6 +55,7 @@ export function gestures(element, on) {
   element.addEventListener("pointerup", (event) => {
     release(event);
     if (on.hover) on.hover(...at(event));
+    if (on.click && isOne && dragged < 4) on.click(...at(event));
   });
   element.addEventListener("pointercancel", release);
   element.addEventListener("dblclick", () => on.reset());
@@ -63,6 +68,7 @@ export function gestures(element, on) {
       ArrowLeft: () => on.pan(40, 0, event), ArrowRight: () => on.pan(-40, 0, event),
       ArrowUp: () => on.pan(0, 40, event), ArrowDown: () => on.pan(0, -40, event),
       ",": () => step(-1), ".": () => step(1), Escape: () => element.blur(),
+      Enter: on.click && (() => on.click(x, y)),
     }[event.key];
     if (!done) return;
     event.preventDefault();

@@ -1,3 +1,3 @@
 // The script of a page with a map. A map in 3D takes the place of its drawing before the charts start.
-import "./view.mjs";
+import "./tools.mjs";
 import "./chart_page.mjs";

@@ -1,113 +1,131 @@
 // What is drawn over the points of the map: ground truth, trajectory, loops, failed scans, the marked scan, scale and axes;
-// of merged runs the trajectory of each, and the loops between them.
+// of merged runs the trajectory of each, and the loops between them. Lines hide behind points in 3D, signs do not.
 import { clamp } from "./numbers.mjs";
 import { marked, scans } from "./scans.mjs";
 import { sessions } from "./sessions.mjs";
 
-export function drawOver(pen, view, axes) {
-  const style = getComputedStyle(view.figure);
-  const colour = (name) => style.getPropertyValue(`--${name}`).trim();
+const HIDDEN = 0.25; // opacity of a line behind points
+
+/** Lines for the drawer, each with a rim below that sets it off from the points. */
+export function linesOf(view, colour) {
+  const found = [];
+  const hidden = view.camera.isFlat ? 1 : HIDDEN;
+  const add = (points, css, width, isPairs = false) => {
+    found.push({ points, tint: tintOf(colour("paper")), width: width + 2.5, hidden: view.camera.isFlat ? 1 : 0, isPairs });
+    found.push({ points, tint: tintOf(css), width, hidden, isPairs });
+  };
+  if (view.section) {
+    if (view.section.line) add(view.section.line, colour("c2"), 2);
+    return found;
+  }
+  if (scans) {
+    if (scans.truth) add(scans.truth, colour("truth"), 1.5);
+    add(scans.positions, colour("c2"), 2);
+    add(loopLines(), colour("c1"), 2, true);
+  }
+  if (sessions) {
+    const style = (session) => getComputedStyle(view.figure.querySelector(`.legend .${session.style}`)).color;
+    for (const session of sessions.sessions) add(session.positions, style(session), 2);
+    add(sessions.ties, colour("ink"), 1, true);
+  }
+  for (const lines of view.liners) found.push(...lines(view, colour, add));
+  return found;
+}
+
+let loopEnds = null;
+
+/** Both ends of each closed loop, x, y, z. */
+function loopLines() {
+  loopEnds ||= Float32Array.from(scans.loops.flat().flatMap((k) => [...scans.positions.subarray(3 * k, 3 * k + 3)]));
+  return loopEnds;
+}
+
+/** Red, green, blue and opacity of a colour of the page, as shares. */
+export function tintOf(css) {
+  const hex = /^#(..)(..)(..)$/.exec(css);
+  const parts = hex ? hex.slice(1).map((part) => parseInt(part, 16)) : css.match(/[\d.]+/g).map(Number);
+  return [parts[0] / 255, parts[1] / 255, parts[2] / 255, 1];
+}
+
+export function drawOver(pen, view, colour) {
   pen.lineJoin = "round";
   pen.font = "12px system-ui, sans-serif";
-  if (scans) drawWay(pen, view, colour);
-  if (sessions) drawSessions(pen, view, colour);
+  if (scans && !view.section) drawSigns(pen, view, colour);
+  if (sessions && !view.section) drawPointed(pen, view, colour);
   drawScale(pen, view, colour);
-  drawAxes(pen, view, axes, colour);
+  drawAxes(pen, view, view.camera.axes(), colour);
 }
 
 /** A line through px in pairs, with a rim that sets it off from the points. */
-export function stroke(pen, seen, colour, rim, width, dashes = []) {
+export function stroke(pen, seen, colour, rim, width) {
   pen.beginPath();
   let isOn = false;
-  let [lastX, lastY] = [NaN, NaN];
   for (let i = 0; i < seen.length; i += 2) {
     const [x, y] = [seen[i], seen[i + 1]];
     if (!Number.isFinite(x + y)) isOn = false;
     else if (!isOn) {
       pen.moveTo(x, y);
-      [isOn, lastX, lastY] = [true, x, y];
-    } else if (Math.abs(x - lastX) + Math.abs(y - lastY) > 0.7 || i === seen.length - 2) {
-      pen.lineTo(x, y);
-      [lastX, lastY] = [x, y];
-    }
+      isOn = true;
+    } else pen.lineTo(x, y);
   }
-  pen.setLineDash([]);
   if (rim) {
     [pen.strokeStyle, pen.lineWidth] = [rim, width + 2.5];
     pen.stroke();
   }
-  pen.setLineDash(dashes);
   [pen.strokeStyle, pen.lineWidth] = [colour, width];
   pen.stroke();
-  pen.setLineDash([]);
 }
 
-function drawWay(pen, view, colour) {
+/** Ends of the trajectory, scans that failed, and the one that is marked: a disc, and where it looks. */
+function drawSigns(pen, view, colour) {
   const [paper, bad] = [colour("paper"), colour("bad")];
-  if (scans.truth) stroke(pen, view.project(scans.truth), colour("truth"), paper, 1.5, [6, 4]);
   const way = view.project(scans.positions);
   view.way = way;
-  stroke(pen, way, colour("c2"), paper, 2);
-  for (const [a, b] of scans.loops) {
-    stroke(pen, [way[2 * a], way[2 * a + 1], way[2 * b], way[2 * b + 1]], colour("c1"), paper, 2);
-  }
   for (const k of scans.failed) {
     const [x, y] = [way[2 * k], way[2 * k + 1]];
     stroke(pen, [x - 4, y - 4, x + 4, y + 4, NaN, NaN, x + 4, y - 4, x - 4, y + 4], bad, paper, 2);
   }
-  const last = scans.count - 1;
   const sign = (k, fill, draw) => {
-    if (!Number.isFinite(way[2 * k] + way[2 * k + 1])) return;
-    pen.beginPath();
-    draw(way[2 * k], way[2 * k + 1]);
-    [pen.fillStyle, pen.strokeStyle, pen.lineWidth] = [fill, paper, 1.5];
-    pen.fill();
-    pen.stroke();
+    if (Number.isFinite(way[2 * k] + way[2 * k + 1])) filled(pen, fill, paper, () => draw(way[2 * k], way[2 * k + 1]));
   };
-  sign(last, bad, (x, y) => pen.rect(x - 5, y - 5, 10, 10));
+  sign(scans.count - 1, bad, (x, y) => pen.rect(x - 5, y - 5, 10, 10));
   sign(0, colour("c3"), (x, y) => pen.arc(x, y, 4.5, 0, 7));
-  drawMarked(pen, view, sign, colour);
-}
-
-/** The marked scan: a disc, and where it looks. */
-function drawMarked(pen, view, sign, colour) {
   const at = Array.from(scans.positions.subarray(3 * marked, 3 * marked + 3));
   const yaw = (scans.angles[3 * marked + 2] * Math.PI) / 180;
-  const ahead = 28 * view.metres;
+  const ahead = 28 * view.camera.metres;
   const nose = view.project([...at, at[0] + ahead * Math.cos(yaw), at[1] + ahead * Math.sin(yaw), at[2]]);
-  stroke(pen, nose, colour("ink"), colour("paper"), 2.5);
+  stroke(pen, nose, colour("ink"), paper, 2.5);
   sign(marked, colour("ink"), (x, y) => pen.arc(x, y, 7, 0, 7));
 }
 
-/** Merged runs: where each went, where they are tied, and the scan under the pointer. */
-function drawSessions(pen, view, colour) {
-  const paper = colour("paper");
-  for (const session of sessions.sessions) {
-    session.way = view.project(session.positions);
-    stroke(pen, session.way, getComputedStyle(view.figure.querySelector(`.legend .${session.style}`)).color, paper, 2);
-  }
-  const ends = view.project(sessions.ties);
-  for (let i = 0; i < ends.length; i += 4) stroke(pen, ends.subarray(i, i + 4), colour("ink"), null, 1);
+/** A shape that `draw` outlines, filled, with a rim. */
+export function filled(pen, fill, rim, draw) {
+  pen.beginPath();
+  draw();
+  [pen.fillStyle, pen.strokeStyle, pen.lineWidth] = [fill, rim, 1.5];
+  pen.fill();
+  pen.stroke();
+}
+
+/** Merged runs: the scan under the pointer. */
+function drawPointed(pen, view, colour) {
+  for (const session of sessions.sessions) session.way = view.project(session.positions);
   if (!view.pointed) return;
   const { session, k } = view.pointed;
   const [x, y] = [session.way[2 * k], session.way[2 * k + 1]];
-  pen.beginPath();
-  pen.arc(x, y, 6, 0, 7);
-  [pen.fillStyle, pen.strokeStyle, pen.lineWidth] = [colour("ink"), paper, 1.5];
-  pen.fill();
-  pen.stroke();
+  filled(pen, colour("ink"), colour("paper"), () => pen.arc(x, y, 6, 0, 7));
   const text = `${session.name}, scan ${session.index[k]}`;
-  label(pen, text, clamp(x, pen.measureText(text).width / 2 + 4, view.width - pen.measureText(text).width / 2 - 4), y - 12, colour);
+  const half = pen.measureText(text).width / 2 + 4;
+  label(pen, text, clamp(x, half, view.camera.width - half), y - 12, colour);
 }
 
-
-/** A bar of a round length, which from above is true everywhere, in 3D at the centre. */
-function drawScale(pen, view, colour) {
-  const power = 10 ** Math.floor(Math.log10(120 * view.metres));
-  const length = [1, 2, 5, 10].map((m) => m * power).filter((m) => m <= 120 * view.metres).pop();
-  const width = length / view.metres;
+/** A bar of a round length, which without perspective is true everywhere, in 3D at the centre. */
+function drawScale(pen, { camera }, colour) {
+  const power = 10 ** Math.floor(Math.log10(120 * camera.metres));
+  const length = [1, 2, 5, 10].map((m) => m * power).filter((m) => m <= 120 * camera.metres).pop();
+  const width = length / camera.metres;
   const text = `${length >= 1 ? length : length.toPrecision(1)} m`;
-  const [x, y] = [14, view.height - 14];
+  const [x, y] = [14, camera.height - 14];
   stroke(pen, [x, y - 5, x, y, x + width, y, x + width, y - 5], colour("ink"), colour("paper"), 2);
   label(pen, text, x + width / 2, y - 7, colour);
 }
@@ -120,11 +138,11 @@ export function label(pen, text, x, y, colour) {
 }
 
 function drawAxes(pen, view, { right, up }, colour) {
-  const [x, y] = [view.width - 44, view.height - 40];
-  ["x", "y", "z"].forEach((name, k) => {
+  const [x, y] = [view.camera.width - 44, view.camera.height - 40];
+  (view.section ? ["along", "", "z"] : ["x", "y", "z"]).forEach((name, k) => {
     const [dx, dy] = [right[k], -up[k]];
-    if (Math.hypot(dx, dy) < 0.15) return;
+    if (!name || Math.hypot(dx, dy) < 0.15) return;
     stroke(pen, [x, y, x + 24 * dx, y + 24 * dy], colour("ink"), colour("paper"), 1.5);
-    label(pen, name, x + 33 * dx, y + 33 * dy + 4, colour);
+    label(pen, name, x + 33 * dx - (name.length > 1 ? 24 * dx : 0), y + 33 * dy + 4 + (name.length > 1 ? 14 : 0), colour);
   });
 }

@@ -1,37 +1,50 @@
-// The map as points that turn, with the trajectory over them. Without WebGL the drawing of the page stays.
-import { colourings } from "./colours.mjs";
+// The map as points that turn, with the trajectory over them. Without WebGL 2 the drawing of the page stays.
+import { Camera } from "./camera.mjs";
+import { cloudOf, coordinates } from "./clouds.mjs";
+import { BY, colourings, percentile } from "./colours.mjs";
 import { KEYS, make, read } from "./elements.mjs";
 import { gestures } from "./gestures.mjs";
 import { clamp, nearestBy } from "./numbers.mjs";
-import { drawOver } from "./overlay.mjs";
-import { pointDrawer } from "./points.mjs";
+import { drawOver, linesOf } from "./overlay.mjs";
+import { PointDrawer } from "./points.mjs";
 import { mark, scans, watchers } from "./scans.mjs";
 import { sessionAt, sessions } from "./sessions.mjs";
 
-const LENS = 0.5; // tan of half the angle of view
-const STEEPEST = 1.45; // rad from straight down
+const SHADING = 8; // of edges by depth, in 3D
+const REST_MS = 150; // without a gesture until more points are drawn
+const LEAST_PX = 1.5; // of a point
+const FRAME_MS = 40; // of a frame, by drawing fewer points
+const FIRST = 200_000; // points of the first one
 
 export class MapView {
-  constructor(figure, cloud) {
+  constructor(figure, data) {
     this.figure = figure;
-    this.cloud = cloud;
     this.stage = figure.querySelector(".stage");
-    [this.points, this.lines] = ["points", "lines"].map((name) => {
+    [this.canvas, this.lines] = ["points", "lines"].map((name) => {
       const canvas = document.createElement("canvas");
       canvas.className = name;
       this.stage.append(canvas);
       return canvas;
     });
-    this.drawer = pointDrawer(this.points, cloud);
+    this.drawer = PointDrawer.on(this.canvas, data.colours);
     if (!this.drawer) {
-      this.points.remove();
+      this.canvas.remove();
       this.lines.remove();
       return;
     }
     figure.classList.add("live");
+    this.cloud = cloudOf(data, scans ? scans.count : 0);
+    this.drawer.add("map", this.cloud);
+    this.names = ["map"]; // clouds that are drawn
+    this.known = colourings(this.cloud, scans);
+    this.camera = new Camera();
+    [this.size, this.isShaded, this.share] = [1, true, Math.min(1, FIRST / this.cloud.count)];
+    [this.painters, this.liners, this.leavers] = [[], [], []];
+    [this.drawn, this.movedAt, this.last] = [0, -Infinity, 0];
+    this.onClick = null; // of a tool that takes clicks
     this.home = figure.dataset.extent.split(" ").map(Number);
-    this.ground = (cloud.height[0] + cloud.height[1]) / 2;
-    this.startTools();
+    this.ground = (data.height[0] + data.height[1]) / 2;
+    this.startLegend();
     this.lines.setAttribute("role", "application");
     this.lines.setAttribute("aria-label", `${this.stage.querySelector("svg").getAttribute("aria-label")}, ${KEYS}; comma and full stop mark the scan before and after`);
     gestures(this.lines, {
@@ -39,30 +52,21 @@ export class MapView {
       pan: (dx, dy, event) => this.move(dx, dy, event.shiftKey || event.buttons === 2),
       reset: () => this.reset(),
       hover: (x, y) => this.hover(x, y),
+      click: (x, y) => this.onClick?.(x, y),
     });
     this.lines.addEventListener("contextmenu", (event) => event.preventDefault());
     this.colour("height");
     this.reset();
-    watchers.push(() => this.draw());
+    watchers.push(() => this.drawSigns());
     new ResizeObserver(() => this.fit()).observe(this.stage);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
   }
 
-  startTools() {
-    const tools = this.figure.querySelector(".tools");
-    const actions = {
-      flat: () => this.turnTo(0, 0), turn: () => this.turnTo(0.6, 0.95), in: () => this.zoom(1.4), out: () => this.zoom(1 / 1.4), reset: () => this.reset(),
-    };
-    for (const button of tools.querySelectorAll("button")) button.addEventListener("click", actions[button.dataset.do]);
+  startLegend() {
     for (const [name, style] of scans ? [["ground truth", scans.truth && "gt"], ["loop closed", scans.loops.length && "s1"]] : []) {
       if (style) this.explain(name, style);
     }
     if (sessions && sessions.tied) this.explain("loop between two of them", "");
-    this.known = colourings(this.cloud);
-    const select = tools.querySelector("select");
-    for (const name of Object.keys(this.known)) select.add(new Option(name));
-    select.addEventListener("change", () => this.colour(select.value));
-    tools.hidden = false;
   }
 
   /** One more line of the legend: what the drawing underneath does not show. */
@@ -75,114 +79,198 @@ export class MapView {
     this.figure.querySelector(".legend").append(item);
   }
 
+  /** Colour the points by one of the ways that are known, over its usual range. */
   colour(name) {
-    const { said, range, shades } = this.known[name];
-    const ramp = this.figure.querySelector(".ramp");
-    [ramp.querySelector(".low").textContent, ramp.querySelector(".high").textContent] = range;
-    ramp.querySelector(".said").textContent = said;
-    this.drawer.shade(shades());
+    this.way_of_colour = name;
+    const { bytes, by, usual } = this.known[name];
+    if (bytes) this.drawer.recolour("map", by === BY.rgb ? "rgb" : "value", bytes);
+    this.spread(...(usual || [0, 100]));
+  }
+
+  /** Spread the colours from the one percentile to the other. */
+  spread(from, to) {
+    const { by, ordered, text, said, kinds } = this.known[this.way_of_colour];
+    this.percentiles = [from, to];
+    this.by = by;
+    const [low, high] = ordered ? [percentile(ordered, from), percentile(ordered, to)] : [0, 1];
+    this.range = [low, Math.max(high, low + 1e-6)];
+    this.say(text ? this.range.map(text) : null, said, kinds);
     this.draw();
   }
 
-  /** The whole map, as it is turned. */
+  /** What the colours mean, beside the palette. */
+  say(ends, said, kinds = []) {
+    const ramp = this.figure.querySelector(".ramp");
+    if (!ramp) return;
+    [ramp.querySelector(".low").textContent, ramp.querySelector(".high").textContent] = ends || ["", ""];
+    ramp.querySelector("i").hidden = !ends;
+    ramp.querySelector(".said").replaceChildren(said, ...kinds.flatMap(([name, colour]) => {
+      const swatch = document.createElement("b");
+      swatch.className = "swatch";
+      swatch.style.color = `#${colour}`;
+      return [" ", swatch, name];
+    }));
+  }
+
+  /** The whole map, as it is turned; of a section the whole of it. */
   reset() {
     const [x0, x1, y0, y1] = this.home;
-    this.centre = [(x0 + x1) / 2, (y0 + y1) / 2, this.ground];
-    this.metres = null;
-    this.turnTo(this.yaw || 0, this.tilt || 0);
+    this.camera.centre = [(x0 + x1) / 2, (y0 + y1) / 2, this.ground];
+    this.isWhole = true;
+    if (this.section) this.fit();
+    else this.turnTo(this.camera.yaw, this.camera.tilt);
   }
 
   turnTo(yaw, tilt) {
-    [this.yaw, this.tilt] = [yaw, tilt];
-    for (const button of this.figure.querySelectorAll("[aria-pressed]")) {
-      button.setAttribute("aria-pressed", String((button.dataset.do === "turn") === tilt > 0));
-    }
+    if (this.section) this.leaveSection();
+    Object.assign(this.camera, { yaw, tilt, isFlat: tilt === 0 });
+    this.press(tilt > 0 ? "turn" : "flat");
+    this.fit();
+  }
+
+  /** Show which of the two views it is; neither in a section. */
+  press(which) {
+    for (const name of ["flat", "turn"]) this.figure.querySelector(`[data-do=${name}]`).setAttribute("aria-pressed", String(name === which));
+  }
+
+  /** Show a cloud of its own, (along, to the left, z), and a line in it, from the side; `sides` x0, x1, z0, z1 of it, m. */
+  showSection(cloud, line, sides) {
+    const { yaw, tilt } = this.camera;
+    const before = this.section?.before || { yaw, tilt, centre: [...this.camera.centre], metres: this.camera.metres, home: this.home, ground: this.ground, isFlat: this.camera.isFlat };
+    this.section = { cloud, line, before };
+    const [x0, x1, z0, z1] = sides;
+    this.drawer.add("section", cloud);
+    this.names = ["section"];
+    this.home = [x0, x1, 0, 0];
+    this.sides = sides;
+    this.ground = (z0 + z1) / 2;
+    Object.assign(this.camera, { yaw: 0, tilt: Math.PI / 2, isFlat: true });
+    this.press("");
+    this.reset();
+  }
+
+  leaveSection() {
+    const { home, ground, ...camera } = this.section.before;
+    this.section = null;
+    [this.names, this.home, this.ground] = [["map"], home, ground];
+    this.drawer.remove("section");
+    Object.assign(this.camera, camera);
+    this.press(camera.isFlat ? "flat" : "turn");
+    for (const leave of this.leavers) leave();
     this.fit();
   }
 
   fit() {
     const [width, height] = [this.stage.clientWidth, this.stage.clientHeight];
     if (!width || !height) return;
-    const [x0, x1, y0, y1] = this.home;
-    this.widest = 1.04 * Math.max((x1 - x0) / width, (y1 - y0) / height);
-    this.metres = this.metres || this.widest; // of a CSS px
+    this.camera.fit(width, height, this.section ? this.sides : this.home);
+    if (this.isWhole) this.camera.metres = this.camera.widest;
+    this.isWhole = false;
     this.ratio = devicePixelRatio || 1;
-    for (const canvas of [this.points, this.lines]) [canvas.width, canvas.height] = [width * this.ratio, height * this.ratio];
-    [this.width, this.height] = [width, height];
+    for (const canvas of [this.canvas, this.lines]) [canvas.width, canvas.height] = [width * this.ratio, height * this.ratio];
+    this.isFitted = true;
     this.draw();
   }
 
-  zoom(factor, x = this.width / 2, y = this.height / 2) {
-    const before = this.metres;
-    this.metres = clamp(before / factor, this.widest / 2000, 3 * this.widest);
-    this.shift((x - this.width / 2) * (before - this.metres), (this.height / 2 - y) * (before - this.metres));
-    this.draw();
-  }
-
-  /** Move the centre along the ground: so many m to the right and away from the viewer, as seen. */
-  shift(right, up) {
-    const away = up / Math.max(Math.cos(this.tilt), 0.2);
-    this.centre[0] += Math.cos(this.yaw) * right - Math.sin(this.yaw) * away;
-    this.centre[1] += Math.sin(this.yaw) * right + Math.cos(this.yaw) * away;
+  zoom(factor, x = this.camera.width / 2, y = this.camera.height / 2) {
+    this.camera.zoom(factor, x, y);
+    this.moved();
   }
 
   move(dx, dy, isShift) {
-    if (this.tilt > 0 && !isShift) {
-      this.yaw += 0.006 * dx;
-      this.tilt = clamp(this.tilt - 0.006 * dy, 0.05, STEEPEST);
-    } else this.shift(-dx * this.metres, dy * this.metres);
+    if (this.camera.isFlat || isShift) this.camera.shift(-dx * this.camera.metres, dy * this.camera.metres);
+    else this.camera.turn(dx, dy);
+    this.moved();
+  }
+
+  moved() {
+    this.movedAt = performance.now();
     this.draw();
   }
 
-  /** Axes of the view in the world, and how far the viewer is from the centre, m. */
-  axes() {
-    const [c, s, ct, st] = [Math.cos(this.yaw), Math.sin(this.yaw), Math.cos(this.tilt), Math.sin(this.tilt)];
-    return { right: [c, s, 0], up: [-s * ct, c * ct, st], back: [s * st, -c * st, ct], away: (this.height * this.metres) / 2 / LENS };
-  }
-
-  /** Column by column: points less the centre to clip coordinates; from above without perspective. */
-  matrix({ right, up, back, away }) {
-    const [a, b] = [2 / (this.width * this.metres), 2 / (this.height * this.metres)];
-    const reach = Math.hypot(...this.cloud.step.map((step) => 65535 * step)) + Math.hypot(...this.centre.map((value, k) => value - this.cloud.low[k]));
-    const perspective = this.tilt > 0 ? 1 / away : 0;
-    const [near, far] = [0.02 * away, away + reach];
-    const [depth, rest] = perspective ? [-(far + near) / (far - near) / away, (far + near) / (far - near) - (2 * far * near) / (far - near) / away] : [-1 / reach, 0];
-    const column = (k) => [a * right[k], b * up[k], depth * back[k], -perspective * back[k]];
-    return new Float32Array([...column(0), ...column(1), ...column(2), 0, 0, rest, 1]);
-  }
-
-  /** Where points (x, y, z, x, y, ...) are seen: px, in pairs, NaN behind the viewer. */
-  project(points) {
-    const { right, up, back, away } = this.axes();
-    const seen = new Float32Array((points.length / 3) * 2);
-    for (let i = 0; i < points.length / 3; i += 1) {
-      const d = [points[3 * i] - this.centre[0], points[3 * i + 1] - this.centre[1], points[3 * i + 2] - this.centre[2]];
-      const along = (axis) => axis[0] * d[0] + axis[1] * d[1] + axis[2] * d[2];
-      const w = this.tilt > 0 ? 1 - along(back) / away : 1;
-      const share = w > 0.02 ? 1 / (w * this.metres) : NaN;
-      seen[2 * i] = this.width / 2 + along(right) * share;
-      seen[2 * i + 1] = this.height / 2 - along(up) * share;
-    }
-    return seen;
-  }
-
+  /**
+   * The map anew, as it is now: as many points as keep it moving, then more of them in each frame until all are drawn.
+   * Shading waits for the last of them, unless all are drawn at once.
+   */
   draw() {
-    if (!this.width || !this.metres) return;
-    const axes = this.axes();
-    const size = Math.max(this.figure.dataset.voxel / this.metres, 1.3) * this.ratio;
-    this.drawer.draw(this.matrix(axes), this.centre, size);
+    this.drawn = 0;
+    this.soon();
+  }
+
+  soon() {
+    if (this.isDue || !this.isFitted) return;
+    this.isDue = true;
+    requestAnimationFrame((now) => {
+      this.isDue = false;
+      if (this.last) this.share = clamp(this.share * clamp(FRAME_MS / (now - this.last), 0.3, 1.5), 0.02, 1);
+      this.paint();
+      this.last = this.drawn < 1 || performance.now() - this.movedAt < REST_MS ? now : 0;
+      if (this.drawn < 1 && performance.now() - this.movedAt < REST_MS) setTimeout(() => this.soon(), REST_MS);
+      else if (this.drawn < 1) this.soon();
+    });
+  }
+
+  paint() {
+    const { camera, ratio } = this;
+    const colour = this.colourOf();
+    const reach = Math.hypot(...[0, 1, 2].map((k) => 65535 * this.cloud.step[k] + Math.abs(camera.centre[k] - this.cloud.low[k])));
+    const voxel = Number(this.figure.dataset.voxel);
+    const [from, to] = [this.drawn, Math.min(1, this.drawn + this.share)];
+    const isWhole = to === 1;
+    this.drawer.draw({
+      view: camera.matrix(reach), centre: camera.centre, by: this.by, range: this.range, ratio, names: this.names, from, to,
+      size: Math.max((1.5 * voxel) / camera.metres, LEAST_PX) * this.size * ratio, least: LEAST_PX * Math.min(this.size, 1) * ratio,
+      strength: isWhole && this.isShaded && !(camera.isFlat && !this.section) ? SHADING : 0, lines: linesOf(this, colour),
+    });
+    this.drawn = to;
+    this.drawSigns();
+  }
+
+  /** What lies over points and lines: it changes with the pointer. */
+  drawSigns() {
+    if (!this.isFitted) return;
+    const [{ camera, ratio }, colour] = [this, this.colourOf()];
     const pen = this.lines.getContext("2d");
-    pen.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
-    pen.clearRect(0, 0, this.width, this.height);
-    drawOver(pen, this, axes);
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+    pen.clearRect(0, 0, camera.width, camera.height);
+    drawOver(pen, this, colour);
+    for (const paint of this.painters) paint(pen, this, colour);
+  }
+
+  /** Colours of the page by name. */
+  colourOf() {
+    const style = getComputedStyle(this.figure);
+    return (name) => style.getPropertyValue(`--${name}`).trim();
+  }
+
+  project(points) {
+    return this.camera.project(points);
+  }
+
+  /** The point of the map, or of the section, that is seen at px: [x, y, z], m; null without one. */
+  pick(x, y) {
+    if (this.picked !== this.shown) [this.picked, this.places] = [this.shown, coordinates(this.shown)];
+    const i = this.camera.pick(this.places, x, y);
+    return i < 0 ? null : Array.from(this.places.subarray(3 * i, 3 * i + 3));
+  }
+
+  /** From now on clicks go to `act(x, y)` of `tool`; the tool that had them before is stopped. */
+  take(tool, act) {
+    const before = this.tool;
+    [this.tool, this.onClick] = [tool, act];
+    if (before && before !== tool) before.stop();
+  }
+
+  get shown() {
+    return this.section ? this.section.cloud : this.cloud;
   }
 
   hover(x, y) {
     if (sessions) {
       this.pointed = sessionAt(x, y);
-      this.draw();
+      this.drawSigns();
     }
-    if (!this.way) return;
+    if (!this.way || this.section) return;
     const away = Float32Array.from({ length: scans.count }, (_, k) => Math.hypot(this.way[2 * k] - x, this.way[2 * k + 1] - y));
     const k = nearestBy(away, 0);
     if (k >= 0 && away[k] < 30) mark(k);
