@@ -22,7 +22,7 @@ LAYERS = [
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 # Rooms in a room, likewise; "" are the modules that lie in it directly. Kernels are at the bottom of each.
 INNER = {
-    "pipeline": [["convert"], [""], ["doctor"]],
+    "pipeline": [["deliver"], ["convert"], [""], ["doctor"]],
     "odometry": [["frontend"], [""], ["inertial", "integrity"]],
     "backend": [["", "localization"], ["graph", "loops"], ["keyframes"]],
     "io": [["readers"], ["formats"], [""]],

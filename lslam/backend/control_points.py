@@ -99,9 +99,7 @@ def control_residuals(
     off = geodesy.to_local(on_earth, georeference.origin) - se3.apply(
         georeference.T_enu_world, _seen(points, stamps, results)
     )
-    return [
-        ControlResidual(point, int(stamp), residual) for point, stamp, residual in zip(points, stamps, off, strict=True)
-    ]
+    return [ControlResidual(*one) for one in zip(points, stamps.tolist(), off, on_earth, strict=True)]
 
 
 def against_odometry(

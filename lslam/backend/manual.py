@@ -16,7 +16,7 @@ from lslam.core.config import Config
 from lslam.core.errors import InputError, UsageError, cause, nearest
 from lslam.core.geometry.crs_names import parse_crs
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.types.arrays import Floats
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import ControlPoint, ControlResidual, Instant, KnownPair, Manual, NamedPair
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Selection, Sequence
@@ -140,11 +140,13 @@ def read_control_points(path: Path) -> list[ControlPoint]:
 
 def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
     """What is left of each control point, m, east, north and up, surveyed minus solved; raises OutputError."""
-    rows = ["point,stamp_ns,east_m,north_m,up_m,sigma_m,sigma_up_m,sigmas"]
+    rows = ["point,stamp_ns,east_m,north_m,up_m,sigma_m,sigma_up_m,sigmas,lat_deg,lon_deg,height_m"]
     for one in residuals:
         (east, north, up), (sigma, _, sigma_up) = one.residual.tolist(), one.point.sigma.tolist()
         name = one.point.at.said.replace(",", "")
-        rows.append(f"{name},{one.stamp_ns},{east:.4f},{north:.4f},{up:.4f},{sigma:g},{sigma_up:g},{one.size:.2f}")
+        lat, lon, height = one.place
+        off = f"{east:.4f},{north:.4f},{up:.4f},{sigma:g},{sigma_up:g},{one.size:.2f}"
+        rows.append(f"{name},{one.stamp_ns},{off},{lat:.9f},{lon:.9f},{height:.4f}")
     write_text(path, "\n".join(rows) + "\n")
 
 
@@ -209,9 +211,20 @@ def read_manual(config: Config, sequence: Sequence) -> Manual:
     points = read_control_points(Path(config.graph.control)) if config.graph.control else []
     numbers = sequence.indices if isinstance(sequence, Selection) else np.arange(len(sequence))
     period = int(1e9 / sequence.rate_hz) if sequence.rate_hz > 0 else 0
-    ends = [(end, period) for pair in pairs for end in (pair.first, pair.second)]
-    for instant, slack in (*ends, *((point.at, ROUNDING_NS) for point in points)):
-        span = int(sequence.stamps_ns[0]) - slack, int(sequence.stamps_ns[-1]) + slack
+    require_instants([end for pair in pairs for end in (pair.first, pair.second)], numbers, sequence.stamps_ns, period)
+    require_instants([point.at for point in points], numbers, sequence.stamps_ns)
+    for point in points:
+        require_crs(to_wgs84(point.position[None], point.epsg, point.height_epsg, config.gnss.geoid)[0], config.gnss)
+    return Manual(tuple(pairs), tuple(points))
+
+
+def require_instants(instants: Iterable[Instant], numbers: Longs, stamps_ns: Longs, slack: int = ROUNDING_NS) -> None:
+    """Raise InputError for an instant at which a run has no scan.
+
+    numbers, stamps_ns : (N,) of its scans; slack : ns, that a stamp may lie before the first and behind the last
+    """
+    span = int(stamps_ns[0]) - slack, int(stamps_ns[-1]) + slack
+    for instant in instants:
         if instant.scan is not None and instant.scan not in numbers:
             raise InputError(
                 f"{instant.said}: scan {instant.scan} is none of the run's, which are {numbers[0]} to {numbers[-1]}"
@@ -221,9 +234,6 @@ def read_manual(config: Config, sequence: Sequence) -> Manual:
                 f"{instant.said}: the stamp {1e-9 * instant.stamp_ns:.3f} s is none of the run's, which are "
                 f"{1e-9 * span[0]:.3f} to {1e-9 * span[1]:.3f} s"
             )
-    for point in points:
-        require_crs(to_wgs84(point.position[None], point.epsg, point.height_epsg, config.gnss.geoid)[0], config.gnss)
-    return Manual(tuple(pairs), tuple(points))
 
 
 def stamp_of(instant: Instant, results: Many[ScanResult]) -> int:

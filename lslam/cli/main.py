@@ -28,6 +28,7 @@ COMMANDS = {
     "sweep": "Study how results depend on parameters.",
     "simulate": "Simulate a drive with exact ground truth.",
     "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",
+    "deliver": "Make the folder that a surveyor hands over.",
     "osm": "Fetch buildings from OpenStreetMap, or show what is in an extract.",
     "info": "Show the contents and the faults of a sequence.",
     "map": "Build a run's map anew with other settings, or score a map.",

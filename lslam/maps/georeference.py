@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +36,41 @@ def utm_epsg(lat: float, lon: float) -> int:
     """
     zone = int((lon + 180) // 6) % 60 + 1
     return (32700 if lat < 0 else 32600) + zone
+
+
+@dataclass(frozen=True)
+class Operation:
+    """A transformation between coordinate reference systems.
+
+    steps : names of PROJ's operations; accuracy : m, as PROJ states it, None where it states none; grids : files they use
+    """
+
+    steps: tuple[str, ...]
+    accuracy: float | None
+    grids: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """Coordinates of a run without a georeference, where a `Projection` is expected: they stay as they are.
+
+    frame : description of the world
+    """
+
+    frame: str
+
+    name = plane = "local coordinates"
+    epsg = None
+    wkt = plane_wkt = attribution = ""
+    heights = "heights above the first pose of the sensor"
+
+    def apply(self, points: NDArray[Any]) -> Floats:
+        """The points (N, 3), m."""
+        return np.asarray(points, np.float64).reshape(-1, 3)
+
+    def carry(self, poses: NDArray[Any]) -> Floats:
+        """The poses (N, 4, 4), m."""
+        return np.asarray(poses, np.float64).reshape(-1, 4, 4)
 
 
 @dataclass(frozen=True)
@@ -87,6 +122,35 @@ class Projection:
     def wkt2(self) -> str:
         """The same as WKT 2."""
         return str(self._crs.to_wkt())
+
+    @property
+    def attribution(self) -> str:
+        """What a map placed by data of others has to say."""
+        is_theirs = self.georeference.method == "osm"
+        return "placed by buildings, © OpenStreetMap contributors, ODbL 1.0" if is_theirs else ""
+
+    @property
+    def operation(self) -> Operation:
+        """Transformation from the WGS84 local frame, as PROJ describes it."""
+        parts = self._transformer.operations or ()
+        steps = [part.name for part in parts if "unknown" not in part.name and "axis order" not in part.name]
+        grids = [grid.short_name for part in parts for grid in part.grids]
+        accuracy = float(self._transformer.accuracy)
+        return Operation(tuple(steps), accuracy if accuracy >= 0 else None, tuple(grids))
+
+    @property
+    def convergence_and_scale(self) -> tuple[float, float]:
+        """Angle from true north to grid north at the origin, deg, clockwise positive, and the scale of the grid there."""
+        from pyproj import Proj
+
+        lat, lon, _ = (float(v) for v in self.georeference.origin)
+        factors = Proj(self._plane).get_factors(lon, lat)
+        return float(factors.meridian_convergence), float(np.sqrt(factors.areal_scale))
+
+    @property
+    def heights(self) -> str:
+        """Zero level of the heights in words."""
+        return self.frame.partition(", ")[2]
 
     def apply(self, points: NDArray[Any]) -> Floats:
         """Transform points (N, 3) of the run's world, m, to (N, 3) easting, northing, height, m.
@@ -167,10 +231,10 @@ class Projection:
 
 @dataclass(frozen=True)
 class ProjectedCloud:
-    """A cloud of a run's world in projected coordinates; satisfies `Cloud`."""
+    """A cloud in other coordinates, as `Projection.apply` or `invert` transform points (N, 3); satisfies `Cloud`."""
 
     cloud: Cloud
-    projection: Projection
+    transform: Callable[[NDArray[Any]], Floats]
 
     @property
     def has_intensity(self) -> bool:
@@ -186,9 +250,9 @@ class ProjectedCloud:
         return len(self.cloud)
 
     def blocks(self) -> Iterator[CloudBlock]:
-        """The blocks of the cloud, projected."""
+        """The blocks of the cloud, transformed."""
         for block in self.cloud.blocks():
-            yield replace(block, points=self.projection.apply(block.points))
+            yield replace(block, points=self.transform(block.points))
 
 
 def in_crs(georeference: Georeference, crs: OutputCrs | None) -> Georeference:

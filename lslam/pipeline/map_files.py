@@ -165,7 +165,7 @@ def write_map(path: Path, cloud: Cloud, note: MapNote, georeference: Georeferenc
     comment = f"lslam {__version__} map, {where}; {note.world}"
     if projection is not None and projected:
         projection.check()
-        write_cloud(path, ProjectedCloud(cloud, projection), wkt=projection.wkt)
+        write_cloud(path, ProjectedCloud(cloud, projection.apply), wkt=projection.wkt)
     else:
         write_cloud(path, cloud, comment=comment)
     about = {

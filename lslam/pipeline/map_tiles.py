@@ -75,7 +75,7 @@ def write_tiles(
     is_projected = projection is not None and suffix in ("las", "laz")
     if projection is not None and is_projected:
         projection.check()
-        cloud = ProjectedCloud(cloud, projection)
+        cloud = ProjectedCloud(cloud, projection.apply)
     tiles, items = [], []
     ending = COPC if suffix == "laz" else f".{suffix}"
     with tempfile.TemporaryDirectory(prefix=SPOOL, dir=folder, ignore_cleanup_errors=True) as stage:

@@ -73,6 +73,11 @@ def density_png(image: NDArray[Any], top: float | None = None) -> bytes:
     )
 
 
+def density_grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey values (H, W) of a density image: 255 where nothing is, darker with the logarithm of the density, in 16 levels."""
+    return np.asarray(255 - (255 // (LEVELS - 1)) * _levels(np.asarray(image, np.float32), None), np.uint8)
+
+
 def halved(image: NDArray[Any], values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Density image (H, W) and its values at half the resolution: densities are summed, values averaged by density."""
     height, width = (2 * (n // 2) for n in image.shape)

@@ -56,7 +56,7 @@ def test_tiles_keep_the_colours_of_their_points(tmp_path: Path, monkeypatch: pyt
 def test_projected_points_keep_their_colours() -> None:
     colours = np.random.default_rng(5).integers(0, 256, (5000, 3)).astype(np.uint8)
     projection = Projection(Georeference(np.array([49.0, 8.4, 100.0]), np.eye(4)))
-    blocks = list(ProjectedCloud(ColouredCloud(CLOUD, colours), projection).blocks())
+    blocks = list(ProjectedCloud(ColouredCloud(CLOUD, colours), projection.apply).blocks())
     found = np.concatenate([np.stack([block.columns[c] for c in ("red", "green", "blue")], axis=1) for block in blocks])
     assert (found == colours).all()
 

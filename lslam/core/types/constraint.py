@@ -153,11 +153,15 @@ class KnownPair:
 
 @dataclass(frozen=True)
 class ControlResidual:
-    """What is left of a control point: `residual` (3,) m, east, north, up, surveyed minus solved; `sigma` (3,) m, as stated."""
+    """What is left of a control point.
+
+    residual : (3,) m, east, north, up, surveyed minus solved; place : (3,) as surveyed, lat, lon (deg), height (m), WGS84
+    """
 
     point: ControlPoint
     stamp_ns: int
     residual: Floats
+    place: Floats
 
     @property
     def size(self) -> float:

@@ -32,3 +32,15 @@ def gps_time_s(stamps_ns: Longs, is_unix: bool) -> Floats:
     seconds, rest_ns = np.divmod(stamps_ns, 10**9)
     leaps = _LEAPS[np.maximum(np.searchsorted(_LEAPS[:, 0], seconds, side="right") - 1, 0), 1]
     return np.asarray((seconds - _GPS_EPOCH_S + leaps - _LAS_OFFSET_S) + 1e-9 * rest_ns)
+
+
+def unix_time_ns(gps_s: Floats) -> Longs:
+    """(N,) Unix times, ns, of adjusted standard GPS times (N,), s: the inverse of `gps_time_s`, to the last bits of a double.
+
+    >>> unix_time_ns(np.array([384035218.5])).tolist()
+    [1700000000500000000]
+    """
+    seconds, rest = np.divmod(gps_s, 1.0)
+    ahead = seconds.astype(np.int64) + _GPS_EPOCH_S + _LAS_OFFSET_S
+    leaps = _LEAPS[np.maximum(np.searchsorted(_LEAPS.sum(axis=1), ahead, side="right") - 1, 0), 1]
+    return np.asarray((ahead - leaps) * 10**9 + np.rint(1e9 * rest).astype(np.int64))

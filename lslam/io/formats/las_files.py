@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -21,11 +23,11 @@ from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
 from lslam.core.labels import asprs_table
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns, in_memory
+from lslam.core.types.cloud import BLOCK, TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns, in_memory
 from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.copc_files import INFO, INFO_BYTES, USER_ID, copc_bytes, is_copc
-from lslam.io.formats.gps_time import gps_time_s
+from lslam.io.formats.gps_time import gps_time_s, unix_time_ns
 from lslam.io.formats.text_tables import is_unix_time
 
 if TYPE_CHECKING:
@@ -198,6 +200,63 @@ def write_las(path: Path, cloud: Cloud, wkt: str = "") -> None:
 
 def read_las(path: Path) -> tuple[ArrayCloud, str]:
     """Read points (m), 16-bit intensities and WKT (empty if none) of a LAS or LAZ file. Raises InputError if it is damaged."""
+    with _opened(path) as (reader, size):
+        blocks = [
+            (np.column_stack([block.x, block.y, block.z]), np.asarray(block.intensity, np.float32))
+            for block in reader.chunk_iterator(size)
+        ]
+        header = reader.header
+    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in blocks)])
+    intensity = np.concatenate([np.zeros(0, np.float32), *(values for _, values in blocks)])
+    texts = [vlr.string for vlr in header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"]
+    return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
+
+
+@dataclass(frozen=True)
+class LasCloud:
+    """A LAS or LAZ file that lslam wrote, with the columns of its points, read block by block; satisfies `Cloud`."""
+
+    path: Path
+    count: int
+    column_types: Mapping[str, np.dtype[Any]]
+    is_unix: bool
+    has_intensity: bool = True
+
+    def __len__(self) -> int:
+        return self.count
+
+    def blocks(self) -> Iterator[CloudBlock]:
+        """The points, in the coordinates of the file. Raises InputError if it is damaged."""
+        with _opened(self.path) as (reader, size):
+            for block in reader.chunk_iterator(min(size, BLOCK)):
+                columns = {name: self._column(block, name, kind) for name, kind in self.column_types.items()}
+                points = np.column_stack([block.x, block.y, block.z])
+                yield CloudBlock(points, np.asarray(block.intensity, np.float32), columns)
+
+    def _column(self, block: Any, name: str, kind: np.dtype[Any]) -> NDArray[Any]:
+        if name == TIME_NS:
+            seconds = np.asarray(block["gps_time"], np.float64)
+            return unix_time_ns(seconds) if self.is_unix else np.rint(1e9 * seconds).astype(np.int64)
+        if name in _COLOURS:
+            return (np.asarray(block[name]) // 257).astype(kind)
+        return np.asarray(block["point_source_id" if name == "scan" and kind.itemsize == 2 else name], kind)
+
+
+def open_las(path: Path, attributes: Collection[str]) -> LasCloud:
+    """Open a map of lslam whose points have these `attributes`, as its note names them. Raises InputError if it is damaged."""
+    with _opened(path) as (reader, _):
+        header = reader.header
+    kinds = {d.name: d.dtype for d in header.point_format.dimensions if d.dtype is not None}
+    types: dict[str, np.dtype[Any]] = {name: np.dtype(np.uint8) for name in _COLOURS if name in kinds}
+    types |= {TIME_NS: np.dtype(np.int64)} if "time" in attributes else {}
+    types |= {"scan": np.dtype(kinds.get("scan", np.uint16))} if "scan" in attributes else {}
+    types |= {name: np.dtype(kinds[name]) for name in attributes if name not in ("time", "scan") and name in kinds}
+    return LasCloud(path, header.point_count, types, int(header.global_encoding.gps_time_type) == 1)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, int]]:
+    """A reader of laspy, and how many points it may decompress at a time. Raises InputError for whatever goes wrong inside."""
     with importing("laspy", _WAY_OUT):
         import laspy
         import lazrs  # noqa: F401
@@ -208,21 +267,13 @@ def read_las(path: Path) -> tuple[ArrayCloud, str]:
             # On all cores whole chunks are decompressed at once, however large they are.
             backend = laspy.LazBackend.LazrsParallel if largest <= _BLOCK else laspy.LazBackend.Lazrs
             with laspy.open(stream, closefd=False, laz_backend=backend) as reader:
-                blocks = [
-                    (np.column_stack([block.x, block.y, block.z]), np.asarray(block.intensity, np.float32))
-                    for block in reader.chunk_iterator(max(_BLOCK // record, 1))
-                ]
-                header = reader.header
+                yield reader, max(_BLOCK // record, 1)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
     except BaseException as error:  # laspy and lazrs raise whatever a damaged byte leads to, Rust its panics
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise InputError(f"{path} cannot be read as LAS: {error}") from None
-    points = np.concatenate([np.zeros((0, 3)), *(points for points, _ in blocks)])
-    intensity = np.concatenate([np.zeros(0, np.float32), *(values for _, values in blocks)])
-    texts = [vlr.string for vlr in header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"]
-    return ArrayCloud(points, intensity), texts[0].rstrip("\0") if texts else ""
 
 
 def is_extra(name: str, kind: np.dtype[Any]) -> bool:

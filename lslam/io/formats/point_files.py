@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -16,7 +16,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write
-from lslam.io.formats.las_files import read_las, write_las
+from lslam.io.formats.las_files import open_las, read_las, write_las
 from lslam.io.formats.pcd_files import packed_colour, pcd_columns, pcd_header
 from lslam.io.formats.ply_files import ply_columns, ply_header
 from lslam.io.formats.point_cloud import AXES, PointCloud, cloud_from_fields, float_table
@@ -32,6 +32,7 @@ _PLACES = ("xyz", "point", "points", "position", "positions")
 # Coordinates beyond are those of a projection; of a map they shall lie in finer steps.
 LARGE_M, COARSE_M = 1e5, 0.01
 _FEW = 8
+_COLOURS = ("red", "green", "blue")
 log = logging.getLogger("lslam")
 
 
@@ -243,6 +244,25 @@ def read_cloud(path: Path) -> ArrayCloud:
             step,
         )
     return cloud
+
+
+def open_map(path: Path, attributes: Collection[str]) -> Cloud:
+    """Open a map that lslam wrote, with the columns of its points, in the coordinates of the file, m.
+
+    attributes : of its points, as its note names them. LAS and LAZ are read block by block, PLY and PCD whole.
+    Raises InputError naming the file when it is missing, damaged or of another kind.
+    """
+    if path.suffix.lower() in (".las", ".laz"):
+        return open_las(path, attributes)
+    fields = _read_columns(path)
+    cloud = cloud_from_fields(path, fields, np.float64)
+    columns = {name: fields[name] for name in (*attributes, *_COLOURS) if name in fields and name != "time"}
+    if "time" in attributes and "time" in fields:
+        columns[TIME_NS] = np.rint(1e9 * fields["time"]).astype(np.int64)
+    if "rgb" in fields:
+        packed = np.ascontiguousarray(fields["rgb"]).view(np.uint32)
+        columns |= {name: (packed >> shift).astype(np.uint8) for name, shift in zip(_COLOURS, (16, 8, 0), strict=True)}
+    return ArrayCloud(cloud.points, cloud.intensity, columns)
 
 
 def coordinate_step(points: Floats) -> float:

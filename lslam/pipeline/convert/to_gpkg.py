@@ -15,10 +15,9 @@ import numpy as np
 from lslam.core.errors import InputError, OutputError, OutputExistsError, UsageError, cause
 from lslam.core.extras import importing, install_hint
 from lslam.core.types.arrays import Floats
-from lslam.core.types.building import CorrectedMap
 from lslam.core.types.gnss import OutputCrs
 from lslam.io.formats.text_tables import utc_of
-from lslam.maps.georeference import Projection, in_crs
+from lslam.maps.georeference import LocalFrame, Projection, in_crs
 from lslam.osm.buildings_geojson import read_corrected
 from lslam.pipeline.convert import staged
 from lslam.pipeline.convert.convert_trajectory import georeference_beside
@@ -51,18 +50,21 @@ class GeoLayer:
     colours: Mapping[str, str] = field(default_factory=dict)
 
 
-def write_gpkg(path: Path, layers: Sequence[GeoLayer], projection: Projection) -> None:
+def write_gpkg(path: Path, layers: Sequence[GeoLayer], projection: Projection | LocalFrame) -> None:
     """Write the layers to `path`, a new file ending in .gpkg, with QGIS' styles. It is not atomic; the caller renames it.
 
-    Raises OutputError when it cannot be written, InputError without fudgeo.
+    Layers in a local frame have the undefined Cartesian reference system of the standard. Raises OutputError when it cannot be
+    written, InputError without fudgeo.
     """
     with importing("fudgeo", install_hint("geo")):
         from fudgeo import GeoPackage, SpatialReferenceSystem
-    system = SpatialReferenceSystem(projection.plane, "EPSG", projection.epsg, projection.plane_wkt)
+    code = ("NONE", -1, "undefined") if projection.epsg is None else ("EPSG", projection.epsg, projection.plane_wkt)
+    system = SpatialReferenceSystem(projection.plane, *code)
     try:
         package = GeoPackage.create(path, flavor="EPSG")
         try:
-            package.add_spatial_reference(system)
+            if projection.epsg is not None:
+                package.add_spatial_reference(system)
             for layer in layers:
                 _write_layer(package, layer, system)
             _write_styles(package, layers)
@@ -191,42 +193,46 @@ def convert_to_gpkg(
     run = read_run(folder)
     if not len(run.trajectory):
         raise InputError(f"{folder / 'trajectory.tum'} has no pose")
-    layers = _of_poses(run, projection)
-    if (folder / "buildings.geojson").is_file():
-        layers += _of_buildings(read_corrected(folder / "buildings.geojson"), projection)
+    name = str(run.manifest.get("sequence", {}).get("name", run.folder.name))
+    layers = pose_layers({name: run}, projection) + building_layers(folder, projection)
     with staged(out) as made:
         write_gpkg(made, layers, projection)
     return layers
 
 
-def _of_poses(run: EarlierRun, projection: Projection) -> list[GeoLayer]:
-    about = f"{projection.frame}; by lslam"
-    if projection.georeference.method == "osm":
-        about += "; placed by buildings, © OpenStreetMap contributors, ODbL 1.0"
-    places = projection.apply(run.trajectory.positions)
-    stamps, nothing = run.trajectory.stamps_ns, [None] * len(places)
-    times = utc_of(stamps) or nothing
-    covariances = covariances_of(run)
-    columns: dict[str, Any] = {
-        "scan": [result.index for result in results_of(run)],
-        "stamp_ns": stamps.tolist(),
-        "utc": times,
-        "status": list(run.statuses),
-        "sigma_m": nothing if covariances is None else _sigmas(covariances[:, :3, :3]),
-        "sigma_deg": nothing if covariances is None else _sigmas(np.degrees(1) ** 2 * covariances[:, 3:, 3:]),
-    }
-    # A line has two points.
-    line = places if len(places) > 1 else np.repeat(places, 2, axis=0)
-    whole: dict[str, Any] = {
-        "sequence": [str(run.manifest.get("sequence", {}).get("name", run.folder.name))],
-        "scans": [len(places)],
-        "length_m": [float(run.trajectory.path_lengths[-1])],
-        "begin": times[:1],
-        "end": times[-1:],
-    }
+def pose_layers(drives: Mapping[str, EarlierRun], projection: Projection | LocalFrame) -> list[GeoLayer]:
+    """Layers of runs in one world, by name: a line each, and a point for each of their scans."""
+    about = "; ".join(filter(None, [f"{projection.frame}; by lslam", projection.attribution]))
+    whole: dict[str, list[Any]] = {name: [] for name in ("sequence", "scans", "length_m", "begin", "end")}
+    names = ("sequence", "scan", "stamp_ns", "utc", "status", "sigma_m", "sigma_deg")
+    columns: dict[str, list[Any]] = {name: [] for name in names}
+    lines, points = [], []
+    for name, run in drives.items():
+        places = projection.apply(run.trajectory.positions)
+        stamps, nothing = run.trajectory.stamps_ns, [None] * len(places)
+        times = utc_of(stamps) or nothing
+        covariances = covariances_of(run)
+        in_deg = None if covariances is None else np.degrees(1) ** 2 * covariances[:, 3:, 3:]
+        own: tuple[Sequence[Any], ...] = (
+            [name] * len(places),
+            [result.index for result in results_of(run)],
+            stamps.tolist(),
+            times,
+            run.statuses,
+            nothing if covariances is None else _sigmas(covariances[:, :3, :3]),
+            nothing if in_deg is None else _sigmas(in_deg),
+        )
+        for column, values in zip(columns.values(), own, strict=True):
+            column.extend(values)
+        points += list(places)
+        # A line has two points.
+        lines.append(places if len(places) > 1 else np.repeat(places, 2, axis=0))
+        facts = (name, len(places), float(run.trajectory.path_lengths[-1]), times[0], times[-1])
+        for column, value in zip(whole.values(), facts, strict=True):
+            column.append(value)
     return [
-        GeoLayer("trajectory", "lines", [line], whole, about, {"": _BLUE}),
-        GeoLayer("scans", "points", list(places), columns, about, _SCANS),
+        GeoLayer("trajectory", "lines", lines, whole, about, {"": _BLUE}),
+        GeoLayer("scans", "points", points, columns, about, _SCANS),
     ]
 
 
@@ -237,8 +243,11 @@ def _sigmas(covariances: Floats) -> list[float | None]:
     return [float(np.sqrt(max(v, 0.0))) if k else None for v, k in zip(largest, known, strict=True)]
 
 
-def _of_buildings(found: CorrectedMap, projection: Projection) -> list[GeoLayer]:
-    """Layers of buildings at their georeferenced places, as in buildings.geojson."""
+def building_layers(folder: Path, projection: Projection) -> list[GeoLayer]:
+    """Layers of buildings at their georeferenced places, as in buildings.geojson of the run's folder; none without it."""
+    if not (folder / "buildings.geojson").is_file():
+        return []
+    found = read_corrected(folder / "buildings.geojson")
     # Buildings lie in the local frame of their own origin.
     there = Projection(
         replace(projection.georeference, origin=found.origin, T_enu_world=np.eye(4), epsg=projection.epsg)

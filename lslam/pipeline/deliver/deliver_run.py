@@ -1,0 +1,188 @@
+"""Delivery of a run: a folder with its map, trajectory, layers, plans, a sheet to sign and a README, whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lslam.core.errors import InputError, OutputExistsError, UsageError
+from lslam.core.extras import install_command
+from lslam.core.printable import counted
+from lslam.core.untrusted import MISFIT
+from lslam.core.version import __version__
+from lslam.io.formats.atomic import atomic_write, write_text
+from lslam.io.formats.geotiff import write_geotiff
+from lslam.io.formats.las_files import write_las
+from lslam.io.formats.point_files import open_map
+from lslam.io.formats.state_files import read_npz
+from lslam.maps.floor_plan import UNKNOWN, Extent, floor_plan, top_view
+from lslam.maps.georeference import ProjectedCloud, Projection
+from lslam.maps.occupancy import OccupancyGrid
+from lslam.pipeline.convert import check_beside, staged
+from lslam.pipeline.convert.to_gpkg import write_gpkg
+from lslam.pipeline.deliver import words
+from lslam.pipeline.deliver.survey import Survey
+from lslam.pipeline.deliver.tables import layers_of, write_trajectories
+from lslam.pipeline.map_files import georeference_of, note_of
+from lslam.pipeline.rebuild import map_of
+from lslam.reports.png import density_grey
+from lslam.reports.survey_sheet import SurveySheet, survey_pdf
+
+MAP, GPKG, PLAN, FLOOR, SHEET, README = (
+    "map.laz",
+    "survey.gpkg",
+    "plan.tif",
+    "floor_plan.tif",
+    "sheet.pdf",
+    "README.txt",
+)
+STEPS = 6
+_EMPTY = 255  # grey of a pixel without points
+_PIXEL_M, _LONGEST = 0.1, 4000
+_PAPER_M = 20.0  # around a trajectory without a map
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """Result of `deliver`: descriptions of the files by name, sentences about the accuracy, and what is missing and why."""
+
+    folder: Path
+    files: Mapping[str, str]
+    accuracy: list[str]
+    notes: list[str]
+
+
+def check_delivery(folder: Path, out: Path, overwrite: bool) -> None:
+    """Raise UsageError or OutputExistsError for what cannot be delivered to `out`, before any work is done."""
+    if find_spec("fudgeo") is None:
+        raise UsageError(f"a delivery has a GeoPackage, which fudgeo writes: install it with: {install_command('geo')}")
+    check_beside(out, folder, "the run")
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    first = (out / README).read_text(errors="replace")[: len(words.TITLE)] if (out / README).is_file() else ""
+    if first != words.TITLE:
+        raise OutputExistsError(
+            f"{out} exists and is no delivery of lslam, --overwrite replaces those only: name another --out"
+        )
+    if not overwrite:
+        raise OutputExistsError(f"{out} exists; name another folder with --out or replace it with --overwrite")
+
+
+def deliver(
+    survey: Survey, out: Path, *, overwrite: bool = False, command: str = "", on_step: Callable[[], None] = lambda: None
+) -> Delivery:
+    """Write the delivery of `survey` to the folder `out`.
+
+    What the run does not have, a map or a floor plan, is left out and said in README.txt. `on_step` is called `STEPS` times.
+    Raises as `check_delivery`, InputError for a damaged map, OutputError when something cannot be written.
+    """
+    check_delivery(survey.folder, out, overwrite)
+    with staged(out) as made:
+        made.mkdir()
+        files, notes = _write_map(made, survey)
+        on_step()
+        image, extent = _write_plan(made, survey, files)
+        on_step()
+        _write_floor_plan(made, survey, files)
+        for name in write_trajectories(made, survey):
+            files[name] = (
+                "pose of the LiDAR at each scan with standard deviations and status; its head says what columns mean"
+            )
+        on_step()
+        layers = layers_of(survey)
+        write_gpkg(made / GPKG, layers, survey.frame)
+        files[GPKG] = f"layers for GIS, with styles for QGIS: {', '.join(layer.name for layer in layers)}"
+        on_step()
+        with atomic_write(made / SHEET) as stream:
+            stream.write(survey_pdf(_sheet(survey, image, extent, notes)))
+        files[SHEET] = "one page to sign: map, accuracy, coordinates, limits"
+        on_step()
+        write_text(made / README, words.readme(survey, files, notes, command))
+        on_step()
+    return Delivery(out, {**files, README: "this survey in words"}, words.accuracy(survey), notes)
+
+
+def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]:
+    """Write map.laz in the delivered coordinates. Returns what it is, and what it lacks."""
+    try:
+        path = map_of(survey.folder)
+    except InputError:
+        return {}, ["There is no map, and no plan from above: the run was made without one."]
+    note = note_of(path)
+    attributes = dict(note.get("attributes") or {})
+    cloud = open_map(path, attributes)
+    own = georeference_of(note.get("georeference")) if note.get("crs") else None
+    local = cloud if own is None else ProjectedCloud(cloud, Projection(own).invert)
+    write_las(folder / MAP, ProjectedCloud(local, survey.frame.apply), survey.frame.wkt)
+    named = [*attributes, *(["colour"] if "red" in cloud.column_types else [])]
+    voxel = f"one in each voxel of {note['voxel']:g} m" if note.get("voxel") else "every point of every scan"
+    about = f"{counted(len(cloud), 'point')}, {voxel}; beside coordinates: {', '.join(['intensity', *named])}"
+    if "time" in attributes:
+        about += f"; time: {attributes['time']}"
+    if survey.frame.attribution:
+        about += f"; {survey.frame.attribution}"
+    missing = [name for name in ("time", "class") if name not in attributes]
+    if not missing or survey.manifest.get("kind") == "merge":
+        return {MAP: about}, []
+    way = f"lslam map {survey.folder} --attributes {','.join([*attributes, *missing])} --overwrite"
+    notes = f"Points of the map have no {' and no '.join(missing)}; `{way}` gives them what the recording has of it."
+    return {MAP: about}, [notes]
+
+
+def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[NDArray[np.uint8] | None, Extent]:
+    """Write plan.tif, the delivered map from above. Returns its image and the edges of it, or of the trajectory without a map."""
+    if MAP not in files:
+        places = np.concatenate([survey.frame.apply(run.trajectory.positions)[:, :2] for run in survey.drives.values()])
+        (x, y), (east, north) = places.min(axis=0) - _PAPER_M, places.max(axis=0) + _PAPER_M
+        return None, (float(x), float(east), float(y), float(north))
+    view = top_view(open_map(folder / MAP, ()), _PIXEL_M, _LONGEST)
+    image, (west, east, south, north) = density_grey(view.image), view.extent
+    size = (east - west) / image.shape[1]
+    write_geotiff(folder / PLAN, image, np.array([[size, 0, west], [0, -size, north]]), survey.frame.epsg, _EMPTY)
+    files[PLAN] = f"the map from above, GeoTIFF with pixels of {size:.3g} m: the darker, the more points"
+    return image, view.extent
+
+
+def _write_floor_plan(folder: Path, survey: Survey, files: dict[str, str]) -> None:
+    """Write floor_plan.tif where the run has an occupancy map. Its rows are askew in the grid, as the axes of the run are."""
+    path = survey.folder / "occupancy.npz"
+    if not path.is_file():
+        return
+    arrays = read_npz(path)
+    try:
+        plan = floor_plan(OccupancyGrid(arrays["cells"], arrays["log_odds"], float(arrays["voxel"])))
+    except MISFIT as error:
+        raise InputError(f"{path} is no occupancy map: {error}; build it anew with lslam map --occupancy") from None
+    height, width = plan.image.shape
+    z = float(next(iter(survey.drives.values())).trajectory.positions[:, 2].mean())
+    x, y = plan.x + width * plan.resolution, plan.y + height * plan.resolution
+    corner, right, low = survey.frame.apply(np.array([[plan.x, y, z], [x, y, z], [plan.x, plan.y, z]]))[:, :2]
+    transform = np.column_stack([(right - corner) / width, (low - corner) / height, corner])
+    write_geotiff(folder / FLOOR, plan.image, transform, survey.frame.epsg, UNKNOWN)
+    files[FLOOR] = (
+        f"floor plan, GeoTIFF with pixels of {plan.resolution:.3g} m: black occupied, white free, else unknown"
+    )
+
+
+def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, notes: list[str]) -> SurveySheet:
+    is_local = survey.frame.epsg is None
+    north = [f"{words.north(survey)}."] if words.north(survey) else []
+    return SurveySheet(
+        title=f"Survey of {survey.name}",
+        subtitle=f"{survey.frame.name}; status of the run: {survey.status}",
+        image=image,
+        extent=extent,
+        drives=[(survey.frame.apply(run.trajectory.positions)[:, :2], run.statuses) for run in survey.drives.values()],
+        points={points.kind: points.places[:, :2] for points in survey.points},
+        axes=("x, m", "y, m") if is_local else ("easting, m", "northing, m"),
+        has_north=not is_local,
+        left={"Accuracy": words.accuracy(survey), "Coordinates": [*words.coordinates(survey), *north]},
+        right={"Survey": words.making(survey), "Limits": [*words.limits(survey), *notes]},
+        foot=f"lslam {__version__}; delivered on {datetime.now(UTC):%Y-%m-%d}; README.txt says how it was made",
+    )

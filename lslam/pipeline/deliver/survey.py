@@ -1,0 +1,221 @@
+"""A finished run, or a merge of several, as it is delivered: its drives, coordinates, and surveyed points beside its poses."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lslam.backend.control_points import control_residuals
+from lslam.backend.manual import read_control_points, require_instants
+from lslam.core.errors import InputError, RunFailedError, UsageError, input_errors
+from lslam.core.geometry import geodesy, noise, se3
+from lslam.core.types.arrays import Floats
+from lslam.core.types.gnss import OutputCrs
+from lslam.core.untrusted import MISFIT
+from lslam.io.formats.trajectory_files import read_trajectory
+from lslam.maps.georeference import LocalFrame, Projection, in_crs
+from lslam.pipeline.map_files import georeference_of, read_json
+from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
+from lslam.pipeline.run_folder import MANIFEST, SESSIONS, require_run
+
+FINISHED = ("done", "degraded")
+
+
+@dataclass(frozen=True)
+class SurveyedPoints:
+    """Surveyed points beside the final poses.
+
+    kind : `used` ones held the run, those `kept out` check it; names : where each was stated
+    places : (N, 3) as surveyed; residuals : (N, 3) surveyed minus solved; both easting, northing, height, m
+    """
+
+    kind: Literal["used", "kept out"]
+    names: list[str]
+    stamps_ns: list[int]
+    places: Floats
+    residuals: Floats
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Root mean square of the residuals, m, horizontally and vertically."""
+        squares = (self.residuals**2).mean(axis=0)
+        return float(np.sqrt(squares[0] + squares[1])), float(np.sqrt(squares[2]))
+
+    @property
+    def worst(self) -> tuple[float, float]:
+        """Largest residuals, m, horizontally and vertically."""
+        return float(np.hypot(*self.residuals.T[:2]).max()), float(np.abs(self.residuals[:, 2]).max())
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is delivered of a folder.
+
+    drives : the run by the name of its sequence, or the sessions of a merge, all in one world
+    frame : from that world to the delivered coordinates; points : surveyed ones, those that held the run first
+    """
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    drives: Mapping[str, EarlierRun]
+    frame: Projection | LocalFrame
+    points: tuple[SurveyedPoints, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Names of the drives."""
+        return ", ".join(self.drives)
+
+    @property
+    def status(self) -> str:
+        """How the run ended."""
+        return str(self.manifest.get("status", "unknown"))
+
+    @property
+    def problems(self) -> list[str]:
+        """What the run says went wrong."""
+        return [str(problem) for problem in self.manifest.get("problems", ())]
+
+    def covariances(self, run: EarlierRun) -> Floats | None:
+        """(N, 6, 6) of the poses of a drive about the axes of the delivered coordinates, m2 and rad2; None where unknown."""
+        known = covariances_of(run)
+        return None if known is None else noise.rotated(known, self.frame.carry(np.eye(4))[0, :3, :3])
+
+    @property
+    def sigmas(self) -> Floats:
+        """(N, 2) one standard deviation of each known position, m: horizontally, where it is largest, and of the height."""
+        found = [C for run in self.drives.values() if (C := self.covariances(run)) is not None]
+        C = np.concatenate([np.zeros((0, 6, 6)), *found])
+        C = C[np.isfinite(C).all((1, 2))]
+        variances = np.column_stack([np.linalg.eigvalsh(C[:, :2, :2])[:, -1], C[:, 2, 2]])
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+
+def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, is_forced: bool = False) -> Survey:
+    """Read what a run or a merge left in `folder`.
+
+    crs : coordinates to deliver in, None for those of the run; check : file of points that the run did not use
+    is_forced : whether a run that diverged or was interrupted is read too
+
+    Raises
+    ------
+    RunFailedError : such a run is not to be delivered. UsageError : no place on the Earth is known, heights in `crs` cannot be
+    had, or a check point held the run. InputError : a file is missing or damaged.
+    """
+    require_run(folder)
+    manifest = read_json(folder / MANIFEST)
+    status = str(manifest.get("status", "unknown"))
+    if status not in FINISHED and not is_forced:
+        raise RunFailedError(
+            f"{folder} is no result to hand over: its status is {status}; run the sequence again, or take it as it is with --anyway"
+        )
+    drives = _drives(folder, manifest)
+    first = next(iter(drives.values()))
+    if not all(len(run.trajectory) for run in drives.values()):
+        raise InputError(f"{folder} has a trajectory without a pose: run the sequence again")
+    if first.georeference is None:
+        if crs is not None or check is not None:
+            raise UsageError(
+                f"{'--check' if crs is None else '--crs'}: {folder} is not georeferenced: run the sequence with --gnss or "
+                "--georeference where it has satellite fixes, or with --osm MAP --origin LAT,LON, or give it points: lslam graph "
+                f"{folder} --control points.csv; without --crs it is delivered in local coordinates"
+            )
+        return Survey(folder, manifest, drives, LocalFrame(f"local coordinates, m: {_world(manifest)}"))
+    projection = Projection(in_crs(first.georeference, crs))
+    projection.check()
+    survey = Survey(folder, manifest, drives, projection)
+    used = _control(survey, projection)
+    points = [] if used is None else [used]
+    if check is not None:
+        points.append(_checked(survey, projection, check, used))
+    return replace(survey, points=tuple(points))
+
+
+def _world(manifest: Mapping[str, Any]) -> str:
+    return str(manifest.get("frames", {}).get("world", "LiDAR at the first scan"))
+
+
+def _drives(folder: Path, manifest: Mapping[str, Any]) -> dict[str, EarlierRun]:
+    if manifest.get("kind") != "merge":
+        run = read_run(folder)
+        return {str(run.manifest.get("sequence", {}).get("name", folder.name)): run}
+    georeference, drives = georeference_of(manifest.get("georeference")), {}
+    try:
+        sessions = [(str(row["name"]), Path(row["run"])) for row in manifest["sessions"]]
+    except MISFIT as error:
+        raise InputError(f"{folder / MANIFEST}: sessions: {error}; merge the runs again") from None
+    for name, source in sessions:
+        if not source.is_dir():
+            raise InputError(f"{folder} was merged from {source}, which is gone: put it back, or merge the runs again")
+        run, trajectory = read_run(source), read_trajectory(folder / SESSIONS / f"{name}.tum", "tum")
+        if not np.array_equal(run.trajectory.stamps_ns, trajectory.stamps_ns):
+            raise InputError(f"{source} has other scans than {folder} was merged from: merge the runs again")
+        drives[name] = replace(run, folder=folder, trajectory=trajectory, georeference=georeference)
+    return drives
+
+
+def _control(survey: Survey, projection: Projection) -> SurveyedPoints | None:
+    """Control points of the run, by its control.csv; None without any."""
+    path = survey.folder / "control.csv"
+    if not path.is_file():
+        return None
+    with (
+        input_errors(path, *MISFIT, as_what="a table of control points"),
+        path.open(newline="", encoding="utf-8") as stream,
+    ):
+        rows = list(csv.DictReader(stream))
+        if rows and "lat_deg" not in rows[0]:
+            raise InputError(
+                f"{path} is of an earlier lslam and has no places: make it anew with lslam graph {survey.folder}"
+            )
+        numbers = {
+            name: np.array([float(row[name]) for row in rows]) for name in (rows[0] if rows else ()) if name != "point"
+        }
+        names, stamps = [row["point"] for row in rows], [int(row["stamp_ns"]) for row in rows]
+    if not rows:
+        return None
+    places = np.column_stack([numbers[name] for name in ("lat_deg", "lon_deg", "height_m")])
+    residuals = np.column_stack([numbers[name] for name in ("east_m", "north_m", "up_m")])
+    return _points("used", names, stamps, places, residuals, projection)
+
+
+def _checked(survey: Survey, projection: Projection, path: Path, used: SurveyedPoints | None) -> SurveyedPoints:
+    """Points of a person that the run did not use, beside its final poses."""
+    if len(survey.drives) > 1:
+        raise UsageError(
+            f"--check: {survey.folder} is a merge, whose scans have no numbers of their own: check one of its runs"
+        )
+    (run,) = survey.drives.values()
+    points, results = read_control_points(path), results_of(run)
+    require_instants([point.at for point in points], np.array([r.index for r in results]), run.trajectory.stamps_ns)
+    found = control_residuals(points, results, projection.georeference, projection.georeference.geoid)
+    names, stamps = [point.at.said for point in points], [one.stamp_ns for one in found]
+    places, residuals = np.stack([one.place for one in found]), np.stack([one.residual for one in found])
+    checked = _points("kept out", names, stamps, places, residuals, projection)
+    for name, place in zip(names, checked.places, strict=True):
+        # Half a centimetre: less is rounding, and no two marks lie so near.
+        if used is not None and (np.linalg.norm(used.places[:, :2] - place[:2], axis=1) < 0.005).any():
+            raise UsageError(
+                f"--check: {name} is a control point that held the run: it checks nothing; leave it out of one file"
+            )
+    return checked
+
+
+def _points(
+    kind: Literal["used", "kept out"],
+    names: list[str],
+    stamps: list[int],
+    places: Floats,
+    off: Floats,
+    projection: Projection,
+) -> SurveyedPoints:
+    """From places lat, lon (deg), height (m), and residuals (N, 3) east, north, up, m."""
+    there = projection.georeference
+    enu = geodesy.to_local(places, there.origin)
+    surveyed, solved = (projection.apply(se3.apply(se3.inverse(there.T_enu_world), at)) for at in (enu, enu - off))
+    return SurveyedPoints(kind, names, stamps, surveyed, surveyed - solved)
