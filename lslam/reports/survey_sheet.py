@@ -19,7 +19,8 @@ _MM = 1 / 25.4  # inch
 _PAGE, _MARGIN = (210.0, 297.0), 15.0  # mm
 _MAP_MM = (_PAGE[0] - 2 * _MARGIN, 150.0)
 _MAP_LOW_MM = 122.0
-_COLUMN_LINES, _COLUMN_CHARACTERS = 29, 62
+_COLUMN_LINES, _COLUMN_CHARACTERS = 26, 68
+_SCALES = (1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 7.5)
 _MARKS = {"used": ("^", "control points, used"), "kept out": ("o", "check points, kept out")}
 _STATUS = {"ok": COLOURS[0], "bridged": COLOURS[1], "skipped": "0.5"}
 
@@ -47,23 +48,21 @@ class SurveySheet:
     foot: str
 
 
-def nice(value: float) -> float:
-    """The smallest of 1, 2, 2.5 and 5 times a power of ten that is not below `value`.
+def nice(value: float, steps: Sequence[float] = (1, 2, 5)) -> float:
+    """The smallest of `steps` times a power of ten that is not below `value`.
 
-    >>> nice(0.7), nice(230.0), nice(2.0)
-    (1.0, 250.0, 2.0)
+    >>> nice(0.7), nice(230.0), nice(2.0), nice(230.0, (1, 2, 2.5, 5))
+    (1.0, 500.0, 2.0, 250.0)
     """
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(step * power for step in (1, 2, 2.5, 5, 10) if step * power >= value * (1 - 1e-9)))
+    return float(next(step * power for step in (*steps, 10) if step * power >= value * (1 - 1e-9)))
 
 
 def survey_pdf(sheet: SurveySheet) -> bytes:
     """PDF of the page."""
-    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    # Text that can be searched and copied, in fonts that every reader takes.
-    with house_style(7.5), rc_context({"pdf.fonttype": 42}):
+    with house_style(7.5):
         figure = Figure(figsize=(_PAGE[0] * _MM, _PAGE[1] * _MM))
         figure.text(*_at(_MARGIN, 284), sheet.title, size=14, weight="bold", va="center", parse_math=False)
         figure.text(*_at(_MARGIN, 277.5), sheet.subtitle, size=8.5, va="center", parse_math=False)
@@ -93,7 +92,7 @@ def _draw_map(figure: Any, sheet: SurveySheet) -> None:
     plot = figure.add_axes(box)
     low, high = np.array(sheet.extent[::2]), np.array(sheet.extent[1::2])
     size_m = 1e-3 * np.array([_MAP_MM[0] - 4, _MAP_MM[1]])
-    scale = nice(float(((high - low) / size_m).max()))
+    scale = nice(float(((high - low) / size_m).max()), _SCALES)
     middle, half = (low + high) / 2, scale * size_m / 2
     if sheet.image is not None:
         plot.imshow(sheet.image, cmap="gray", vmin=0, vmax=255, extent=sheet.extent, interpolation="antialiased")
@@ -151,11 +150,12 @@ def _draw_column(figure: Any, paragraphs: Mapping[str, Sequence[str]], x_mm: flo
         figure.text(*_at(x_mm, y), heading, weight="bold", va="center")
         y, lines_left = y - 3.6, lines_left - 1
         for k, text in enumerate(texts):
-            wrapped = textwrap.wrap(text, _COLUMN_CHARACTERS)
+            wrapped = textwrap.wrap(text, _COLUMN_CHARACTERS, break_on_hyphens=False)
             if len(wrapped) > lines_left - 1:
                 figure.text(*_at(x_mm, y), f"and {len(texts) - k} more: see README.txt", va="center", style="italic")
                 return
             for line in wrapped:
                 figure.text(*_at(x_mm, y), line, size=6.8, va="center", parse_math=False)
                 y, lines_left = y - 3.0, lines_left - 1
+            y -= 0.8
         y -= 1.6

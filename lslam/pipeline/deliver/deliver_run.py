@@ -21,6 +21,7 @@ from lslam.io.formats.geotiff import write_geotiff
 from lslam.io.formats.las_files import write_las
 from lslam.io.formats.point_files import open_map
 from lslam.io.formats.state_files import read_npz
+from lslam.io.formats.text_tables import is_unix_time
 from lslam.maps.floor_plan import UNKNOWN, Extent, floor_plan, top_view
 from lslam.maps.georeference import ProjectedCloud, Projection
 from lslam.maps.occupancy import OccupancyGrid
@@ -108,6 +109,11 @@ def deliver(
     return Delivery(out, {**files, README: "this survey in words"}, words.accuracy(survey), notes)
 
 
+def _voxel(survey: Survey) -> float:
+    """Edge of the voxels of the run's map, m; 0 for every point."""
+    return float(note_of(map_of(survey.folder)).get("voxel") or 0.0)
+
+
 def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]:
     """Write map.laz in the delivered coordinates. Returns what it is, and what it lacks."""
     try:
@@ -120,19 +126,24 @@ def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]
     own = georeference_of(note.get("georeference")) if note.get("crs") else None
     local = cloud if own is None else ProjectedCloud(cloud, Projection(own).invert)
     write_las(folder / MAP, ProjectedCloud(local, survey.frame.apply), survey.frame.wkt)
-    named = [*attributes, *(["colour"] if "red" in cloud.column_types else [])]
-    voxel = f"one in each voxel of {note['voxel']:g} m" if note.get("voxel") else "every point of every scan"
-    about = f"{counted(len(cloud), 'point')}, {voxel}; beside coordinates: {', '.join(['intensity', *named])}"
+    named = [
+        "intensity",
+        *(name for name in attributes if name != "time"),
+        *(["colour"] if "red" in cloud.column_types else []),
+    ]
+    voxel = f"one in each voxel of {_voxel(survey):g} m" if _voxel(survey) else "every point of every scan"
+    about = f"{counted(len(cloud), 'point')}, {voxel}; with {', '.join(named)}"
     if "time" in attributes:
-        about += f"; time: {attributes['time']}"
+        is_unix = is_unix_time(int(next(iter(survey.drives.values())).trajectory.stamps_ns[0]))
+        about += (
+            ", GPS time (adjusted standard)" if is_unix else ", time by the recording's own clock (marked as week time)"
+        )
     if survey.frame.attribution:
         about += f"; {survey.frame.attribution}"
-    missing = [name for name in ("time", "class") if name not in attributes]
-    if not missing or survey.manifest.get("kind") == "merge":
+    if "time" in attributes or survey.manifest.get("kind") == "merge":
         return {MAP: about}, []
-    way = f"lslam map {survey.folder} --attributes {','.join([*attributes, *missing])} --overwrite"
-    notes = f"Points of the map have no {' and no '.join(missing)}; `{way}` gives them what the recording has of it."
-    return {MAP: about}, [notes]
+    way = f"lslam map {survey.folder} --attributes {','.join(['time', *attributes])} --overwrite"
+    return {MAP: about}, [f"The points of the map have no times: `{way}` gives them, and then deliver again."]
 
 
 def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[NDArray[np.uint8] | None, Extent]:
@@ -141,8 +152,9 @@ def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[ND
         places = np.concatenate([survey.frame.apply(run.trajectory.positions)[:, :2] for run in survey.drives.values()])
         (x, y), (east, north) = places.min(axis=0) - _PAPER_M, places.max(axis=0) + _PAPER_M
         return None, (float(x), float(east), float(y), float(north))
-    view = top_view(open_map(folder / MAP, ()), _PIXEL_M, _LONGEST)
-    image, (west, east, south, north) = density_grey(view.image), view.extent
+    pixel = max(_PIXEL_M, _voxel(survey))
+    view = top_view(open_map(folder / MAP, ()), pixel, _LONGEST)
+    image, (west, east, _, north) = density_grey(view.image), view.extent
     size = (east - west) / image.shape[1]
     write_geotiff(folder / PLAN, image, np.array([[size, 0, west], [0, -size, north]]), survey.frame.epsg, _EMPTY)
     files[PLAN] = f"the map from above, GeoTIFF with pixels of {size:.3g} m: the darker, the more points"
@@ -172,7 +184,6 @@ def _write_floor_plan(folder: Path, survey: Survey, files: dict[str, str]) -> No
 
 def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, notes: list[str]) -> SurveySheet:
     is_local = survey.frame.epsg is None
-    north = [f"{words.north(survey)}."] if words.north(survey) else []
     return SurveySheet(
         title=f"Survey of {survey.name}",
         subtitle=f"{survey.frame.name}; status of the run: {survey.status}",
@@ -182,7 +193,7 @@ def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, note
         points={points.kind: points.places[:, :2] for points in survey.points},
         axes=("x, m", "y, m") if is_local else ("easting, m", "northing, m"),
         has_north=not is_local,
-        left={"Accuracy": words.accuracy(survey), "Coordinates": [*words.coordinates(survey), *north]},
+        left={"Accuracy": words.accuracy(survey), "Coordinates": words.coordinates(survey)},
         right={"Survey": words.making(survey), "Limits": [*words.limits(survey), *notes]},
         foot=f"lslam {__version__}; delivered on {datetime.now(UTC):%Y-%m-%d}; README.txt says how it was made",
     )

@@ -112,7 +112,7 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
     status = str(manifest.get("status", "unknown"))
     if status not in FINISHED and not is_forced:
         raise RunFailedError(
-            f"{folder} is no result to hand over: its status is {status}; run the sequence again, or take it as it is with --anyway"
+            f"{folder} is no result to hand over, it is {status}: run the sequence again, or take it as it is with --anyway"
         )
     drives = _drives(folder, manifest)
     first = next(iter(drives.values()))

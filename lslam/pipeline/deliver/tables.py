@@ -36,9 +36,10 @@ def trajectory_text(survey: Survey, name: str) -> str:
         if is_local
         else f"coordinates: m, {frame.name} ({frame.plane}); {frame.heights}",
         f"stamp_ns: ns, {clock}, of the {_pose_time(run)} of each scan",
-        f"roll_deg, pitch_deg, yaw_deg: R = Rz(yaw) Ry(pitch) Rx(roll) takes the sensor's axes (forward, left, up) to {', '.join(about)}"
+        "roll_deg, pitch_deg, yaw_deg: R = Rz(yaw) Ry(pitch) Rx(roll) takes the sensor's axes (forward, left, up) to "
+        f"{', '.join(about)}"
         f"{'' if is_local else ' of the grid; yaw counts from east to north'}; qx to qw is the same rotation",
-        f"sigma_*: one standard deviation by the covariances, {precision_note(survey)}; rotations in deg about {', '.join(about)}",
+        f"sigma_*: one standard deviation by the covariances, {precision_note(survey)}; rotations, deg, about {', '.join(about)}",
         "status: ok was registered, bridged follows the motion prior, skipped has no points",
         "frame: lidar",
     ]

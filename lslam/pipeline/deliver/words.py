@@ -81,6 +81,7 @@ def coordinates(survey: Survey) -> list[str]:
         f"{frame.heights[0].upper()}{frame.heights[1:]}: "
         + ("ellipsoidal heights, no geoid was applied." if is_ellipsoidal else "physical heights, by a geoid."),
         f"From WGS 84 by PROJ: {'; '.join(operation.steps)}; {accuracy_said}; {grids}.",
+        _north(frame),
         f"Epoch: {epoch(survey)}.",
         *([f"{frame.attribution[0].upper()}{frame.attribution[1:]}."] if frame.attribution else []),
     ]
@@ -96,13 +97,11 @@ def epoch(survey: Survey) -> str:
     return f"{times[0]:%Y-%m-%d}, {times[0].year + share:.2f}, when it was recorded"
 
 
-def north(survey: Survey) -> str:
-    """Directions of grid north and true north; empty in local coordinates."""
-    if not isinstance(survey.frame, Projection):
-        return ""
-    convergence, scale = survey.frame.convergence_and_scale
+def _north(projection: Projection) -> str:
+    """Directions of grid north and true north, and the scale."""
+    convergence, scale = projection.convergence_and_scale
     side = "east" if convergence > 0 else "west"
-    return f"N is grid north, {abs(convergence):.3f} deg {side} of true north; scale of the grid {scale:.6f}"
+    return f"N is grid north, {abs(convergence):.3f} deg {side} of true north; scale of the grid {scale:.6f}."
 
 
 def limits(survey: Survey) -> list[str]:
@@ -132,7 +131,7 @@ def making(survey: Survey) -> list[str]:
 def readme(survey: Survey, files: Mapping[str, str], notes: Sequence[str], command: str) -> str:
     """README.txt: files by name with what they are, and all of the above; notes : what is missing, and why."""
     sections: dict[str, Sequence[str]] = {
-        "Coordinates": [*coordinates(survey), *filter(None, [north(survey)])],
+        "Coordinates": coordinates(survey),
         "Accuracy": accuracy(survey),
         "Limits": [*limits(survey), *notes],
         "How it was made": [
