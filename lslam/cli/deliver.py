@@ -65,12 +65,12 @@ def command(run: Path, **given: Any) -> None:
         }
         show(json.dumps(document) + "\n")
         return
-    lines = [
-        f"{'delivered':<12} {made.folder}",
-        f"{'coordinates':<12} {survey.frame.frame}",
-        f"{'status':<12} {survey.status}",
+    rows = [
+        ("delivered", str(made.folder)),
+        ("coordinates", survey.frame.frame),
+        ("status", survey.status),
+        *made.files.items(),
     ]
-    lines += [f"{name:<12} {about}" for name, about in made.files.items()]
-    lines += [f"{'accuracy' if k == 0 else '':<12} {said}" for k, said in enumerate(made.accuracy)]
-    lines += [f"{'note':<12} {said}" for said in made.notes]
-    show("\n".join(lines) + "\n")
+    rows += [("accuracy" if k == 0 else "", said) for k, said in enumerate(made.accuracy)]
+    rows += [("note", said) for said in made.notes]
+    show("".join(f"{name:<14} {text}\n" for name, text in rows))

@@ -32,11 +32,12 @@ class SurveySheet:
     image : (H, W) grey map from above, None without one; extent : its x_min, x_max, y_min, y_max
     drives : positions (N, 2) and the status of each scan; points : (N, 2) by `used` and `kept out`
     axes : names of both; has_north : whether the second points to grid north
-    left, right : paragraphs by heading; foot : last line
+    warning : one clause that stands out, or none; left, right : paragraphs by heading; foot : last line
     """
 
     title: str
     subtitle: str
+    warning: str
     image: NDArray[np.uint8] | None
     extent: tuple[float, float, float, float]
     drives: Sequence[tuple[Floats, Sequence[str]]]
@@ -66,6 +67,8 @@ def survey_pdf(sheet: SurveySheet) -> bytes:
         figure = Figure(figsize=(_PAGE[0] * _MM, _PAGE[1] * _MM))
         figure.text(*_at(_MARGIN, 284), sheet.title, size=14, weight="bold", va="center", parse_math=False)
         figure.text(*_at(_MARGIN, 277.5), sheet.subtitle, size=8.5, va="center", parse_math=False)
+        said = figure.text(*_at(_PAGE[0] - _MARGIN, 277.5), sheet.warning, size=9, weight="bold", color=COLOURS[1])
+        said.set(ha="right", va="center")
         _draw_map(figure, sheet)
         _draw_column(figure, sheet.left, _MARGIN)
         _draw_column(figure, sheet.right, _PAGE[0] / 2 + 2)

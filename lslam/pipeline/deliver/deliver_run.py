@@ -186,7 +186,8 @@ def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, note
     is_local = survey.frame.epsg is None
     return SurveySheet(
         title=f"Survey of {survey.name}",
-        subtitle=f"{survey.frame.name}; status of the run: {survey.status}",
+        subtitle=survey.frame.frame,
+        warning="" if survey.status == "done" else f"the run is {survey.status}: see the limits",
         image=image,
         extent=extent,
         drives=[(survey.frame.apply(run.trajectory.positions)[:, :2], run.statuses) for run in survey.drives.values()],

@@ -24,6 +24,8 @@ from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results
 from lslam.pipeline.run_folder import MANIFEST, SESSIONS, require_run
 
 FINISHED = ("done", "degraded")
+# Surveys of one mark differ by less, two marks by more.
+SAME_MARK_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -198,8 +200,7 @@ def _checked(survey: Survey, projection: Projection, path: Path, used: SurveyedP
     places, residuals = np.stack([one.place for one in found]), np.stack([one.residual for one in found])
     checked = _points("kept out", names, stamps, places, residuals, projection)
     for name, place in zip(names, checked.places, strict=True):
-        # Half a centimetre: less is rounding, and no two marks lie so near.
-        if used is not None and (np.linalg.norm(used.places[:, :2] - place[:2], axis=1) < 0.005).any():
+        if used is not None and (np.linalg.norm(used.places[:, :2] - place[:2], axis=1) < SAME_MARK_M).any():
             raise UsageError(
                 f"--check: {name} is a control point that held the run: it checks nothing; leave it out of one file"
             )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.core.printable import counted, metres
+from lslam.core.printable import counted, fixed
 from lslam.core.version import __version__
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import Projection
@@ -50,13 +50,13 @@ def accuracy(survey: Survey) -> list[str]:
 
 
 def _pair(values: Any) -> str:
-    return f"{metres(float(values[0]))} m horizontally, {metres(float(values[1]))} m vertically"
+    return f"{fixed(float(values[0]), 3)} m horizontally, {fixed(float(values[1]), 3)} m vertically"
 
 
 def _fixes(survey: Survey) -> list[str]:
     """Sentence about satellite fixes, where a run has used some."""
     facts = survey.manifest.get("georeference", {})
-    if not facts.get("used"):
+    if not (facts.get("fixes") and facts.get("used")):
         return []
     how = "held the run" if facts["method"] == "graph" else "placed the finished trajectory"
     rms = [float(facts.get(name, "nan")) for name in ("rmse_horizontal", "rmse_vertical")]
