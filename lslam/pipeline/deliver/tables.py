@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -126,26 +127,19 @@ def _loops_layer(survey: Survey) -> list[GeoLayer]:
         {r.index: place for r, place in zip(results_of(run), survey.frame.apply(run.trajectory.positions), strict=True)}
         for run in drives
     ]
+    columns: dict[str, Any] = {}
     with input_errors(path, *MISFIT, as_what="a table of loops"), path.open(newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-        ends = [
-            [
-                places[int(np.searchsorted(firsts, int(row[f"keyframe_{end}"]), "right")) - 1][int(row[f"scan_{end}"])]
-                for end in "ab"
-            ]
-            for row in rows
-        ]
-        columns = {
-            **{name: [int(row[name]) for row in rows] for name in ("scan_a", "scan_b")},
-            "status": [row["verdict"] for row in rows],
-            **{
-                name: [float(row[name]) if row[name] else None for row in rows]
-                for name in ("distance_m", "rmse_m", "overlap")
-            },
-            "reason": [row["reason"] for row in rows],
+        sessions = {
+            end: np.searchsorted(firsts, [int(row[f"keyframe_{end}"]) for row in rows], "right") - 1 for end in "ab"
         }
-    return (
-        [GeoLayer("loops", "lines", [np.stack(pair) for pair in ends], columns, survey.frame.frame, _DRAWN["loops"])]
-        if rows
-        else []
-    )
+        for end in "ab":
+            columns[f"scan_{end}"] = [int(row[f"scan_{end}"]) for row in rows]
+        lines = [
+            np.stack([places[sessions[end][k]][columns[f"scan_{end}"][k]] for end in "ab"]) for k in range(len(rows))
+        ]
+        columns["status"] = [row["verdict"] for row in rows]
+        for name in ("distance_m", "rmse_m", "overlap"):
+            columns[name] = [float(row[name]) if row[name] else None for row in rows]
+        columns["reason"] = [row["reason"] for row in rows]
+    return [GeoLayer("loops", "lines", lines, columns, survey.frame.frame, _DRAWN["loops"])] if rows else []
