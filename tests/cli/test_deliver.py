@@ -430,7 +430,7 @@ def test_a_run_without_a_map_delivers_the_rest_and_says_it(tmp_path: Path) -> No
     out = delivered(run, tmp_path / "out")
     assert {path.name for path in out.iterdir()} == FILES - {"map.laz", "plan.tif"}
     for words in (text_of(out / "sheet.pdf")[1], flat(out / "README.txt")):
-        assert "There is no map, and no plan from above: the run was made without one." in words
+        assert "There is no map, and no plan from above: the run was made without one" in words
 
 
 @pytest.mark.parametrize("status", ["diverged", "interrupted", "running"])
@@ -442,6 +442,11 @@ def test_what_is_no_result_is_refused_and_marked_where_it_is_wanted_all_the_same
         assert is_in(
             f"The run is {status}: this is no finished result, and was delivered on request (--anyway).", words
         )
+
+
+def test_scans_at_no_known_place_are_not_delivered_unasked(tmp_path: Path) -> None:
+    run = made(tmp_path / "town", status="degraded", segments=[{"frame": 0}, {"frame": 1}])
+    refused(1, "scans of it lie in a frame of their own, at no known place", run.folder, "--out", tmp_path / "out")
 
 
 def test_a_merge_is_delivered_with_all_its_sessions(tmp_path: Path) -> None:

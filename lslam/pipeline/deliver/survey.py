@@ -111,10 +111,12 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
     """
     require_run(folder)
     manifest = read_json(folder / MANIFEST)
-    status = str(manifest.get("status", "unknown"))
-    if status not in FINISHED and not is_forced:
+    why = "" if (status := str(manifest.get("status", "unknown"))) in FINISHED else f"it is {status}"
+    if any(part.get("frame") for part in manifest.get("segments", ())):
+        why = why or "scans of it lie in a frame of their own, at no known place"
+    if why and not is_forced:
         raise RunFailedError(
-            f"{folder} is no result to hand over, it is {status}: run the sequence again, or take it as it is with --anyway"
+            f"{folder} is no result to hand over, {why}: run the sequence again, or take it as it is with --anyway"
         )
     drives = _drives(folder, manifest)
     first = next(iter(drives.values()))
