@@ -39,18 +39,6 @@ def utm_epsg(lat: float, lon: float) -> int:
 
 
 @dataclass(frozen=True)
-class Operation:
-    """A transformation between coordinate reference systems.
-
-    steps : names of PROJ's operations; accuracy : m, as PROJ states it, None where it states none; grids : files they use
-    """
-
-    steps: tuple[str, ...]
-    accuracy: float | None
-    grids: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class LocalFrame:
     """Coordinates of a run without a georeference, where a `Projection` is expected: they stay as they are.
 
@@ -130,13 +118,15 @@ class Projection:
         return "placed by buildings, © OpenStreetMap contributors, ODbL 1.0" if is_theirs else ""
 
     @property
-    def operation(self) -> Operation:
-        """Transformation from the WGS84 local frame, as PROJ describes it."""
+    def operation(self) -> str:
+        """Transformation from WGS 84 as PROJ describes it: its steps, stated accuracy, and grids."""
         parts = self._transformer.operations or ()
         steps = [part.name for part in parts if "unknown" not in part.name and "axis order" not in part.name]
         grids = [grid.short_name for part in parts for grid in part.grids]
+        grids += [Path(self.georeference.geoid).name] if self.georeference.geoid else []
         accuracy = float(self._transformer.accuracy)
-        return Operation(tuple(steps), accuracy if accuracy >= 0 else None, tuple(grids))
+        stated = f"stated accuracy {accuracy:g} m" if accuracy >= 0 else "no stated accuracy"
+        return "; ".join([*steps, stated, f"grids {', '.join(grids)}" if grids else "no grid"])
 
     @property
     def convergence_and_scale(self) -> tuple[float, float]:

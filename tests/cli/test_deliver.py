@@ -172,7 +172,7 @@ def text_of(pdf: Path) -> tuple[int, str]:
     streams = []
     for match in re.finditer(rb"stream\r?\n(.*?)\r?\nendstream", data, re.DOTALL):
         try:
-            streams.append(zlib.decompress(match.group(1)))
+            streams.append(zlib.decompressobj().decompress(match.group(1)))
         except zlib.error:
             continue
     shown = re.compile(rb"\((?:\\.|[^\\()])*\)\s*Tj|\[((?:\((?:\\.|[^\\()])*\)|[^\]()])*)\]\s*TJ")
@@ -235,6 +235,7 @@ def test_points_lie_where_pyproj_puts_them_with_all_that_the_map_has(tmp_path: P
     assert CRS.from_wkt(wkt.rstrip("\0")).is_projected
 
 
+@pytest.mark.quick
 def test_heights_are_above_the_geoid_and_never_silently_above_the_ellipsoid(
     run: MadeRun, geoid: Path, tmp_path: Path
 ) -> None:
@@ -265,6 +266,7 @@ def test_heights_are_above_the_geoid_and_never_silently_above_the_ellipsoid(
         assert "ellipsoidal heights, no geoid was applied" in words
 
 
+@pytest.mark.quick
 def test_the_table_has_each_pose_in_the_grid_with_its_sigmas_and_status(run: MadeRun, tmp_path: Path) -> None:
     out = delivered(run, tmp_path / "out")
     rows = rows_of(out / "trajectory.csv")
@@ -402,8 +404,16 @@ def _far(path: Path) -> Path:
 
 
 def test_a_run_without_a_place_is_delivered_in_its_own_coordinates_and_says_so(tmp_path: Path) -> None:
-    run = made(tmp_path / "town", is_placed=False)
+    problems = [
+        f"problem {k} of a kind that takes more than one line of a column, which has 68 letters" for k in range(30)
+    ]
+    run = made(tmp_path / "town", is_placed=False, status="degraded", problems=problems)
     out = delivered(run, tmp_path / "out")
+    # Of many problems the page has the first, and counts the others.
+    words = text_of(out / "sheet.pdf")[1]
+    (more,) = re.findall(r"and (\d+) more: see README.txt", words)
+    assert len(re.findall(r"problem \d+ of a kind", words)) == 30 - int(more) > 5
+    assert len(re.findall(r"problem \d+ of a kind", flat(out / "README.txt"))) == 30
     np.testing.assert_allclose(laspy.read(out / "map.laz").xyz, world_of(run.points), atol=2e-3)
     assert not [
         vlr for vlr in laspy.read(out / "map.laz").header.vlrs if type(vlr).__name__ == "WktCoordinateSystemVlr"
@@ -419,7 +429,7 @@ def test_a_run_without_a_place_is_delivered_in_its_own_coordinates_and_says_so(t
         assert "local coordinates" in words.lower()
         assert "easting" not in words
     assert "not georeferenced" in text_of(out / "sheet.pdf")[1]
-    for flag, value in (("--crs", "EPSG:25832"), ("--check", _far(tmp_path / "points.csv"))):
+    for flag, value in (("--crs", "EPSG:25832"), ("--geoid", "g.gtx"), ("--check", _far(tmp_path / "points.csv"))):
         said = rf"{flag}: .*town is not georeferenced.*--gnss.*--origin.*--control points.csv"
         refused(2, said, run.folder, "--out", tmp_path / "no", flag, value)
 

@@ -35,17 +35,11 @@ from lslam.pipeline.rebuild import map_of
 from lslam.reports.png import density_grey
 from lslam.reports.survey_sheet import SurveySheet, survey_pdf
 
-MAP, GPKG, PLAN, FLOOR, SHEET, README = (
-    "map.laz",
-    "survey.gpkg",
-    "plan.tif",
-    "floor_plan.tif",
-    "sheet.pdf",
-    "README.txt",
-)
+MAP, PLAN, FLOOR = "map.laz", "plan.tif", "floor_plan.tif"
+GPKG, SHEET, README = "survey.gpkg", "sheet.pdf", "README.txt"
 STEPS = 6
 _EMPTY = 255  # grey of a pixel without points
-_PIXEL_M, _LONGEST = 0.1, 4000
+_PIXEL_M, _LONGEST = 0.1, 2500
 _PAPER_M = 20.0  # around a trajectory without a map
 
 
@@ -92,9 +86,7 @@ def deliver(
         on_step()
         _write_floor_plan(made, survey, files)
         for name in write_trajectories(made, survey):
-            files[name] = (
-                "pose of the LiDAR at each scan with standard deviations and status; its head says what columns mean"
-            )
+            files[name] = "pose of the LiDAR at each scan, standard deviations, status; its head says what columns mean"
         on_step()
         layers = layers_of(survey)
         write_gpkg(made / GPKG, layers, survey.frame)
@@ -126,18 +118,13 @@ def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]
     own = georeference_of(note.get("georeference")) if note.get("crs") else None
     local = cloud if own is None else ProjectedCloud(cloud, Projection(own).invert)
     write_las(folder / MAP, ProjectedCloud(local, survey.frame.apply), survey.frame.wkt)
-    named = [
-        "intensity",
-        *(name for name in attributes if name != "time"),
-        *(["colour"] if "red" in cloud.column_types else []),
-    ]
+    named = ["intensity", *(name for name in attributes if name != "time")]
+    named += ["colour"] if "red" in cloud.column_types else []
     voxel = f"one in each voxel of {_voxel(survey):g} m" if _voxel(survey) else "every point of every scan"
     about = f"{counted(len(cloud), 'point')}, {voxel}; with {', '.join(named)}"
     if "time" in attributes:
         is_unix = is_unix_time(int(next(iter(survey.drives.values())).trajectory.stamps_ns[0]))
-        about += (
-            ", GPS time (adjusted standard)" if is_unix else ", time by the recording's own clock (marked as week time)"
-        )
+        about += ", GPS time (adjusted standard)" if is_unix else ", times by the recording's clock (as week time)"
     if survey.frame.attribution:
         about += f"; {survey.frame.attribution}"
     if "time" in attributes or survey.manifest.get("kind") == "merge":
@@ -177,9 +164,7 @@ def _write_floor_plan(folder: Path, survey: Survey, files: dict[str, str]) -> No
     corner, right, low = survey.frame.apply(np.array([[plan.x, y, z], [x, y, z], [plan.x, plan.y, z]]))[:, :2]
     transform = np.column_stack([(right - corner) / width, (low - corner) / height, corner])
     write_geotiff(folder / FLOOR, plan.image, transform, survey.frame.epsg, UNKNOWN)
-    files[FLOOR] = (
-        f"floor plan, GeoTIFF with pixels of {plan.resolution:.3g} m: black occupied, white free, else unknown"
-    )
+    files[FLOOR] = f"floor plan, GeoTIFF, pixels of {plan.resolution:.3g} m: black occupied, white free, else unknown"
 
 
 def _sheet(survey: Survey, image: NDArray[np.uint8] | None, extent: Extent, notes: list[str]) -> SurveySheet:

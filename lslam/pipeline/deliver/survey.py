@@ -14,6 +14,7 @@ from lslam.backend.control_points import control_residuals
 from lslam.backend.manual import read_control_points, require_instants
 from lslam.core.errors import InputError, RunFailedError, UsageError, input_errors
 from lslam.core.geometry import geodesy, noise, se3
+from lslam.core.printable import shown
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.core.untrusted import MISFIT
@@ -70,8 +71,8 @@ class Survey:
 
     @property
     def name(self) -> str:
-        """Names of the drives."""
-        return ", ".join(self.drives)
+        """Names of the drives, the first of many."""
+        return shown(list(self.drives))
 
     @property
     def status(self) -> str:
@@ -124,12 +125,14 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
         raise InputError(f"{folder} has a trajectory without a pose: run the sequence again")
     if first.georeference is None:
         if crs is not None or check is not None:
+            flag = "--check" if crs is None else "--geoid" if crs.epsg is None else "--crs"
             raise UsageError(
-                f"{'--check' if crs is None else '--crs'}: {folder} is not georeferenced: run the sequence with --gnss or "
+                f"{flag}: {folder} is not georeferenced: run the sequence with --gnss or "
                 "--georeference where it has satellite fixes, or with --osm MAP --origin LAT,LON, or give it points: lslam graph "
-                f"{folder} --control points.csv; without --crs it is delivered in local coordinates"
+                f"{folder} --control points.csv; without {flag} it is delivered in local coordinates"
             )
-        return Survey(folder, manifest, drives, LocalFrame(f"local coordinates, m: {_world(manifest)}"))
+        world = manifest.get("frames", {}).get("world", "LiDAR at the first scan")
+        return Survey(folder, manifest, drives, LocalFrame(f"local coordinates, m: {world}"))
     projection = Projection(in_crs(first.georeference, crs))
     projection.check()
     survey = Survey(folder, manifest, drives, projection)
@@ -138,10 +141,6 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
     if check is not None:
         points.append(_checked(survey, projection, check, used))
     return replace(survey, points=tuple(points))
-
-
-def _world(manifest: Mapping[str, Any]) -> str:
-    return str(manifest.get("frames", {}).get("world", "LiDAR at the first scan"))
 
 
 def _drives(folder: Path, manifest: Mapping[str, Any]) -> dict[str, EarlierRun]:
@@ -168,24 +167,19 @@ def _control(survey: Survey, projection: Projection) -> SurveyedPoints | None:
     path = survey.folder / "control.csv"
     if not path.is_file():
         return None
-    with (
-        input_errors(path, *MISFIT, as_what="a table of control points"),
-        path.open(newline="", encoding="utf-8") as stream,
-    ):
-        rows = list(csv.DictReader(stream))
+    with input_errors(path, *MISFIT, as_what="a table of control points"):
+        with path.open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
         if rows and "lat_deg" not in rows[0]:
             raise InputError(
                 f"{path} is of an earlier lslam and has no places: make it anew with lslam graph {survey.folder}"
             )
-        numbers = {
-            name: np.array([float(row[name]) for row in rows]) for name in (rows[0] if rows else ()) if name != "point"
-        }
         names, stamps = [row["point"] for row in rows], [int(row["stamp_ns"]) for row in rows]
-    if not rows:
-        return None
-    places = np.column_stack([numbers[name] for name in ("lat_deg", "lon_deg", "height_m")])
-    residuals = np.column_stack([numbers[name] for name in ("east_m", "north_m", "up_m")])
-    return _points("used", names, stamps, places, residuals, projection)
+        places, residuals = (
+            np.array([[float(row[column]) for column in columns] for row in rows])
+            for columns in (("lat_deg", "lon_deg", "height_m"), ("east_m", "north_m", "up_m"))
+        )
+    return _points("used", names, stamps, places, residuals, projection) if rows else None
 
 
 def _checked(survey: Survey, projection: Projection, path: Path, used: SurveyedPoints | None) -> SurveyedPoints:

@@ -33,9 +33,7 @@ def trajectory_text(survey: Survey, name: str) -> str:
     clock = "Unix time" if utc else "the clock of the recording, which is no Unix time"
     comments = [
         f"lslam {__version__}: trajectory of the LiDAR, {name}, {len(poses)} scans, a row each",
-        f"coordinates: m, {frame.frame}"
-        if is_local
-        else f"coordinates: m, {frame.name} ({frame.plane}); {frame.heights}",
+        f"coordinates: {frame.frame if is_local else f'm, {frame.name} ({frame.plane}); {frame.heights}'}",
         f"stamp_ns: ns, {clock}, of the {_pose_time(run)} of each scan",
         "roll_deg, pitch_deg, yaw_deg: R = Rz(yaw) Ry(pitch) Rx(roll) takes the sensor's axes (forward, left, up) to "
         f"{', '.join(about)}"
@@ -45,16 +43,9 @@ def trajectory_text(survey: Survey, name: str) -> str:
         "frame: lidar",
     ]
     sigmas = tuple(f"sigma_{axis}_m" for axis in axes) + tuple(f"sigma_about_{axis}_deg" for axis in about)
-    names = (
-        "scan",
-        "stamp_ns",
-        *(["utc"] if utc else []),
-        *(f"{axis}_m" for axis in axes),
-        "roll_deg",
-        "pitch_deg",
-        "yaw_deg",
-    )
-    lines = [*(f"# {line}" for line in comments), ",".join([*names, "qx", "qy", "qz", "qw", *sigmas, "status"])]
+    names = ["scan", "stamp_ns", *(["utc"] if utc else []), *(f"{axis}_m" for axis in axes)]
+    names += ["roll_deg", "pitch_deg", "yaw_deg", "qx", "qy", "qz", "qw", *sigmas, "status"]
+    lines = [*(f"# {line}" for line in comments), ",".join(names)]
     angles, turns = np.degrees(so3.euler_rpy(poses[:, :3, :3])), so3.to_quaternion(poses[:, :3, :3])
     spread = np.full((len(poses), 6), np.nan) if covariances is None else _sigmas(covariances)
     for k, result in enumerate(results_of(run)):

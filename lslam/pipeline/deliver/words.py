@@ -46,6 +46,8 @@ def accuracy(survey: Survey) -> list[str]:
             f"One standard deviation by the covariances, {precision_note(survey)}: {_pair(middle)} in the median, {_pair(worst)} "
             "at most. Systematic errors are not in it."
         )
+    else:
+        said.append("No covariances are known of these poses: nothing is said of their precision.")
     return said
 
 
@@ -71,16 +73,12 @@ def coordinates(survey: Survey) -> list[str]:
             f"Local coordinates, m, not georeferenced: {frame.frame.partition(': ')[2]}. x and y have no relation to north, "
             "heights none to any datum."
         ]
-    operation, is_ellipsoidal = frame.operation, "ellipsoid" in frame.heights
-    accuracy_said = "no stated accuracy" if operation.accuracy is None else f"stated accuracy {operation.accuracy:g} m"
-    grids = f"grids: {', '.join(operation.grids)}" if operation.grids else "no grid"
-    if frame.georeference.geoid:
-        grids += f"; heights by the grid {frame.georeference.geoid.rsplit('/', 1)[-1]}"
+    is_ellipsoidal = "ellipsoid" in frame.heights
+    kind = "ellipsoidal heights, no geoid was applied" if is_ellipsoidal else "physical heights, by a geoid"
     return [
         f"{frame.name}: {frame.plane}.",
-        f"{frame.heights[0].upper()}{frame.heights[1:]}: "
-        + ("ellipsoidal heights, no geoid was applied." if is_ellipsoidal else "physical heights, by a geoid."),
-        f"From WGS 84 by PROJ: {'; '.join(operation.steps)}; {accuracy_said}; {grids}.",
+        f"{frame.heights[0].upper()}{frame.heights[1:]}: {kind}.",
+        f"From WGS 84 by PROJ: {frame.operation}.",
         _north(frame),
         f"Epoch: {epoch(survey)}.",
         *([f"{frame.attribution[0].upper()}{frame.attribution[1:]}."] if frame.attribution else []),
@@ -108,10 +106,8 @@ def limits(survey: Survey) -> list[str]:
     """What a user of the data must know: how the run ended, and why."""
     if survey.status == "done":
         return ["The run ended as done.", *survey.problems]
-    warning = (
-        "" if survey.status in FINISHED else ": this is no finished result, and was delivered on request (--anyway)"
-    )
-    return [f"The run is {survey.status}{warning}.", *survey.problems]
+    warning = ": this is no finished result, and was delivered on request (--anyway)"
+    return [f"The run is {survey.status}{'' if survey.status in FINISHED else warning}.", *survey.problems]
 
 
 def making(survey: Survey) -> list[str]:
@@ -124,7 +120,7 @@ def making(survey: Survey) -> list[str]:
         f"Recording: {survey.name}; {counted(scans, 'scan')}, {registered} registered; {length:.1f} m of way.",
         f"Method: {run.config.odometry.method}, lslam {manifest.get('lslam', 'of unknown version')}; "
         f"{counted(int(manifest.get('graph', {}).get('loops', 0)), 'loop closure')}.",
-        f"Processed: {manifest.get('written', 'date unknown')}.",
+        *([f"Processed: {str(manifest['written'])[:10]}."] if "written" in manifest else []),
     ]
 
 
