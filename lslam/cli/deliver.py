@@ -60,17 +60,13 @@ def command(run: Path, **given: Any) -> None:
             "crs": None if survey.frame.epsg is None else survey.frame.name,
             "status": survey.status,
             "files": dict(made.files),
+            "points": {p.kind: {"count": len(p.names), "rms_m": p.rms, "largest_m": p.worst} for p in survey.points},
             "accuracy": made.accuracy,
             "notes": made.notes,
         }
         show(json.dumps(document) + "\n")
         return
-    rows = [
-        ("delivered", str(made.folder)),
-        ("coordinates", survey.frame.frame),
-        ("status", survey.status),
-        *made.files.items(),
-    ]
-    rows += [("accuracy" if k == 0 else "", said) for k, said in enumerate(made.accuracy)]
+    rows = [("delivered", str(made.folder)), ("coordinates", survey.frame.frame), ("status", survey.status)]
+    rows += [*made.files.items(), *(("accuracy" if k == 0 else "", said) for k, said in enumerate(made.accuracy))]
     rows += [("note", said) for said in made.notes]
     show("".join(f"{name:<14} {text}\n" for name, text in rows))

@@ -588,8 +588,11 @@ def test_json_and_what_a_map_lacks(run: MadeRun, tmp_path: Path) -> None:
     note = json.loads((bare.folder / "map.json").read_text())
     del note["attributes"]
     (bare.folder / "map.json").write_text(json.dumps(note))
-    done = lslam("deliver", bare.folder, "--out", tmp_path / "out", "--json")
+    check = point_file(tmp_path / "check.csv", run, (4, 15), np.array([0.03, 0.04, -0.12]))
+    done = lslam("deliver", bare.folder, "--out", tmp_path / "out", "--check", check, "--json")
     document = strict_json(done.stdout)
+    (points,) = document["points"].values()
+    assert (points["count"], points["rms_m"]) == (2, pytest.approx([0.05, 0.12], abs=3e-4))
     assert set(document["files"]) == FILES
     assert document["crs"] == "EPSG:25832"
     assert any("The points of the map have no times: `lslam map" in said for said in document["notes"])
