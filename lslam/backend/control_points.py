@@ -10,6 +10,7 @@ import numpy as np
 
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
 from lslam.backend.graph.consistency import Drift, judge_loops
+from lslam.backend.graph.gnss_alignment import refined
 from lslam.backend.graph.odometry_constraints import odometry_constraints
 from lslam.backend.graph.pose_graph import from_held
 from lslam.backend.graph.problem import PoseGraph, PositionFix
@@ -66,9 +67,10 @@ def with_control(
                 problem=f"control points: from {counted(len(points), 'place')} nobody can say which way the run goes; it "
                 "takes two that lie apart",
             )
+        tilt = LEVELLED if up is not None else UNLEVELLED
+        T = refined(T, own @ level.T, enu, sigmas, tilt)  # a slope under the first scan is no drift of odometry
         T_enu_world = T @ se3.make(level, np.zeros(3))
         reference = _in_crs(Georeference(on_earth[0], T_enu_world, method="control"), points, config)
-        tilt = UNLEVELLED if up is None else LEVELLED
     else:
         enu, tilt = geodesy.to_local(on_earth, reference.origin), placement.tilt_sigma
         reference = reference if reference.epsg else _in_crs(reference, points, config)

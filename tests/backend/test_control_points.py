@@ -60,6 +60,21 @@ def test_exact_points_give_the_exact_place_and_factors_without_a_residual(seen: 
     assert contradicting(left, 0.999) == []
 
 
+@pytest.mark.parametrize("tilt_deg", [1.5, -6.0])
+def test_a_slope_under_the_first_scan_is_found_by_four_points(tilt_deg: float) -> None:
+    """Without an IMU nothing says what is up: taken for level, the drive would have to be bent to pass the points."""
+    T = TRUE.T_enu_world @ se3.make(so3.exp(np.deg2rad([0.3 * tilt_deg, tilt_deg, 0.0])), np.zeros(3))
+    sloped = replace(TRUE, T_enu_world=T)
+    places = Projection(sloped).apply(POSES[:, :3, 3])
+    points = [
+        replace(point, position=places[k]) for point, k in zip(surveyed((0, 21, 40, 60)), (0, 21, 40, 60), strict=True)
+    ]
+    placed = with_control(Placement(), points, RESULTS, KEYFRAMES, None, Config())
+    assert placed.georeference is not None
+    # 5 mm: up has a prior of 10 deg, and the points one of 2 cm.
+    np.testing.assert_allclose(Projection(placed.georeference).apply(POSES[:, :3, 3]), places, atol=5e-3)
+
+
 def test_a_point_of_the_wrong_scan_is_named_with_its_line() -> None:
     points = surveyed((0, 20, 40, 60))
     wrong = [*points[:2], replace(points[2], at=Instant("line 4", scan=44)), points[3]]
