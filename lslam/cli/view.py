@@ -1,43 +1,66 @@
-"""`lslam view`: a run as a recording for the rerun viewer."""
+"""`lslam view`: a run in the browser, served on this machine, or as a recording for the rerun viewer."""
 
 from __future__ import annotations
 
+import signal
+import threading
+import webbrowser
 from pathlib import Path
 
 import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
+from lslam.core.errors import UsageError
 from lslam.core.extras import install_command
 
-HELP = f"""Write trajectory, odometry before the pose graph, and map of a run as a recording for the rerun viewer.
+HELP = f"""Show a run in the browser: its report with all points of the map, and loops and points to correct.
+
+The page is served to this machine alone, at an address that nobody else knows, until Ctrl-C. What is corrected there goes into
+edits.csv and points.csv of the run folder, and the graph that is made with them into a new folder beside it.
 
 \b
-It needs rerun: {install_command("view")}
+--rerun writes a recording for the rerun viewer instead, which it needs: {install_command("view")}
 """
 EPILOG = """\b
 Examples:
   lslam view runs/first
-  rerun runs/first/run.rrd
+  lslam view runs/first --no-browser --port 8123
+  lslam view runs/first --rerun run.rrd
 """
 
 
 @click.command(help=HELP, epilog=EPILOG)
 @click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="Recording  [RUN/run.rrd].")
+@click.option("--port", type=click.IntRange(0, 65535), metavar="N", help="Port of the server  [any that is free].")
+@click.option("--no-browser", is_flag=True, help="Print the address, and open no browser.")
+@click.option("--rerun", type=click.Path(path_type=Path), metavar="FILE", help="Write a recording for rerun, and end.")
 @click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
 @options.verbosity
-def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: bool) -> None:
-    """Write the recording; what users read is HELP."""
+def command(
+    run: Path, port: int | None, no_browser: bool, rerun: Path | None, overwrite: bool, verbose: bool, quiet: bool
+) -> None:
+    """Serve the run or write the recording; what users read is HELP."""
     setup_logging(verbose, quiet)
+    if rerun is not None:
+        if port is not None or no_browser:
+            raise UsageError("--port and --no-browser are of the server, which --rerun does without: leave them out")
+        record(run, rerun, overwrite)
+        return
+    if overwrite:
+        raise UsageError("--overwrite is of a recording: give --rerun FILE, or leave it out")
+    serve(run, port or 0, not no_browser)
+
+
+def record(run: Path, path: Path, overwrite: bool) -> None:
+    """Write the recording."""
     from lslam.core.errors import OutputError, OutputExistsError
     from lslam.pipeline.run_folder import require_run
     from lslam.reports.recording import require_rerun, write_recording
 
     require_rerun()
-    path = run / "run.rrd" if out is None else out
     if path.exists() and not overwrite:
-        raise OutputExistsError(f"{path} exists; name another file with --out or replace it with --overwrite")
+        raise OutputExistsError(f"{path} exists; name another file with --rerun or replace it with --overwrite")
     require_run(run)
     from lslam.pipeline.rebuild import viewed_run
 
@@ -46,3 +69,37 @@ def command(run: Path, out: Path | None, overwrite: bool, verbose: bool, quiet: 
         raise OutputError(f"{path} cannot be written: the folder {path.parent} does not exist")
     write_recording(path, viewed)
     show(f"{path}\n")
+
+
+def serve(run: Path, port: int, opens: bool) -> None:
+    """Serve the run until a signal ends it."""
+    from lslam.core.stopping import current
+    from lslam.pipeline.run_folder import require_run
+
+    require_run(run)
+    from lslam.pipeline.view.page import require_page
+    from lslam.pipeline.view.server import RunServer
+    from lslam.pipeline.view.sites import ViewedSites
+
+    require_page(run)
+    stop = current()
+    # The server ends with its terminal, unless nohup says otherwise.
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_DFL:
+        signal.signal(signal.SIGHUP, stop.on_signal)
+    stop.is_gentle = True
+    with RunServer(port) as server:
+        sites = ViewedSites(server)
+        sites.add(run)
+        worker = threading.Thread(target=server.serve_forever, name="lslam-view", daemon=True)
+        worker.start()
+        try:
+            show(f"{server.url}\n")
+            if opens:
+                webbrowser.open(server.url)
+            while not stop():
+                worker.join(0.2)
+        finally:
+            server.shutdown()
+            sites.stop()
+    stop.is_gentle = False
+    stop.check()

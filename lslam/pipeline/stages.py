@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.loops.pair_view import view_pairs
 from lslam.backend.outcome import BackEnd, view_loop
 from lslam.core.config import Config, load_config
 from lslam.core.errors import (
@@ -64,6 +65,7 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
     done = refine_poses(job, record, done)
     level_world(record, job.sequence, job.config, job.manifest)
     record.loop_view = view_loop(record, done, job.store)
+    record.pair_views = view_pairs(record, job.store, job.config.keyframes.submap_size)
     return done
 
 

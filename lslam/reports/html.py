@@ -18,6 +18,7 @@ from lslam.io.formats.atomic import atomic_write
 from lslam.reports import plots, svg
 from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.reports.buildings import building_pages
+from lslam.reports.candidates import candidate_data
 from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.page_data import MapFigure, cloud_data, feature_figures, map_figure, scan_data
 from lslam.reports.plots import Figure
@@ -147,6 +148,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         record=record,
         facts=facts,
         scan_data=scan_data(record, evaluation),
+        candidate_data=candidate_data(record),
         cards=_cards(facts, evaluation),
         failures=facts.failures[:MOST_ROWS],
         degenerate=facts.degenerate[:MOST_ROWS],

@@ -31,7 +31,9 @@ class Script:
 
 def render(name: str, script: str = CHARTS, **shown: Any) -> str:
     """Page of this package: the template `name`, which extends the shell, with the module `script` inserted."""
-    return template(name).render(version=__version__, script=_script(script), **shown)
+    return template(name).render(
+        version=__version__, script=script_of(script), policy=policy(script_of(script)), **shown
+    )
 
 
 def template(name: str) -> Template:
@@ -40,10 +42,16 @@ def template(name: str) -> Template:
 
 
 @cache
-def _script(entry: str) -> Script:
+def script_of(entry: str) -> Script:
+    """The script of a page that starts with the module `entry`."""
     text = '\n"use strict";\n' + "\n".join(bundled(entry).values())
     digest = base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
     return Script(text, f"sha256-{digest}")
+
+
+def policy(script: Script) -> str:
+    """Content security policy of a page: nothing is loaded, and no other script runs."""
+    return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src '{script.digest}'"
 
 
 def bundled(entry: str) -> dict[str, str]:

@@ -87,6 +87,14 @@ class LoopCandidate:
         """Whether its constraint holds the poses."""
         return self.verdict == Verdict.ACCEPTED
 
+    @property
+    def doubt(self) -> float:
+        """How much a person should look at it, 0 to 1: accepted with little overlap, or rejected late."""
+        if self.is_accepted:
+            return 0.0 if self.stage == LoopStage.MANUAL else 1.0 - float(np.nan_to_num(self.overlap))
+        stages = list(LoopStage)
+        return stages.index(self.stage) / len(stages)
+
 
 @dataclass(frozen=True)
 class Instant:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.building import CorrectedMap, OsmMatches
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import LoopCandidate, MapFix, Turn
@@ -98,6 +98,21 @@ class LoopView:
 
 
 @dataclass(frozen=True)
+class PairView:
+    """The surroundings of the two keyframes of a loop candidate, for people to lay on each other.
+
+    a : (N, 3) m, of the older one, from its place in level axes; b : (M, 3) m, of the newer one in its LiDAR frame
+    before, after : (4, 4) that take b to a, by odometry and by the registration of both; `after` is None where that failed
+    """
+
+    candidate: LoopCandidate
+    a: Points
+    b: Points
+    before: Floats
+    after: Floats | None
+
+
+@dataclass(frozen=True)
 class FeatureView:
     """What a feature method works on.
 
@@ -140,7 +155,7 @@ class RunRecord:
         of that map, where they really stand
     loops : candidates with verdicts, between keyframes; keyframe_scans : (K,) position of each one's scan in `results`
     back_end_seconds : by the number of its scan, what each stage after odometry took a keyframe, s; the whole graph with the last
-    loop_view : the map at the loop that was corrected most, None without one
+    loop_view : the map at the loop that was corrected most, None without one; pair_views : the most doubtful loop candidates
     features : what a feature method saw, None of another
     map_fixes : each scan against the map that the run was located in, empty without one; map_origin : (3,) m, what the
         coordinates of that map are less in this world
@@ -175,6 +190,7 @@ class RunRecord:
     back_end_seconds: dict[int, dict[str, float]] = field(default_factory=dict)
     georeference: Georeference | None = None
     loop_view: LoopView | None = None
+    pair_views: list[PairView] = field(default_factory=list)
     features: FeatureView | None = None
     imu: ImuStream | None = None
     osm: OsmMatches | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +45,14 @@ class _Element:
     properties: list[tuple[str, str]]  # name, numpy code; code "list" for lists
 
 
-def ply_columns(path: Path) -> dict[str, NDArray[Any]]:
-    """The vertices of a PLY file by property, without faces behind them. Raises InputError naming the file and the line."""
-    with input_errors(path):
-        data = path.read_bytes()
+def ply_columns(path: Path, data: bytes | mmap | None = None) -> dict[str, NDArray[Any]]:
+    """The vertices of a PLY file by property, without faces behind them. Raises InputError naming the file and the line.
+
+    data : its content where that is known; columns of a binary file that is mapped are mapped, too
+    """
+    if data is None:
+        with input_errors(path):
+            data = path.read_bytes()
     encoding, elements, size = _read_header(path, data)
     order = _ORDERS[encoding]
     body = memoryview(data)[size:]
@@ -115,8 +120,8 @@ def ply_header(count: int, kind: np.dtype[Any], comment: str = "") -> bytes:
     )
 
 
-def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
-    if not data.startswith((b"ply\n", b"ply\r")):
+def _read_header(path: Path, data: bytes | mmap) -> tuple[str, list[_Element], int]:
+    if data[:4] not in (b"ply\n", b"ply\r"):
         raise InputError(f"{path}: no PLY file, its first line is not 'ply'")
     encoding, elements, position, number = "", list[_Element](), 0, 0
     while True:

@@ -1,0 +1,190 @@
+"""What a person says of a run on its page: pairs of scans and control points, in two files that `lslam graph` reads."""
+
+from __future__ import annotations
+
+import csv
+import io
+import threading
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from lslam.backend.keyframes.store import KeyframeStore
+from lslam.backend.keyframes.submaps import mounted_up
+from lslam.backend.loops.find_loops import verify_known
+from lslam.backend.loops.pair_view import view_pair
+from lslam.backend.manual import keyframe_pairs, read_control_points, read_named_pairs, stamp_of
+from lslam.core.errors import InputError, UsageError
+from lslam.core.geometry.crs_names import crs_name, parse_crs
+from lslam.core.types.constraint import Instant, NamedPair
+from lslam.core.types.scan_result import ScanResult
+from lslam.io.formats.atomic import write_text
+from lslam.pipeline.rebuild import read_run, results_of
+from lslam.pipeline.run_folder import KEYFRAMES
+from lslam.reports.candidates import judgement, pair_data
+
+EDITS, POINTS = "edits.csv", "points.csv"
+SHOWN = 12_000  # points of a scan's surroundings on the page, at most
+
+
+class Pair(BaseModel):
+    """A row of edits.csv."""
+
+    model_config = ConfigDict(extra="forbid")
+    scan_a: int = Field(ge=0)
+    scan_b: int = Field(ge=0)
+    verdict: Literal["known", "forbidden"]
+    x_m: FiniteFloat = 0.0
+    y_m: FiniteFloat = 0.0
+    within_m: FiniteFloat | None = Field(None, gt=0)
+
+
+class Point(BaseModel):
+    """A row of points.csv."""
+
+    model_config = ConfigDict(extra="forbid")
+    scan: int = Field(ge=0)
+    x: FiniteFloat
+    y: FiniteFloat
+    z: FiniteFloat
+    sigma: FiniteFloat = Field(gt=0)
+    crs: str
+    sigma_z: FiniteFloat | None = Field(None, gt=0)
+    lidar_x: FiniteFloat = 0.0
+    lidar_y: FiniteFloat = 0.0
+    lidar_z: FiniteFloat = 0.0
+
+
+class Edits(BaseModel):
+    """All of it."""
+
+    model_config = ConfigDict(extra="forbid")
+    pairs: list[Pair] = Field(max_length=5000)
+    points: list[Point] = Field(max_length=5000)
+
+
+class Corrections:
+    """The corrections of a run, and what its scans look like on each other.
+
+    Raises InputError for a run that cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.run = read_run(folder)
+        self._results = results_of(self.run)
+        self._lock = threading.Lock()
+
+    @cached_property
+    def _store(self) -> KeyframeStore:
+        store = KeyframeStore(self.folder / KEYFRAMES)
+        if not len(store):
+            raise InputError(f"{self.folder} kept no keyframes: run the sequence again, with its loops")
+        return store
+
+    def edits(self, words: object = None) -> dict[str, Any]:
+        """What was said before: the files of the run folder, else those that its graph was made with."""
+        config, pairs, points = self.run.config, [], []
+        if path := self._before(EDITS, config.loops.file):
+            for pair in read_named_pairs(path):
+                scans = {"scan_a": self._scan(pair.first), "scan_b": self._scan(pair.second)}
+                place = dict(zip(("x_m", "y_m"), pair.place.tolist(), strict=True))
+                pairs.append(Pair(**scans, **place, verdict=pair.verdict, within_m=pair.within))
+        if path := self._before(POINTS, config.graph.control):
+            for point in read_control_points(path):
+                values = dict(zip("xyz", point.position.tolist(), strict=True))
+                seen = dict(zip(("lidar_x", "lidar_y", "lidar_z"), point.seen.tolist(), strict=True))
+                crs, sigmas = crs_name(point.epsg, point.height_epsg), point.sigma.tolist()
+                spread = {"sigma": sigmas[0], "sigma_z": sigmas[2] if sigmas[2] != sigmas[0] else None}
+                points.append(Point(scan=self._scan(point.at), crs=crs, **values, **spread, **seen))
+        return Edits(pairs=pairs, points=points).model_dump()
+
+    def save(self, document: Any) -> dict[str, Any]:
+        """Write both files, and remove one without rows. Raises UsageError for what they cannot hold, OutputError."""
+        try:
+            edits = Edits.model_validate(document)
+            for point in edits.points:
+                parse_crs(point.crs)
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise UsageError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        known = {result.index for result in self._results}
+        for scan in [*(n for pair in edits.pairs for n in (pair.scan_a, pair.scan_b)), *(p.scan for p in edits.points)]:
+            if scan not in known:
+                raise UsageError(f"scan {scan} is none of the run's, which are {min(known)} to {max(known)}")
+        with self._lock:
+            _write(self.folder / EDITS, Pair, edits.pairs)
+            _write(self.folder / POINTS, Point, edits.points)
+        return {"pairs": len(edits.pairs), "points": len(edits.points)}
+
+    def arguments(self) -> list[str]:
+        """Of `lslam graph`, for the files that are there. Raises UsageError without any."""
+        flags = {"--loops": self.folder / EDITS, "--control": self.folder / POINTS}
+        words = [word for flag, path in flags.items() if path.is_file() for word in (flag, str(path))]
+        if not words:
+            raise UsageError("nothing was corrected: say known or forbidden of a pair, or give a point its coordinates")
+        return words
+
+    def pair(self, words: Mapping[str, str]) -> dict[str, Any]:
+        """Two scans on each other, by the words `a` and `b`, their numbers: registered as `lslam graph` registers a known pair.
+
+        Raises UsageError where they are none of the run's, or lie at one keyframe.
+        """
+        numbers = [self._result(words.get(name, "")).index for name in "ab"]
+        older, newer = (Instant(f"scan {number}", scan=number) for number in numbers)
+        named = NamedPair(older, newer, "known")
+        store, config = self._store, self.run.config
+        with self._lock:  # one at a time: each takes a core
+            found = keyframe_pairs([named], self._results, store.keyframes)
+            if not found.known:
+                raise UsageError(
+                    f"scans {numbers[0]} and {numbers[1]} belong to one keyframe: choose two that lie apart"
+                )
+            known = found.known[0]
+            poses = np.stack([k.T_world_lidar for k in store.keyframes])
+            size = config.keyframes.submap_size
+            up = mounted_up(store, poses, config.preprocess)
+            (candidate,) = verify_known(store, [known], config.loops, config.registration, size, up=up)
+            at = {result.stamp_ns: k for k, result in enumerate(self._results)}
+            scans = [at[store.keyframes[k].stamp_ns] for k in (known.a, known.b)]
+            T = self.run.trajectory.poses[scans[0]]
+            view = view_pair(store, candidate, T, size, SHOWN)
+        return {**pair_data(view), "scans": [self._results[k].index for k in scans], **judgement(candidate)}
+
+    def _before(self, name: str, configured: str) -> Path | None:
+        path = self.folder / name
+        if path.is_file():
+            return path
+        return Path(configured) if configured and Path(configured).is_file() else None
+
+    def _scan(self, instant: Instant) -> int:
+        """The number of the scan nearest to an instant. Raises InputError for one that the run does not have."""
+        if instant.scan is not None:
+            return self._result(str(instant.scan)).index
+        stamps = np.array([result.stamp_ns for result in self._results])
+        return self._results[int(np.abs(stamps - stamp_of(instant, self._results)).argmin())].index
+
+    def _result(self, text: str) -> ScanResult:
+        known = {str(result.index): result for result in self._results}
+        if text not in known:
+            raise UsageError(f"scan {text or '?'} is none of the run's, which are {min(known)} to {max(known)}")
+        return known[text]
+
+
+def _write(path: Path, kind: type[BaseModel], rows: Sequence[BaseModel]) -> None:
+    """Write the rows as CSV, with columns that may be empty only where one of them is not; no rows are no file."""
+    if not rows:
+        path.unlink(missing_ok=True)
+        return
+    names = [name for name, about in kind.model_fields.items() if about.is_required()]
+    if any(set(row.model_dump(exclude_defaults=True)) - set(names) for row in rows):
+        names = list(kind.model_fields)
+    text = io.StringIO()
+    table = csv.DictWriter(text, names, extrasaction="ignore", lineterminator="\n")
+    table.writeheader()
+    table.writerows(row.model_dump() for row in rows)
+    write_text(path, text.getvalue())

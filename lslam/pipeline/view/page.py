@@ -1,0 +1,55 @@
+"""The page that is served: the run's report, which may talk to the server where its script is this version's."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+from lslam.core.errors import InputError, input_errors
+from lslam.pipeline.view.server import Answer
+from lslam.reports.shell import RUN, policy, script_of
+
+log = logging.getLogger("lslam")
+REPORT = "report.html"
+TALKS = "connect-src 'self'"
+
+
+def page_of(folder: Path, number: int) -> Answer:
+    """The report of the run that is the server's `number`.
+
+    A page of another version, or whoever wrote it, is shown by itself: its script reaches nothing here.
+    Raises InputError when it cannot be read.
+    """
+    with input_errors(folder / REPORT):
+        text = (folder / REPORT).read_text(encoding="utf-8")
+    if not is_ours(text):
+        return _page(text, "sandbox allow-scripts allow-downloads")
+    own = policy(script_of(RUN))
+    served = json.dumps({"number": number, "name": folder.name}).replace("<", "\\u003c")
+    text = text.replace(own, f"{own}; {TALKS}", 1)
+    text = text.replace("<main>", f'<script type="application/json" id="served">{served}</script>\n<main>', 1)
+    return _page(text, f"{own}; {TALKS}")
+
+
+def is_ours(text: str) -> bool:
+    """Whether a page has the script of this version."""
+    return policy(script_of(RUN)) in text
+
+
+def require_page(folder: Path) -> None:
+    """Raise InputError where a run has no report; say so where it is of another version."""
+    if not (folder / REPORT).is_file():
+        raise InputError(f"{folder} has no {REPORT}: make one with lslam graph {folder}")
+    with input_errors(folder / REPORT):
+        text = (folder / REPORT).read_text(encoding="utf-8", errors="replace")
+    if not is_ours(text):
+        log.warning(
+            "%s is of another version of lslam: it is shown without tiles and corrections; lslam graph %s makes a new one",
+            folder / REPORT,
+            folder,
+        )
+
+
+def _page(text: str, rules: str) -> Answer:
+    return Answer("text/html; charset=utf-8", text.encode(), headers=(("Content-Security-Policy", rules),))
