@@ -23,7 +23,7 @@ from lslam.reports.facts import RunFacts, run_facts
 from lslam.reports.page_data import MapFigure, cloud_data, feature_figures, map_figure, scan_data
 from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
-from lslam.reports.shell import MAP, render, template
+from lslam.reports.shell import RUN, render, template
 from lslam.reports.svg import Track
 from lslam.reports.text import imu_rows, localization_rows
 
@@ -144,7 +144,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
     facts = run_facts(record)
     return render(
         "report.html.j2",
-        MAP,
+        RUN,
         record=record,
         facts=facts,
         scan_data=scan_data(record, evaluation),

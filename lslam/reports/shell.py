@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment, Template
 
 # Modules of `scripts` that a page starts with.
-CHARTS, MAP = "chart_page.mjs", "map_page.mjs"
+CHARTS, MAP, RUN = "chart_page.mjs", "map_page.mjs", "run_page.mjs"
 _IMPORT = re.compile(r'^import (?:[^"]* from )?"\./([^"]+)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async function|class|const|function|let)\b)", re.MULTILINE)
 

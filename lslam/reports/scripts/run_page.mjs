@@ -1,0 +1,3 @@
+// The script of a run's page.
+import "./map_page.mjs";
+import "./corrections.mjs";
