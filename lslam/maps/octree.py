@@ -34,7 +34,7 @@ def write_octree(
 ) -> dict[str, Any]:
     """Write the nodes of the finite points of a cloud one after the other, and return the index.
 
-    Of a node of n points: int16 (n, 3), coordinates in steps of the cube's edge / 65535, less 32768; then the bytes of each column.
+    Of a node of n points: int16 (n, 3), coordinates in steps of its edge / 65535, less 32768; then the bytes of each column.
 
     spool : folder for the points of nodes that do not fit into memory; shades : intensities that become 0 and 255
     on_share : called with the share that is written, 0 to 1; it may raise to stop

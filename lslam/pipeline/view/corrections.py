@@ -6,6 +6,7 @@ import csv
 import io
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ from lslam.core.geometry.crs_names import crs_name, parse_crs
 from lslam.core.types.constraint import Instant, NamedPair
 from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.atomic import write_text
+from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.pipeline.rebuild import read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES
 from lslam.reports.candidates import judgement, pair_data
@@ -84,6 +86,13 @@ class Corrections:
         store = KeyframeStore(self.folder / KEYFRAMES)
         if not len(store):
             raise InputError(f"{self.folder} kept no keyframes: run the sequence again, with its loops")
+        path = self.folder / "trajectory_odometry.tum"
+        if path.is_file():  # where the loops were looked for
+            odometry = read_trajectory(path, "tum")
+            poses = dict(zip(odometry.stamps_ns.tolist(), odometry.poses, strict=True))
+            store.keyframes = [
+                replace(k, T_world_lidar=poses.get(k.stamp_ns, k.T_world_lidar)) for k in store.keyframes
+            ]
         return store
 
     def edits(self, words: object = None) -> dict[str, Any]:

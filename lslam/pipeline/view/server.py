@@ -224,7 +224,7 @@ def _file(folder: Path, path: str) -> Answer:
         is_ours = (
             not path.startswith("/") and ".." not in path.split("/") and file.is_relative_to(root) and file.is_file()
         )
-    except (OSError, ValueError):  # a NUL, a loop of links
+    except (OSError, ValueError, RuntimeError):  # a NUL, a loop of links
         is_ours = False
     if not is_ours:
         raise RefusedError(HTTPStatus.NOT_FOUND)
