@@ -33,7 +33,7 @@ COMMANDS = {
     "info": "Show the contents and the faults of a sequence.",
     "map": "Build a run's map anew with other settings, or score a map.",
     "plot": "Draw one figure of a run, for a paper.",
-    "view": "Write a run as a recording for the rerun viewer.",
+    "view": "Show a run in the browser, and correct its loops there.",
     "methods": "List the odometry methods.",
     "config": "Show or check a configuration.",
     "completion": "Print the completion script of a shell.",

@@ -1,4 +1,4 @@
-"""`lslam view`: what is shown of a run, and what is said where rerun is missing. rerun itself is too large for tests."""
+"""`lslam view --rerun`: what is shown of a run, and what is said where rerun is missing. rerun itself is too large for tests."""
 
 from __future__ import annotations
 
@@ -95,23 +95,24 @@ def rerun(monkeypatch: pytest.MonkeyPatch) -> type[Stream]:
 def test_a_recording_holds_ways_map_and_every_pose(
     run: Path, rerun: type[Stream], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cli(["view", str(run), "-q"], standalone_mode=False)
+    words = ["view", str(run), "--rerun", str(run / "run.rrd")]
+    cli([*words, "-q"], standalone_mode=False)
     assert capsys.readouterr().out == f"{run / 'run.rrd'}\n"
     assert {"world/trajectory", "world/odometry", "world/map"} <= set(rerun.last.logged)
     assert rerun.last.times == [np.datetime64(k * 10**8, "ns") for k in range(5)]
     assert not list(run.glob("*.part"))
     with pytest.raises(OutputExistsError, match="--overwrite"):
-        cli(["view", str(run)], standalone_mode=False)
+        cli(words, standalone_mode=False)
     with pytest.raises(OutputError, match="does not exist"):
-        cli(["view", str(run), "--out", str(run / "none" / "a.rrd")], standalone_mode=False)
+        cli(["view", str(run), "--rerun", str(run / "none" / "a.rrd")], standalone_mode=False)
     with pytest.raises(InputError, match="no folder of a run"):
-        cli(["view", str(run / "none")], standalone_mode=False)
+        cli(["view", str(run / "none"), "--rerun", str(run / "b.rrd")], standalone_mode=False)
 
 
 def test_without_rerun_the_way_out_is_said(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(InputError, match=r"rerun cannot be imported: .*pip install .*\[view\]") as caught:
-        cli(["view", str(run)], standalone_mode=False)
+        cli(["view", str(run), "--rerun", str(run / "run.rrd")], standalone_mode=False)
     assert caught.value.exit_code == 3
     assert not (run / "run.rrd").exists()
 

@@ -22,6 +22,7 @@ class GraphJob:
     def __init__(self, run: Path, words: list[str]) -> None:
         self.out = next_folder(run)
         command = [sys.executable, "-m", "lslam", "graph", str(run), *words, "--out", str(self.out)]
+        self._is_asked = False
         self._said: deque[str] = deque(maxlen=SAID)
         try:
             self._child = subprocess.Popen(
@@ -48,12 +49,14 @@ class GraphJob:
         code = self._child.poll()
         if code is not None:
             self._reader.join(PATIENCE_S)
-        word = "running" if code is None else {0: "done", 130: "stopped"}.get(code, "failed")
+        # Asked before it heeds signals, it dies of one.
+        word = "running" if code is None else "done" if code == 0 else "stopped" if self._is_asked else "failed"
         return {"state": word, "out": self.out.name, "said": list(self._said)}
 
     def stop(self) -> None:
         """Ask it to stop as Ctrl-C does, and end it where it does not."""
         if self.is_running:
+            self._is_asked = True
             self._child.terminate()
             try:
                 self._child.wait(PATIENCE_S)

@@ -174,7 +174,8 @@ class Corrections {
       throw error;
     });
     if (this.chosen !== one) return;
-    const told = pair.verdict === "accepted" ? `as a known pair they close a loop, rmse ${fixed(pair.rmse, 2)} m, overlap ${fixed(100 * pair.overlap, 0)} %` : `as a known pair they close no loop: ${pair.reason}`;
+    const fits = `as a known pair they close a loop, rmse ${fixed(pair.rmse, 2)} m, overlap ${fixed(100 * pair.overlap, 0)} %`;
+    const told = pair.verdict === "accepted" ? fits : `as a known pair they close no loop${pair.reason === one.reason ? " either" : `: ${pair.reason}`}`;
     this.show(pair, [...said, told].join("; "), pair.scans);
   }
 
