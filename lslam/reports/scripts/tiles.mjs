@@ -1,0 +1,110 @@
+// More points of the map from the server: nodes of its octree, as fine as the view needs them.
+import { BY, colourings } from "./colours.mjs";
+import { nodeOf, nodesFor } from "./octree.mjs";
+import { scans } from "./scans.mjs";
+import { ask, served } from "./served.mjs";
+import { mapView } from "./view.mjs";
+
+const BUDGET = 1_500_000; // points that are drawn
+const HELD = 2 * BUDGET; // points that are kept for when they are seen again
+const FINEST = 1.2; // px between points that are near enough
+const AT_ONCE = 4; // nodes that are asked for
+const ASKED_MS = 1500; // between two questions of how far the octree is
+
+export class Tiles {
+  constructor(view) {
+    [this.view, this.tree, this.held, this.asked] = [view, null, new Map(), new Set()];
+    this.said = document.createElement("span");
+    this.said.className = "tiles-said";
+    view.figure.querySelector("figcaption").append(" ", this.said);
+    view.painters.push(() => this.look());
+    this.begin();
+  }
+
+  /** Ask for the index until it is there. */
+  async begin() {
+    try {
+      const tree = await ask("tiles/tree.json");
+      if (tree.error) throw new Error(tree.error);
+      if (tree.nodes) {
+        this.tree = tree;
+        this.view.draw();
+        return;
+      }
+      this.said.textContent = `All points are being sorted: ${Math.round(100 * tree.share)} %.`;
+      setTimeout(() => this.begin(), ASKED_MS);
+    } catch (error) {
+      this.said.textContent = `No more points: ${error.message}.`;
+    }
+  }
+
+  /** Draw the nodes that the view needs, and ask for those that are missing. */
+  look() {
+    const { view } = this;
+    if (!this.tree || view.section) return;
+    this.wanted = nodesFor(this.tree, view.camera, BUDGET, FINEST / (devicePixelRatio || 1));
+    if (this.way !== view.way_of_colour) {
+      this.way = view.way_of_colour;
+      for (const [name, cloud] of this.held) view.drawer.add(name, this.coloured(cloud));
+    }
+    const there = this.wanted.filter((name) => this.held.has(name));
+    for (const name of there) {
+      const cloud = this.held.get(name);
+      this.held.delete(name); // the last seen are the last of the map
+      this.held.set(name, cloud);
+    }
+    const names = ["map", ...there];
+    const isOther = names.join() !== view.names.join();
+    view.names = names;
+    if (isOther) view.draw();
+    this.forget();
+    this.fetchSome();
+    const points = there.reduce((sum, name) => sum + this.tree.nodes[name], 0);
+    this.said.textContent = `Of all ${this.tree.points.toLocaleString("en")} points ${points.toLocaleString("en")} more are drawn, nearer ones as they are seen.`;
+  }
+
+  fetchSome() {
+    for (const name of this.wanted) {
+      if (this.asked.size >= AT_ONCE) return;
+      if (!this.held.has(name) && !this.asked.has(name)) this.fetch(name);
+    }
+  }
+
+  async fetch(name) {
+    this.asked.add(name);
+    try {
+      const answer = await fetch(`tiles/${name}.bin`);
+      if (!answer.ok) throw new Error("the server has it no more");
+      const cloud = nodeOf(name, await answer.arrayBuffer(), this.tree, this.view.cloud);
+      this.held.set(name, cloud);
+      this.view.drawer.add(name, this.coloured(cloud));
+      this.view.draw();
+    } catch (error) {
+      this.tree = null; // it is not asked again
+      this.said.textContent = `No more points: ${error.message}.`;
+    } finally {
+      this.asked.delete(name);
+    }
+  }
+
+  /** The cloud as the drawer takes it, in the map's way of colours. */
+  coloured(cloud) {
+    const way = colourings(cloud, scans)[this.view.way_of_colour];
+    if (this.view.by === BY.rgb) return { ...cloud, rgb: way?.bytes || new Uint8Array(3 * cloud.count).fill(128) };
+    return { ...cloud, rgb: null, value: way?.bytes || new Uint8Array(cloud.count) };
+  }
+
+  /** Drop what was not seen for longest. */
+  forget() {
+    let points = 0;
+    for (const name of this.held.keys()) points += this.tree.nodes[name];
+    for (const name of this.held.keys()) {
+      if (points <= HELD) return;
+      this.view.drawer.remove(name);
+      this.held.delete(name);
+      points -= this.tree.nodes[name];
+    }
+  }
+}
+
+export const tiles = served && mapView?.drawer ? new Tiles(mapView) : null;
