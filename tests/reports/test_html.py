@@ -19,6 +19,7 @@ import pytest
 
 from lslam.core.errors import OutputError
 from lslam.core.types.cloud import ArrayCloud
+from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
@@ -85,7 +86,7 @@ def test_page_is_whole_and_alone(make_record: MakeRecord) -> None:
     page = render_report(record, scored(record))
     parsed = parse(page)
     assert parsed.tags.count("html") == parsed.tags.count("body") == parsed.tags.count("h1") == 1
-    assert [kind for kind, _ in parsed.scripts] == ["application/json", "application/json", ""]
+    assert [kind for kind, _ in parsed.scripts] == ["application/json"] * 3 + [""]
     assert all(address.startswith("data:image/png;base64,") for address in parsed.addresses)
     assert len(parsed.addresses) == 1  # the map
     shown = re.sub(r"<script.*?</script>", "", page, flags=re.S).replace("data:image/png;base64,", "")
@@ -93,7 +94,10 @@ def test_page_is_whole_and_alone(make_record: MakeRecord) -> None:
     # The one address in the script is the name of SVG.
     code = parsed.scripts[-1][1]
     assert set(re.findall(r"https?://[^\"]*", code)) == {"http://www.w3.org/2000/svg"}
-    assert not re.search(r"fetch\(|XMLHttpRequest|WebSocket|import\(|\beval\b", code)
+    # One, of pages that are served; this page may connect to nobody.
+    assert len(re.findall(r"\bfetch\(", code)) == 1
+    assert "connect-src" not in page
+    assert not re.search(r"XMLHttpRequest|WebSocket|import\(|\beval\b", code)
 
 
 def test_no_script_but_the_page_s_own_may_run(make_record: MakeRecord) -> None:
@@ -181,8 +185,15 @@ def test_a_run_that_ended_badly_never_reads_as_flawless(make_record: MakeRecord,
 
 def test_names_cannot_inject(make_record: MakeRecord) -> None:
     evil = "<script>alert('x')</script>\"&"
+    loop = LoopCandidate(0, 5, 1.0, 0.1, Verdict.REJECTED, LoopStage.GATE, evil)
     record = make_record(
-        12, name=evil, bad={3: ("bridged", evil)}, problems=[evil], manifest={"status": evil, evil: {"a": [evil]}}
+        12,
+        name=evil,
+        loops=[loop],
+        keyframe_scans=np.arange(12),
+        bad={3: ("bridged", evil)},
+        problems=[evil],
+        manifest={"status": evil, evil: {"a": [evil]}},
     )
     for i, result in enumerate(record.results):
         record.results[i] = replace(result, stages={evil: 0.01, "read": 0.001})
@@ -190,9 +201,10 @@ def test_names_cannot_inject(make_record: MakeRecord) -> None:
     evaluation = replace(scored(record), estimate=evil, notes=[evil], association=evil)
     page = render_report(record, evaluation)
     parsed = parse(page)
-    assert [kind for kind, _ in parsed.scripts] == ["application/json", "application/json", ""]
+    assert [kind for kind, _ in parsed.scripts] == ["application/json"] * 3 + [""]
     assert "alert" not in parsed.scripts[-1][1]
-    assert json.loads(parsed.scripts[1][1])["reasons"] == {"3": evil}
+    assert json.loads(parsed.scripts[2][1])["reasons"] == {"3": evil}
+    assert json.loads(parsed.scripts[1][1])["candidates"][0]["reason"] == evil
     assert parsed.handlers == []
     assert parsed.text.count("alert('x')") >= 8
 

@@ -1,19 +1,25 @@
-// The server of `lslam view`, which answers its own page.
+// The server of `lslam view`, which answers its own page. A page that is a file asks nobody.
 import { read } from "./elements.mjs";
 
 /** What the server says of the page; null where the page is a file. */
 export const served = read("served");
 
-/** The server's answer, below the page's address; with a `document` it is told that. Raises Error with its sentence. */
-export async function ask(path, document) {
-  const told = document === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(document) };
-  let answer;
-  try {
-    answer = await fetch(path, told);
-  } catch {
+/** The server's answer, below the page's address. Raises Error with its sentence. */
+async function reach(path, told) {
+  if (!served) throw new Error("the page is a file: lslam view serves it");
+  const answer = await fetch(path, told).catch(() => {
     throw new Error("lslam view does not answer: it has ended");
-  }
-  const said = await answer.json();
-  if (!answer.ok) throw new Error(said.error || answer.statusText);
-  return said;
+  });
+  if (!answer.ok) throw new Error((await answer.json()).error || answer.statusText);
+  return answer;
+}
+
+/** What the server says, or says to a `document`. */
+export async function ask(path, document) {
+  const told = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(document) };
+  return (await reach(path, document === undefined ? {} : told)).json();
+}
+
+export async function askBytes(path) {
+  return (await reach(path, {})).arrayBuffer();
 }

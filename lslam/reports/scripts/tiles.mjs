@@ -2,7 +2,7 @@
 import { BY, colourings } from "./colours.mjs";
 import { nodeOf, nodesFor } from "./octree.mjs";
 import { scans } from "./scans.mjs";
-import { ask, served } from "./served.mjs";
+import { ask, askBytes, served } from "./served.mjs";
 import { mapView } from "./view.mjs";
 
 const BUDGET = 1_500_000; // points that are drawn
@@ -58,24 +58,22 @@ export class Tiles {
     view.names = names;
     if (isOther) view.draw();
     this.forget();
-    this.fetchSome();
+    this.loadSome();
     const points = there.reduce((sum, name) => sum + this.tree.nodes[name], 0);
     this.said.textContent = `Of all ${this.tree.points.toLocaleString("en")} points ${points.toLocaleString("en")} more are drawn, nearer ones as they are seen.`;
   }
 
-  fetchSome() {
+  loadSome() {
     for (const name of this.wanted) {
       if (this.asked.size >= AT_ONCE) return;
-      if (!this.held.has(name) && !this.asked.has(name)) this.fetch(name);
+      if (!this.held.has(name) && !this.asked.has(name)) this.load(name);
     }
   }
 
-  async fetch(name) {
+  async load(name) {
     this.asked.add(name);
     try {
-      const answer = await fetch(`tiles/${name}.bin`);
-      if (!answer.ok) throw new Error("the server has it no more");
-      const cloud = nodeOf(name, await answer.arrayBuffer(), this.tree, this.view.cloud);
+      const cloud = nodeOf(name, await askBytes(`tiles/${name}.bin`), this.tree, this.view.cloud);
       this.held.set(name, cloud);
       this.view.drawer.add(name, this.coloured(cloud));
       this.view.draw();
