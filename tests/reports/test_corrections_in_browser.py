@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 # Skipped with it where there is no browser.
-from test_page_in_browser import browser, click, find, hover, load, picture, settle  # noqa: F401 (a fixture)
+from browsing import browser, click, find, hover, load, picture, settle  # noqa: F401 (a fixture)
 
 from lslam.cli.main import cli
 from lslam.core.geometry import se3

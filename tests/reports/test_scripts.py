@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from lslam.reports.shell import CHARTS, MAP, bundled
+from lslam.reports.shell import CHARTS, MAP, RUN, bundled
 
 HERE = Path(__file__).parent
 
 
-@pytest.mark.parametrize("entry", [CHARTS, MAP])
+@pytest.mark.parametrize("entry", [CHARTS, MAP, RUN])
 def test_a_page_has_each_module_once_after_those_it_needs_and_each_name_once(entry: str) -> None:
     modules = bundled(entry)
     folder = Path(bundled.__code__.co_filename).parent / "scripts"

@@ -52,7 +52,7 @@ class Corrections {
     for (const button of this.all("[data-say]")) button.addEventListener("click", () => this.judge(button.dataset.say));
     for (const button of this.all("[data-pick]")) {
       button.disabled = !this.map;
-      button.addEventListener("click", () => this.map.pick(this.map.picking === button.dataset.pick ? "" : button.dataset.pick));
+      button.addEventListener("click", () => (this.map.picking === button.dataset.pick ? this.map.stop() : this.map.pick(button.dataset.pick)));
     }
     for (const button of this.all("[data-by]")) {
       button.addEventListener("click", () => {
@@ -188,7 +188,7 @@ class Corrections {
     after.disabled = !pair?.after;
     this.showVerdict();
     this.markRow();
-    this.map?.view.draw();
+    this.map?.view.drawSigns();
   }
 
   showVerdict() {
@@ -240,7 +240,7 @@ class Corrections {
     this.find("[data-graph=run]").disabled = !(this.pairs.length || this.points.length);
     this.showVerdict();
     this.list();
-    this.map?.view.draw();
+    this.map?.view.drawSigns();
   }
 
   download(name) {
@@ -276,7 +276,7 @@ class Corrections {
     const link = document.createElement("a");
     [link.href, link.textContent] = [state.page, state.out];
     this.find(".outcome").append(`Poses moved by ${fixed(state.mean_m, 3)} m, ${fixed(state.most_m, 3)} m at most (dotted on the map). The new run: `, link);
-    this.map?.view.draw();
+    this.map?.view.drawSigns();
   }
 
   /** What was picked as a point, or null: its scan, its place in the world, and how its LiDAR saw it. */
@@ -289,7 +289,7 @@ class Corrections {
     }
     const at = seen && Object.values(seen.at);
     this.find(".seen").textContent = !seen ? "" : at.length ? `seen from its LiDAR at ${at.map((value) => fixed(value, 2)).join(", ")} m` : "the LiDAR itself";
-    this.map?.view.draw();
+    this.map?.view.drawSigns();
   }
 }
 

@@ -1,6 +1,6 @@
 // The octree of a map: which of its nodes a view needs, and what their bytes mean.
 
-const NEAR = 0.02; // of the viewer's distance to the centre
+const NEAREST = 0.02; // of the viewer's distance to the centre
 
 /** Lowest corner and edge of a node's cube, m; the digits of its name are 4 x + 2 y + z. */
 export function cubeOf(name, tree) {
@@ -24,7 +24,7 @@ export function spacingOf(name, tree, camera) {
   const depth = (extra) => (camera.isFlat ? 1 : 1 + (extra - along(back)) / away);
   const far = camera.metres * depth(radius);
   if (far <= 0 || Math.abs(along(right)) > (far * camera.width) / 2 + radius || Math.abs(along(up)) > (far * camera.height) / 2 + radius) return 0;
-  return edge / tree.cells / (camera.metres * Math.max(depth(-radius), NEAR));
+  return edge / tree.cells / (camera.metres * Math.max(depth(-radius), NEAREST));
 }
 
 /**

@@ -9,7 +9,8 @@ const BUDGET = 1_500_000; // points that are drawn
 const HELD = 2 * BUDGET; // points that are kept for when they are seen again
 const FINEST = 1.2; // px between points that are near enough
 const AT_ONCE = 4; // nodes that are asked for
-const ASKED_MS = 1500; // between two questions of how far the octree is
+const TOGETHER_MS = 250; // in which nodes that come are drawn at once
+const AGAIN_MS = 1500; // between two questions of how far the octree is
 
 export class Tiles {
   constructor(view) {
@@ -28,11 +29,11 @@ export class Tiles {
       if (tree.error) throw new Error(tree.error);
       if (tree.nodes) {
         this.tree = tree;
-        this.view.draw();
+        this.view.drawSigns();
         return;
       }
       this.said.textContent = `All points are being sorted: ${Math.round(100 * tree.share)} %.`;
-      setTimeout(() => this.begin(), ASKED_MS);
+      setTimeout(() => this.begin(), AGAIN_MS);
     } catch (error) {
       this.said.textContent = `No more points: ${error.message}.`;
     }
@@ -56,11 +57,19 @@ export class Tiles {
     const names = ["map", ...there];
     const isOther = names.join() !== view.names.join();
     view.names = names;
-    if (isOther) view.draw();
+    if (isOther) this.drawSoon();
     this.forget();
     this.loadSome();
     const points = there.reduce((sum, name) => sum + this.tree.nodes[name], 0);
     this.said.textContent = `Of all ${this.tree.points.toLocaleString("en")} points ${points.toLocaleString("en")} more are drawn, nearer ones as they are seen.`;
+  }
+
+  /** The map anew, once for all nodes that come in a moment. */
+  drawSoon() {
+    this.due ||= setTimeout(() => {
+      this.due = 0;
+      this.view.draw();
+    }, TOGETHER_MS);
   }
 
   loadSome() {
@@ -76,7 +85,7 @@ export class Tiles {
       const cloud = nodeOf(name, await askBytes(`tiles/${name}.bin`), this.tree, this.view.cloud);
       this.held.set(name, cloud);
       this.view.drawer.add(name, this.coloured(cloud));
-      this.view.draw();
+      this.view.drawSigns();
     } catch (error) {
       this.tree = null; // it is not asked again
       this.said.textContent = `No more points: ${error.message}.`;

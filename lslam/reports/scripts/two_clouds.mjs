@@ -1,13 +1,9 @@
 // Two scans on each other, in two colours, as odometry has them or as registration does.
+import { cloudOf, coordinates } from "./clouds.mjs";
 import { gestures } from "./gestures.mjs";
-import { clamp, unpack } from "./numbers.mjs";
+import { clamp } from "./numbers.mjs";
 
 const SIDE = 1.35; // rad from straight down
-
-/** Coordinates (x, y, z, x, ...) of a packed cloud, m. */
-export function unpackCloud(cloud) {
-  return Float32Array.from(unpack(cloud.points, Int16Array), (q, i) => cloud.low[i % 3] + cloud.step[i % 3] * (q + 32768));
-}
 
 /** Points moved by the rows (3, 4) of a transform. */
 export function moved(points, rows) {
@@ -35,8 +31,8 @@ export class TwoClouds {
   /** Show a pair of clouds, or nothing. */
   show(pair) {
     this.clouds = pair && {
-      a: unpackCloud(pair.a),
-      b: [pair.before, pair.after || pair.before].map((rows) => moved(unpackCloud(pair.b), rows)),
+      a: coordinates(cloudOf(pair.a)),
+      b: [pair.before, pair.after || pair.before].map((rows) => moved(coordinates(cloudOf(pair.b)), rows)),
     };
     this.reset();
   }
