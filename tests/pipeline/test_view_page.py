@@ -41,7 +41,7 @@ def test_the_page_of_this_version_may_ask_the_server_and_runs_no_other_script(tm
 
 
 def test_a_page_of_another_version_is_shown_by_itself_and_said(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = shell().replace(script_of(RUN).digest, "sha256-other")
     folder = written(tmp_path / "run", old)

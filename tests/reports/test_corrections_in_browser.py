@@ -222,6 +222,18 @@ def test_served_a_known_pair_mends_the_run(browser: Any, url: str, lost: Path) -
     load(browser, Address(url))  # type: ignore[arg-type]
     assert not find(browser, "[data-file]").is_displayed()
     until(browser, lambda: find(browser, "[data-graph=run]").is_displayed())
+    # Nearer, finer nodes of the map are drawn, and points of them are picked.
+    until(browser, lambda: "more are drawn" in find(browser, ".tiles-said").text)
+    browser.execute_script("mapView.zoom(20)")
+    until(
+        browser,
+        lambda: browser.execute_script("return mapView.names.includes('map') && mapView.names.some(n => n.length > 2)"),
+    )
+    place = browser.execute_script(
+        "const c = tiles.held.get(tiles.wanted.at(-1)); return [...mapView.project(coordinates(c))].slice(0, 2)"
+    )
+    assert browser.execute_script(f"return mapView.pick({place[0]}, {place[1]})") is not None
+    browser.execute_script("mapView.reset()")
     for name, text in (("a", "0"), ("b", "94")):
         field = find(browser, f"form.pair input[name={name}]")
         field.clear()

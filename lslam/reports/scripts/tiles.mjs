@@ -47,6 +47,7 @@ export class Tiles {
     if (this.way !== view.way_of_colour) {
       this.way = view.way_of_colour;
       for (const [name, cloud] of this.held) view.drawer.add(name, this.coloured(cloud));
+      view.draw(); // some points were drawn in colours that they had before
     }
     const there = this.wanted.filter((name) => this.held.has(name));
     for (const name of there) {

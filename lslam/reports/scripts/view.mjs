@@ -247,11 +247,19 @@ export class MapView {
     return this.camera.project(points);
   }
 
-  /** The point of the map, or of the section, that is seen at px: [x, y, z], m; null without one. */
+  /** The point that is seen at px, of all clouds that are drawn: [x, y, z], m; null without one. */
   pick(x, y) {
-    if (this.picked !== this.shown) [this.picked, this.places] = [this.shown, coordinates(this.shown)];
-    const i = this.camera.pick(this.places, x, y);
-    return i < 0 ? null : Array.from(this.places.subarray(3 * i, 3 * i + 3));
+    const { back } = this.camera.axes();
+    const toViewer = (point) => back[0] * point[0] + back[1] * point[1] + back[2] * point[2];
+    let best = null;
+    for (const name of this.names) {
+      const { cloud } = this.drawer.clouds.get(name);
+      cloud.places ||= coordinates(cloud);
+      const i = this.camera.pick(cloud.places, x, y);
+      const point = i < 0 ? null : Array.from(cloud.places.subarray(3 * i, 3 * i + 3));
+      if (point && (!best || toViewer(point) > toViewer(best))) best = point;
+    }
+    return best;
   }
 
   /** From now on clicks go to `act(x, y)` of `tool`; the tool that had them before is stopped. */
