@@ -249,14 +249,14 @@ def test_served_a_known_pair_mends_the_run(browser: Any, url: str, lost: Path) -
     until(browser, lambda: find(browser, ".outcome").text == "lslam graph was stopped")
     map_before = picture(browser)
     click(browser, "[data-graph=run]")
-    until(browser, lambda: "The new run: " in find(browser, ".outcome").text)
+    until(browser, lambda: "The new run: " in find(browser, ".change").text)
     assert (picture(browser) != map_before).any(axis=2).mean() > 0.002, "its way is on the map"
     # Opened again, the page knows what was said and done.
     load(browser, Address(url))  # type: ignore[arg-type]
     until(browser, lambda: said(browser) == ["0 – 94 known"])
-    until(browser, lambda: "The new run: " in find(browser, ".outcome").text)
-    name = find(browser, ".outcome a").text
-    click(browser, ".outcome a")
+    until(browser, lambda: "The new run: " in find(browser, ".change").text)
+    name = find(browser, ".change a").text
+    click(browser, ".change a")
     until(browser, lambda: "/1/" in browser.current_url and said(browser) == ["0 – 94 known"])
     assert browser.get_log("browser") == []
     new = read_trajectory(lost.with_name(name) / "trajectory.tum", "tum")

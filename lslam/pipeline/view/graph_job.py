@@ -68,7 +68,7 @@ class GraphJob:
         assert self._child.stderr is not None
         with contextlib.suppress(ValueError):
             for line in self._child.stderr:
-                self._said.append(line.rstrip())
+                self._said.append(line.rstrip().removeprefix("INFO: "))
 
 
 def next_folder(run: Path) -> Path:

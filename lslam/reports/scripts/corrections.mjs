@@ -275,7 +275,7 @@ class Corrections {
     this.changed = unpack(state.positions, Float32Array);
     const link = document.createElement("a");
     [link.href, link.textContent] = [state.page, state.out];
-    this.find(".outcome").append(`Poses moved by ${fixed(state.mean_m, 3)} m, ${fixed(state.most_m, 3)} m at most (dotted on the map). The new run: `, link);
+    this.find(".change").replaceChildren(`Poses moved by ${fixed(state.mean_m, 3)} m, ${fixed(state.most_m, 3)} m at most (dashed green on the map). The new run: `, link);
     this.map?.view.drawSigns();
   }
 

@@ -120,7 +120,7 @@ export class MapPicks {
       const ends = this.ends([pair.scan_a, pair.scan_b].map((number) => of.poseOf.get(number)));
       line(ends, colour(pair.verdict === "known" ? "ok" : "bad"), paper, 3, []);
     }
-    if (of.changed) line(this.view.project(of.changed), colour("c1"), null, 2.5, [2, 4]);
+    if (of.changed) line(this.view.project(of.changed), colour("c3"), paper, 3, [8, 5]);
     if (of.chosen && of.isAsked) {
       const ends = this.ends(of.chosen.poses);
       line(ends, colour("ink"), paper, 2.5, []);
