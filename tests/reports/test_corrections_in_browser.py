@@ -26,6 +26,7 @@ from lslam.pipeline.view.server import RunServer
 from lslam.pipeline.view.sites import ViewedSites
 from lslam.reports.html import write_report
 
+pytestmark = pytest.mark.slow
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data"
 DRIFT = ("debug.drift=true", "debug.drift_percent=4", "debug.drift_deg_per_100m=12")
 SCANS = 60
