@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import input_errors
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import BLOCK, ArrayCloud, Cloud, CloudBlock
-from lslam.io.formats.las_files import open_las
-from lslam.io.formats.pcd_files import pcd_columns
+from lslam.core.types.cloud import BLOCK, Cloud, CloudBlock
 from lslam.io.formats.ply_files import ply_columns
+from lslam.io.formats.point_files import open_map
 
 COLOURING = ("red", "green", "blue", "class")
 
@@ -77,15 +76,12 @@ class MapCloud:
 
 
 def stored_cloud(path: Path) -> Cloud:
-    """A map as lslam writes it, without holding it in memory; of PCD the file is held.
+    """A map as lslam writes it. Of PLY, LAS and LAZ no more is held than a block; PCD is read whole.
 
     Raises InputError naming the file when it is missing, damaged or of another kind, of LAS while its blocks are read.
     """
-    if path.suffix.lower() in (".las", ".laz"):
-        return open_las(path, COLOURING)
-    if path.suffix.lower() == ".pcd":
-        columns = pcd_columns(path)
-    else:
-        with input_errors(path, ValueError, as_what="a map"), path.open("rb") as stream:
-            columns = ply_columns(path, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
-    return ColumnCloud(columns) if {*"xyz"} <= set(columns) else ArrayCloud.of([])
+    if path.suffix.lower() != ".ply":
+        return open_map(path, ("class",))
+    with input_errors(path, ValueError, as_what="a map"), path.open("rb") as stream:
+        columns = ply_columns(path, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    return ColumnCloud(columns)
