@@ -12,6 +12,7 @@ import pytest
 
 from lslam.core.errors import InterruptedRunError
 from lslam.core.types.cloud import ArrayCloud, CloudBlock
+from lslam.maps import octree
 from lslam.maps.octree import CELLS, DEEPEST, FEW, QUANTA, cube_of, points_of, write_octree
 
 
@@ -64,7 +65,10 @@ def test_every_point_is_in_one_node_and_in_its_cube(cloud: ArrayCloud, tmp_path:
     assert (seen == 1).all()
 
 
-def test_a_level_halves_the_spacing_and_parents_are_there(cloud: ArrayCloud, tmp_path: Path) -> None:
+def test_a_level_halves_the_spacing_and_parents_are_there(
+    cloud: ArrayCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(octree, "BLOCK", 10_000)  # a cell has one point of all blocks
     tree, data = made(cloud, tmp_path)
     assert max(map(len, tree["nodes"])) >= 3
     for name, points, _ in nodes(tree, data):
