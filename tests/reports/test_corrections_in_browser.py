@@ -113,6 +113,7 @@ def test_candidates_are_listed_seen_and_judged(browser: Any, page_of_file: Any, 
     click(browser, "[data-see=above]")
     find(browser, canvas).send_keys(".")
     assert (picture(browser, canvas) != before).any(axis=2).mean() > 0.01, "the full stop switches too"
+    assert find(browser, "[data-see=after]").get_attribute("aria-pressed") == "true"
     for word, line in (("known", ["4 – 50 known"]), ("forbidden", ["4 – 50 forbidden"]), ("", [])):
         click(browser, f"[data-say='{word}']")
         assert said(browser) == line

@@ -1,6 +1,6 @@
 // Loops and points that a person corrects: chosen in the list or on the map, looked at, said; saved as files or by the server.
 import { pairsFile, pointOf, pointsFile, saidOf, sortedBy, withVerdict } from "./edits.mjs";
-import { read } from "./elements.mjs";
+import { KEYS, read } from "./elements.mjs";
 import { MapPicks } from "./map_picks.mjs";
 import { fixed, unpack } from "./numbers.mjs";
 import { scans } from "./scans.mjs";
@@ -16,7 +16,7 @@ class Corrections {
     [this.pairs, this.points] = [[], []];
     this.candidates.forEach((one, k) => Object.assign(one, { k, scans: one.poses.map((pose) => scans.index[pose]) }));
     this.poseOf = new Map(Array.from(scans.index, (number, pose) => [number, pose]));
-    this.clouds = new TwoClouds(this.find("canvas"));
+    this.clouds = new TwoClouds(this.find("canvas"), (isAfter) => this.press(isAfter ? "after" : "before", ["before", "after"]));
     this.sorting = ["doubt", true];
     section.classList.toggle("served", Boolean(served));
     section.hidden = false;
@@ -37,6 +37,7 @@ class Corrections {
   }
 
   startButtons() {
+    const views = ["above", "side"];
     const see = {
       before: () => this.clouds.switch(false), after: () => this.clouds.switch(true),
       above: () => this.clouds.turnTo(false), side: () => this.clouds.turnTo(true),
@@ -44,9 +45,7 @@ class Corrections {
     for (const button of this.all("[data-see]")) {
       button.addEventListener("click", () => {
         see[button.dataset.see]();
-        for (const other of button.dataset.see in { before: 1, after: 1 } ? ["before", "after"] : ["above", "side"]) {
-          this.find(`[data-see=${other}]`).setAttribute("aria-pressed", String(other === button.dataset.see));
-        }
+        if (views.includes(button.dataset.see)) this.press(button.dataset.see, views);
       });
     }
     for (const button of this.all("[data-say]")) button.addEventListener("click", () => this.judge(button.dataset.say));
@@ -64,6 +63,11 @@ class Corrections {
     for (const button of this.all("[data-file]")) button.addEventListener("click", () => this.download(button.dataset.file));
     this.find("[data-graph=run]").addEventListener("click", () => this.told(async () => this.follow(await ask("api/graph", {}))));
     this.find("[data-graph=stop]").addEventListener("click", () => this.told(async () => this.follow(await ask("api/stop", {}))));
+  }
+
+  /** Show which of some views it is. */
+  press(name, names) {
+    for (const other of names) this.find(`[data-see=${other}]`).setAttribute("aria-pressed", String(other === name));
   }
 
   startForms() {
@@ -183,7 +187,7 @@ class Corrections {
     this.clouds.show(pair);
     this.find(".facts").textContent = said;
     [this.find(".older").textContent, this.find(".newer").textContent] = numbers.map((number) => `scan ${number}`);
-    this.find("canvas").setAttribute("aria-label", pair ? `Both scans on each other, ${numbers.join(" and ")}` : "Their points are not here");
+    this.find("canvas").setAttribute("aria-label", pair ? `Both scans on each other, ${numbers.join(" and ")}; ${KEYS}; comma switches before and registered` : "Their points are not here");
     const after = this.find("[data-see=after]");
     after.disabled = !pair?.after;
     this.showVerdict();

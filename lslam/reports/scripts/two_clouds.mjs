@@ -15,8 +15,9 @@ export function moved(points, rows) {
 }
 
 export class TwoClouds {
-  constructor(canvas) {
-    this.canvas = canvas;
+  /** onSwitch(isAfter) : told which of both is seen */
+  constructor(canvas, onSwitch) {
+    [this.canvas, this.onSwitch] = [canvas, onSwitch];
     [this.yaw, this.tilt, this.isAfter] = [0, 0, true];
     gestures(canvas, {
       zoom: (factor) => this.zoom(factor),
@@ -39,6 +40,7 @@ export class TwoClouds {
 
   switch(isAfter) {
     this.isAfter = isAfter;
+    this.onSwitch(isAfter);
     this.draw();
   }
 
