@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import webbrowser
+from contextvars import copy_context
 from pathlib import Path
 
 import click
@@ -90,7 +91,9 @@ def serve(run: Path, port: int, opens: bool) -> None:
     with RunServer(port) as server:
         sites = ViewedSites(server)
         sites.add(run)
-        worker = threading.Thread(target=server.serve_forever, name="lslam-view", daemon=True)
+        worker = threading.Thread(
+            target=copy_context().run, args=(server.serve_forever,), name="lslam-view", daemon=True
+        )
         worker.start()
         try:
             show(f"{server.url}\n")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from lslam.cli.main import cli
 from lslam.core.errors import InputError, OutputError, OutputExistsError
@@ -19,8 +21,10 @@ from lslam.core.types.gnss import Georeference
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.point_files import read_cloud
 from lslam.io.formats.trajectory_files import write_tum
+from lslam.maps.octree import points_of
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
 from lslam.pipeline.rebuild import viewed_run
+from lslam.pipeline.view.tiles import MapTiles
 from lslam.reports.recording import MOST_POINTS, by_height
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (400, 3))
@@ -53,6 +57,30 @@ def test_all_is_shown_in_the_world_of_the_run(run: Path) -> None:
         path.unlink()
     bare = viewed_run(run)
     assert (bare.cloud, bare.odometry) == (None, None)
+
+
+def test_tiles_of_a_map_in_utm_lie_in_the_world_of_the_run(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    for _ in ("built", "from the cache"):
+        tiles = MapTiles(run, np.zeros((1, 3)))
+        tiles.start()
+        for _ in range(200):
+            if "nodes" in tiles.tree():
+                break
+            time.sleep(0.02)
+        tree, data = tiles.tree(), tiles.node("r")
+        assert (tree["points"], tree["nodes"]) == (400, {"r": 400})
+        assert data is not None
+        away, _ = cKDTree(points_of("r", data[:2400], tree)).query(POINTS)
+        assert away.max() < 0.003
+    assert tiles.node("r0") is None
+    (run / "map.laz").unlink()
+    bare = MapTiles(run, np.zeros((1, 3)))
+    bare.start()
+    bare.stop()
+    assert "no map file" in bare.tree()["error"]
 
 
 class Stream:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections import deque
+from contextvars import copy_context
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ class GraphJob:
             )
         except OSError as error:
             raise OutputError(f"lslam graph cannot be started: {cause(error)}") from None
-        self._reader = threading.Thread(target=self._read, name="lslam-graph", daemon=True)
+        self._reader = threading.Thread(target=copy_context().run, args=(self._read,), name="lslam-graph", daemon=True)
         self._reader.start()
 
     @property

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from pathlib import Path
 
@@ -13,10 +12,11 @@ from lslam.reports.shell import RUN, policy, script_of
 log = logging.getLogger("lslam")
 REPORT = "report.html"
 TALKS = "connect-src 'self'"
+SERVED = '<script type="application/json" id="served">{}</script>\n'  # tells the page's script
 
 
-def page_of(folder: Path, number: int) -> Answer:
-    """The report of the run that is the server's `number`.
+def page_of(folder: Path) -> Answer:
+    """The report of a run.
 
     A page of another version, or whoever wrote it, is shown by itself: its script reaches nothing here.
     Raises InputError when it cannot be read.
@@ -26,9 +26,8 @@ def page_of(folder: Path, number: int) -> Answer:
     if not is_ours(text):
         return _page(text, "sandbox allow-scripts allow-downloads")
     own = policy(script_of(RUN))
-    served = json.dumps({"number": number, "name": folder.name}).replace("<", "\\u003c")
     text = text.replace(own, f"{own}; {TALKS}", 1)
-    text = text.replace("<main>", f'<script type="application/json" id="served">{served}</script>\n<main>', 1)
+    text = text.replace("<main>", SERVED + "<main>", 1)
     return _page(text, f"{own}; {TALKS}")
 
 

@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 
 from lslam.core.errors import LslamError, UsageError, cause
+from lslam.core.untrusted import parse_json
 from lslam.reports.evaluations import strict
 
 log = logging.getLogger("lslam")
@@ -207,8 +208,8 @@ class _Handler(BaseHTTPRequestHandler):
         if self.headers.get_content_type() != "application/json":
             raise RefusedError(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "JSON is asked for")
         try:
-            document = json.loads(self.rfile.read(size) or b"null")
-        except (ValueError, RecursionError):
+            document = parse_json(self.rfile.read(size) or b"null")
+        except ValueError:
             raise RefusedError(HTTPStatus.BAD_REQUEST, "this is no JSON") from None
         return _json(site.posts[path](document))
 

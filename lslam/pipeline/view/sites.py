@@ -40,7 +40,7 @@ class ViewedSites:
         self._server.sites.append(
             Site(
                 folder,
-                lambda: page_of(folder, number),
+                lambda: page_of(folder),
                 gets={
                     "api/edits": corrections.edits,
                     "api/pair": corrections.pair,

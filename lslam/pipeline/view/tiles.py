@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 import threading
+from contextvars import copy_context
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ class MapTiles:
         self._folder = Path()
         self._said: dict[str, Any] = {"share": 0.0}
         self._is_over = threading.Event()
-        self._thread = threading.Thread(target=self._build, name="lslam-tiles", daemon=True)
+        self._thread = threading.Thread(target=copy_context().run, args=(self._build,), name="lslam-tiles", daemon=True)
 
     def start(self) -> None:
         """Begin."""

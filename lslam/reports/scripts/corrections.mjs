@@ -18,7 +18,7 @@ class Corrections {
     this.poseOf = new Map(Array.from(scans.index, (number, pose) => [number, pose]));
     this.clouds = new TwoClouds(this.find("canvas"), (isAfter) => this.press(isAfter ? "after" : "before", ["before", "after"]));
     this.sorting = ["doubt", true];
-    section.classList.toggle("served", Boolean(served));
+    section.classList.toggle("served", served);
     section.hidden = false;
     this.map = mapView?.drawer ? new MapPicks(this, mapView) : null;
     this.startButtons();

@@ -1,8 +1,8 @@
 // The server of `lslam view`, which answers its own page. A page that is a file asks nobody.
 import { read } from "./elements.mjs";
 
-/** What the server says of the page; null where the page is a file. */
-export const served = read("served");
+/** Whether the page is served. */
+export const served = read("served") !== null;
 
 /** The server's answer, below the page's address. Raises Error with its sentence. */
 async function reach(path, told) {
