@@ -89,11 +89,11 @@ class LoopCandidate:
 
     @property
     def doubt(self) -> float:
-        """How much a person should look at it, 0 to 1: accepted with little overlap, or rejected late."""
+        """How much a person should look at it, 0 to 1: accepted with little overlap, or rejected late and with much."""
+        overlap, stages = float(np.nan_to_num(self.overlap)), list(LoopStage)
         if self.is_accepted:
-            return 0.0 if self.stage == LoopStage.MANUAL else 1.0 - float(np.nan_to_num(self.overlap))
-        stages = list(LoopStage)
-        return stages.index(self.stage) / len(stages)
+            return 0.0 if self.stage == LoopStage.MANUAL else 1.0 - overlap
+        return (stages.index(self.stage) + overlap) / len(stages)
 
 
 @dataclass(frozen=True)

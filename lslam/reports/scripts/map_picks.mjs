@@ -22,6 +22,7 @@ export class MapPicks {
     view.lines.addEventListener("pointermove", (event) => this.point(...at(event)));
     view.lines.addEventListener("pointerleave", () => this.point(NaN, NaN));
     this.stop();
+    if (corrections.candidates.some((one) => one.verdict === "rejected")) view.explain("loop rejected", "limit");
     view.lines.addEventListener("keydown", (event) => {
       if (event.key === "Escape") this.stop();
     });
