@@ -12,7 +12,7 @@ from lslam.core.types.constraint import LoopCandidate, LoopStage
 from lslam.core.types.run_record import PairView, RunRecord
 from lslam.reports.page_data import QUANTA, packed
 
-MOST_CANDIDATES = 2000
+MOST_CANDIDATES = 1000
 
 
 def candidate_data(record: RunRecord) -> dict[str, Any] | None:

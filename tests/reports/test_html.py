@@ -17,10 +17,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from lslam.backend.loops.pair_view import FEW_POINTS, MOST_VIEWS
 from lslam.core.errors import OutputError
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
-from lslam.core.types.run_record import RunRecord
+from lslam.core.types.run_record import PairView, RunRecord
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
 from lslam.evaluation.metric import Evaluation
@@ -290,6 +291,13 @@ def test_same_record_same_bytes(make_record: MakeRecord) -> None:
 def test_ten_thousand_scans_stay_quick_and_small(make_record: MakeRecord) -> None:
     """With as much of a map as a page takes, and a picture that no compression makes smaller."""
     record = make_record(10_000, bad=dict.fromkeys(range(0, 10000, 3), ("bridged", "too few inliers: 12 of 3000")))
+    reason = "old to new and new to old differ by 0.05 m and 0.61 deg"
+    record.loops = [
+        LoopCandidate(k, k + 99, 9.0, 0.3, Verdict.REJECTED, LoopStage.AGREEMENT, reason) for k in range(4000)
+    ]
+    record.keyframe_scans = np.arange(0, 10_000, 2)
+    cloud = np.random.default_rng(5).uniform(-60, 60, (FEW_POINTS, 3)).astype(np.float32)
+    record.pair_views = [PairView(c, cloud, cloud, np.eye(4), np.eye(4)) for c in record.loops[:MOST_VIEWS]]
     rng = np.random.default_rng(0)
     record.map_image, record.map_heights = (
         rng.poisson(2.0, (1600, 1600)).astype(np.float32),
