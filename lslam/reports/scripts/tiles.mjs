@@ -28,6 +28,7 @@ export class Tiles {
       const tree = await ask("tiles/tree.json");
       if (tree.error) throw new Error(tree.error);
       if (tree.nodes) {
+        if (tree.points <= this.view.cloud.count) return; // the page has them all
         this.tree = tree;
         this.view.drawSigns();
         return;
