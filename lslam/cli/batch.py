@@ -85,13 +85,16 @@ def _expand(path: Path, output: OutputOptions, given: dict[str, Any]) -> Expande
 
 def _line(number: int, words: list[str], given: dict[str, Any]) -> RunLine:
     """The run of one line, parsed as by `lslam run`; raises the errors of that command with the number of the line."""
+    from lslam.cli.one_run import read_truth
     from lslam.cli.run import command as run_command
-    from lslam.cli.run import opened_with, read_truth, resolved
+    from lslam.cli.run import opened_with, resolved
     from lslam.io.readers.lookup import find_folder
     from lslam.studies.batch import listed_line, opened_line, refused_line
 
     try:
         said = run_command.make_context("run", list(words)).params
+        if said["sequence"] is None or said["again"] is not None:
+            raise UsageError("a line names its SEQUENCE, and has no --again")
         if wrong := [name for name in _OF_THE_BATCH if said[name]]:
             raise UsageError(
                 f"--{wrong[0].removeprefix('as_').replace('_', '-')} is no option of a line: give it to lslam batch"

@@ -214,7 +214,7 @@ def _crop(text: str | None) -> tuple[float, float, float] | None:
 
 
 def _truth(path: Path | None, subjects: list[Subject]) -> Trajectory | None:
-    from lslam.cli.run import read_truth
+    from lslam.cli.one_run import read_truth
     from lslam.core.errors import UsageError
     from lslam.io.readers import open_sequence
     from lslam.studies.plan import ONE_TRUTH

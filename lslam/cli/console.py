@@ -9,12 +9,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import cache
-from statistics import fmean
-from typing import TYPE_CHECKING, Any, Protocol
+from statistics import fmean, median
+from typing import TYPE_CHECKING, Protocol
 
+from lslam.cli.events import Events, events
 from lslam.core.printable import lasting
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console
     from rich.table import Table
 
@@ -30,12 +33,12 @@ class TimeLeft:
     do not count.
     """
 
-    def __init__(self, total: int, at_once: int = 1, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, total: int, at_once: int = 1, clock: Callable[[], float] | None = None) -> None:
         self.at_once = max(1, min(at_once, total))
-        self._total, self._clock = total, clock
+        self._total, self._clock = total, clock or time.monotonic
         self._done = 0
         self._took: list[float] = []
-        self._begun = [clock()] * self.at_once
+        self._begun = [self._clock()] * self.at_once
 
     def step(self) -> None:
         """Record the end of a step and the start of the next, if there is one."""
@@ -48,8 +51,13 @@ class TimeLeft:
 
     @property
     def usual(self) -> float:
-        """Mean duration of a step, s; nan before the first is done."""
-        return fmean(self._took[self.at_once :] or self._took or [float("nan")])
+        """Duration of a step, s: the median of the means of nine equal parts of all; nan before the first is done.
+
+        So a few steps that wait for something else do not count, and many that take longer than most do.
+        """
+        took = self._took[self.at_once :] or self._took or [float("nan")]
+        parts = min(len(took), _PARTS)
+        return median(fmean(took[k * len(took) // parts : (k + 1) * len(took) // parts]) for k in range(parts))
 
     @property
     def seconds(self) -> float:
@@ -81,12 +89,16 @@ class TimeLeft:
 
 
 log = logging.getLogger("lslam")
+_PARTS = 9  # of the steps that are done, for the time left
+_EVERY_S = 1.0  # between two events of a stage
 
 
 def setup_logging(verbose: bool = False, quiet: bool = False) -> None:
     """Send lslam's log to stderr. The log.txt of a run is written by another handler, which `quiet` does not limit."""
-    handler: logging.Handler
-    if sys.stderr.isatty():
+    handler: logging.Handler | None = events()
+    if handler is not None:
+        pass
+    elif sys.stderr.isatty():
         from rich.logging import RichHandler
 
         handler = RichHandler(console=terminal(), show_path=False, show_time=False, markup=False, highlighter=None)
@@ -134,60 +146,84 @@ class Advance(Protocol):
 
 
 @contextmanager
-def progress(title: str, total: int, unit: str = "scans", left: TimeLeft | None = None) -> Iterator[Advance]:
-    """A progress bar with rate and time left on a terminal; elsewhere a plain line at most every 10 s and one at the end.
+def progress(title: str, total: int = 0, unit: str = "scans", left: TimeLeft | None = None) -> Iterator[Advance]:
+    """A bar with pace and time left on a terminal, events for scripts; else a plain line at most every 10 s and one at the end.
 
-    left : estimate for steps that are long or several at once, where recent rates are useless
+    total : number of steps, 0 for a stage without any, of which there is no plain line
+    left : estimate for steps that are several at once
     """
+    left = left or TimeLeft(total)
+    told = events()
     # The first handler is that of stderr; that of log.txt follows.
-    if log.handlers and log.handlers[0].level > logging.INFO:
+    is_quiet = bool(log.handlers) and log.handlers[0].level > logging.INFO
+    if told is not None:
+        with _told(told, title, total, unit, left) as advance:
+            yield advance
+    elif is_quiet:
         yield lambda note="": None
-        return
-    if sys.stderr.isatty():
+    elif sys.stderr.isatty():
         with _bar(title, total, unit, left) as advance:
             yield advance
-        return
-    began = first = last = time.monotonic()
+    else:
+        yield _plain(title, total, unit, left)
+
+
+def _plain(title: str, total: int, unit: str, left: TimeLeft) -> Advance:
+    began = last = time.monotonic()
     done = 0
 
     def plain(note: str = "") -> None:
-        nonlocal done, first, last
+        nonlocal done, last
         done += 1
-        if left is not None:
-            left.step()
+        left.step()
         now = time.monotonic()
-        first = now if done == 1 else first
         if now - last < 10 and done < total:
             return
         last = now
-        rate = done / max(now - began, 1e-9)
-        end = f"{now - began:.1f} s"
-        if done < total and left is not None:
-            end = left.text
-        elif done < total:  # the first may have waited for kernels: it is not the rate
-            rate = (done - 1) / max(now - first, 1e-9) if done > 1 else rate
-            end = f"{(total - done) / rate:.0f} s left" if done > 1 else "compiling"
-        pace = _pace(rate, unit) if left is None else left.pace
+        pace, end = _pace(left, unit), f"{now - began:.1f} s"
+        if done < total:
+            end = "compiling" if done == 1 and unit == "scans" else left.text
+        elif unit == "scans":
+            pace = f"{done / max(now - began, 1e-9):.1f} {unit}/s"
         log.info("%s %d/%d, %s, %s%s", title, done, total, pace, end, note and f", {note}")
 
-    yield plain
+    return plain
 
 
-def _pace(rate: float, unit: str) -> str:
-    return f"{rate:.1f} {unit}/s" if rate >= 1 else f"{1 / rate:.1f} s each"
+def _pace(left: TimeLeft, unit: str) -> str:
+    is_fast = unit == "scans" and left.usual <= 1
+    return f"{1 / max(left.usual, 1e-9):.1f} {unit}/s" if is_fast else left.pace
 
 
 @contextmanager
-def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[Advance]:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
+def _told(to: Events, title: str, total: int, unit: str, left: TimeLeft) -> Iterator[Advance]:
+    """The stage as events: when it begins and ends, and at most one a second between."""
+    began = last = time.monotonic()
+    done = 0
+    steps = {"steps": total, "unit": unit} if total else {}
+
+    def tell(event: str, **facts: object) -> None:
+        share = {"done": done, "share": round(min(done / total, 1.0), 4)} if total else {}
+        to.tell(event, stage=title, **steps, **share, **facts)
+
+    def advance(note: str = "") -> None:
+        nonlocal done, last
+        done += 1
+        left.step()
+        if time.monotonic() - last >= _EVERY_S and done < total:
+            last = time.monotonic()
+            tell("progress", left_s=round(left.seconds, 1), **({"note": note} if note else {}))
+
+    tell("begin")
+    try:
+        yield advance
+    finally:
+        tell("end", seconds=round(time.monotonic() - began, 3))
+
+
+@contextmanager
+def _bar(title: str, total: int, unit: str, left: TimeLeft) -> Iterator[Advance]:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
     from rich.table import Column
     from rich.text import Text
 
@@ -196,7 +232,7 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[A
 
         def render(self, task: Task) -> Text:
             """Text of the remaining time."""
-            return Text(left.text if left is not None else "", style="progress.remaining")
+            return Text(left.text, style="progress.remaining")
 
     class PaceColumn(ProgressColumn):
         """Column of the pace, cut off on a narrow terminal."""
@@ -206,42 +242,60 @@ def _bar(title: str, total: int, unit: str, left: TimeLeft | None) -> Iterator[A
             return Text(task.fields["rate"], no_wrap=True, overflow="ellipsis")
 
     whole = Column(no_wrap=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(table_column=whole),
-        TimeRemainingColumn(table_column=whole) if left is None else LeftColumn(table_column=whole),
-        PaceColumn(),
-    )
-    with Progress(*columns, console=terminal(), transient=True) as bar:
-        task = bar.add_task(title, total=total, rate="")
-        began = time.monotonic()
-        done = 0
+    counted = (MofNCompleteColumn(table_column=whole), LeftColumn(table_column=whole), PaceColumn()) if total else ()
+    with Progress(TextColumn("{task.description}"), BarColumn(), *counted, console=terminal(), transient=True) as bar:
+        task = bar.add_task(title, total=total or None, rate="")
 
         def advance(note: str = "") -> None:
-            nonlocal done
-            done += 1
-            if left is not None:
-                left.step()
-            pace = left.pace if left is not None else _pace(done / max(time.monotonic() - began, 1e-9), unit)
-            bar.update(task, advance=1, rate=f"{pace} {note}")
+            left.step()
+            bar.update(task, advance=1, rate=f"{_pace(left, unit)} {note}")
 
         yield advance
 
 
+class Stages:
+    """The stages of a command, one after the other: where one begins, the one before ends."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self._bar = stack.enter_context(ExitStack())
+        self._advance: Advance = lambda note="": None
+
+    def begin(self, title: str, total: int = 0, unit: str = "scans", at_once: int = 1) -> None:
+        """Begin a stage; arguments as of `progress`, and how many steps are made at once."""
+        self._bar.close()
+        self._advance = self._bar.enter_context(progress(title, total, unit, TimeLeft(total, at_once)))
+
+    def step(self, note: str = "") -> None:
+        """One step of the present stage is done."""
+        self._advance(note)
+
+    def end(self) -> None:
+        """End the last stage."""
+        self._bar.close()
+
+
 def bars(stack: ExitStack) -> StudyProgress:
-    """Progress bars of several stages, one after the other."""
+    """Progress bars of the stages of a study."""
     from lslam.studies.runner import StudyProgress
 
-    bar = stack.enter_context(ExitStack())
-    advance: list[Any] = []
+    stages = Stages(stack)
+    return StudyProgress(stages.begin, stages.step)
 
-    def on_start(stage: str, total: int, unit: str, at_once: int) -> None:
-        bar.close()
-        left = None if unit == "scans" else TimeLeft(total, at_once)
-        advance[:] = [bar.enter_context(progress(stage, total, unit, left))]
 
-    return StudyProgress(on_start, lambda note: advance[0](note))
+def has_window() -> bool:
+    """Whether a browser could show a window: without, one in text would take this terminal."""
+    names = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
+    return sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in names)
+
+
+def open_page(page: Path) -> bool:
+    """Open a page in the user's browser; False where there is none with a window of its own."""
+    import webbrowser
+
+    try:
+        return has_window() and webbrowser.open(page.absolute().as_uri())
+    except (webbrowser.Error, OSError):
+        return False
 
 
 class BestTable:
@@ -271,7 +325,7 @@ def best_so_far() -> Iterator[BestTable]:
     """Live table of the best results on a terminal; nothing elsewhere."""
     table = BestTable()
     is_quiet = bool(log.handlers) and log.handlers[0].level > log.getEffectiveLevel()
-    if is_quiet or not sys.stderr.isatty():
+    if is_quiet or events() is not None or not sys.stderr.isatty():
         yield table
         return
     from rich.live import Live

@@ -62,7 +62,7 @@ def command(run: Path, **given: Any) -> None:
     if given["overwrite"] and given["resume"]:
         raise UsageError("--overwrite does everything anew and --resume keeps finished parts: give one of them")
     options.require_there(given["loops_file"], given["control"], given["gt"])
-    from lslam.cli.run import arguments_of, read_truth
+    from lslam.cli.one_run import arguments_of, read_truth
     from lslam.pipeline.resume import open_again, read_for_graph, reading_of, require_another
     from lslam.pipeline.run import run as make_run
     from lslam.pipeline.run_folder import check_target

@@ -55,8 +55,11 @@ def _size(count: int) -> str:
     return f"{count} bytes"
 
 
-@click.command(epilog="Example: lslam info sample_data")
-@click.argument("sequence")
+@click.command(epilog="\b\nExamples: lslam info sample_data\n          lslam info --machine")
+@click.argument("sequence", required=False)
+@click.option(
+    "--machine", is_flag=True, help="Show what this machine has instead: cores, memory, kernels, grids, extras."
+)
 @options.data_root
 @click.option(
     "--scans",
@@ -86,7 +89,8 @@ def _size(count: int) -> str:
 @options.reading
 @options.as_json
 def command(
-    sequence: str,
+    sequence: str | None,
+    machine: bool,
     data_root: Path | None,
     scans: int,
     all_scans: bool,
@@ -103,6 +107,9 @@ def command(
     Of a bag all topics are listed, also where none has clouds. Each finding comes with advice.
     The first scans are registered, to compare their rotations with the IMU's.
     """
+    if machine or sequence is None:
+        _show_machine(sequence, machine, as_json)
+        return
     from lslam.core.errors import LslamError, OutputExistsError
     from lslam.io.readers import open_sequence
 
@@ -134,6 +141,20 @@ def command(
                 click.echo(f"  - {sentence}")
     if not facts["problems"]:
         click.echo("\nnothing wrong found")
+
+
+def _show_machine(sequence: str | None, machine: bool, as_json: bool) -> None:
+    if sequence is not None or not machine:
+        raise click.UsageError("SEQUENCE or --machine says what is looked at: give one of them")
+    from lslam.cli.machine import machine_document, machine_lines
+
+    document = machine_document()
+    if as_json:
+        import json
+
+        click.echo(json.dumps(document, indent=1, allow_nan=False))
+    else:
+        click.echo("\n".join(machine_lines(document)))
 
 
 def _show_topics(bag: dict[str, Any]) -> None:

@@ -65,7 +65,7 @@ def command(sequence: str, map_path: Path, **given: Any) -> None:
     in the map.
     """
     options.require_there(map_path)
-    settings = [f"localize.map={json.dumps(str(map_path), ensure_ascii=False)}", "loops.use=false"]
+    settings = [f"localize.map={json.dumps(str(map_path.absolute()), ensure_ascii=False)}", "loops.use=false"]
     if given["start"] is not None:
         settings.append(f"localize.start={json.dumps(_start_of(given['start']))}")
     if not given["save_map"]:

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from itertools import pairwise
 from typing import Any, NoReturn
 
 import click
@@ -18,6 +19,7 @@ from lslam.core.version import __version__
 
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
 COMMANDS = {
+    "demo": "Simulate a small drive, run it and open its page, in a minute.",
     "run": "Estimate a trajectory and build a map from a recorded sequence.",
     "localize": "Locate a drive in a map that exists.",
     "graph": "Optimise a run's pose graph again, with loops and control points that you know.",
@@ -30,7 +32,7 @@ COMMANDS = {
     "convert": "Convert a sequence to a bag or KITTI's layout, or a trajectory to another format.",
     "deliver": "Make the folder that a surveyor hands over.",
     "osm": "Fetch buildings from OpenStreetMap, or show what is in an extract.",
-    "info": "Show the contents and the faults of a sequence.",
+    "info": "Show the contents and the faults of a sequence, or what this machine has.",
     "map": "Build a run's map anew with other settings, or score a map.",
     "plot": "Draw one figure of a run, for a paper.",
     "view": "Show a run in the browser, and correct its loops there.",
@@ -38,19 +40,6 @@ COMMANDS = {
     "config": "Show or check a configuration.",
     "completion": "Print the completion script of a shell.",
 }
-
-LIBRARIES = (
-    "numpy",
-    "numba",
-    "scipy",
-    "kiss-icp",
-    "gtsam",
-    "open3d-cpu",
-    "open3d",
-    "pyproj",
-    "shapely",
-    "embreex",
-)
 
 
 class PipeContext(click.Context):
@@ -99,14 +88,12 @@ class LazyGroup(click.Group):
 def _print_version(ctx: click.Context, _: click.Parameter, wanted: bool) -> None:
     if not wanted or ctx.resilient_parsing:
         return
-    from importlib.metadata import PackageNotFoundError, version
+    from lslam.cli.machine import library_versions
 
     click.echo(f"lslam {__version__}, Python {sys.version.split()[0]}")
-    for name in LIBRARIES:
-        try:
-            click.echo(f"  {name} {version(name)}")
-        except PackageNotFoundError:
-            continue
+    for name, version in library_versions().items():
+        if version is not None:
+            click.echo(f"  {name} {version}")
     ctx.exit()
 
 
@@ -133,6 +120,10 @@ def main() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # an ASCII terminal shows ? for ±, instead of an error after hours
+    if "--progress=json" in sys.argv or ("--progress", "json") in pairwise(sys.argv):
+        from lslam.cli.events import begin_events
+
+        begin_events()  # before the options are read, of which one may be wrong
     # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
     with heeded(), _exit_codes():
         code = cli(standalone_mode=False)
@@ -168,13 +159,20 @@ def _exit_codes() -> Iterator[None]:
 def _fail(said: str, code: int) -> NoReturn:
     is_too_late()
     said = sentence(said)
-    click.echo(said if code == 130 else f"error: {said}", err=True)
+    from lslam.cli.events import events
+
+    told = events()
+    if told is not None:
+        told.tell("error", text=said, exit_code=code)
+    else:
+        click.echo(said if code == 130 else f"error: {said}", err=True)
     sys.exit(code)
 
 
 def _fail_usage(error: click.ClickException) -> NoReturn:
     if type(error).__name__ == "NoArgsIsHelpError":
         error.show(file=sys.stderr)
+        click.echo("\nNew here? `lslam demo` simulates a drive, runs it and opens its page, in a minute.", err=True)
         sys.exit(2)
     ctx = getattr(error, "ctx", None)
     command = "lslam" if ctx is None else ctx.command_path

@@ -63,7 +63,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
     }
     settings = [*given["settings"], *(f"{key}={value}" for key, value in flags.items() if value is not None)]
     config = load_config(given["config_file"], settings)
-    from lslam.cli.run import watch_of
+    from lslam.cli.one_run import watch_of
 
     with heeded() as stop, ExitStack() as stack:
         watch = watch_of(stack, stop, lambda outcome: None)

@@ -91,7 +91,14 @@ dry_run = click.option("--dry-run", is_flag=True, help="Resolve everything, writ
 
 
 def verbosity(function: F) -> F:
-    """Decorator that adds --verbose and --quiet."""
+    """Decorator that adds --verbose, --quiet and --progress."""
+    function = click.option(
+        "--progress",
+        type=click.Choice(("text", "json")),
+        default="text",
+        expose_value=False,  # `main` has seen it
+        help="json: each event a JSON object on a line of stderr, for scripts.",
+    )(function)
     function = click.option("-v", "--verbose", is_flag=True, help="Log debugging messages on stderr.")(function)
     return click.option("-q", "--quiet", is_flag=True, help="Only warnings and errors on stderr.")(function)
 

@@ -106,7 +106,8 @@ def fetch(
     bounds = _bounds(bbox, around, along, config.fetch_radius if radius is None else radius, data_root, origin)
     from lslam.osm.overpass import fetch_buildings, reply_folder
 
-    reply = fetch_buildings(bounds, config, reply_folder())
+    with console.progress("fetching"):
+        reply = fetch_buildings(bounds, config, reply_folder())
     _write(out, reply)
 
 

@@ -36,7 +36,7 @@ def command(run: Path, **given: Any) -> None:
     setup_logging(given["verbose"], given["quiet"])
     out: Path = given["out"]
     options.require_there(given["gt"])
-    from lslam.cli.run import read_truth
+    from lslam.cli.one_run import read_truth
     from lslam.pipeline.plot_run import plotted_run, width_of, write_figure
     from lslam.reports.figures import require_figure
     from lslam.reports.picture import check_plot_path

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,18 +11,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lslam.cli import options
-from lslam.cli.console import log, progress, setup_logging, show
-from lslam.core.errors import RunFinishedError, UsageError
+from lslam.cli.console import progress, setup_logging, show
+from lslam.cli.one_run import arguments_of, read_truth
+from lslam.core.errors import UsageError
 from lslam.core.machine import rarely_collecting
-from lslam.core.stopping import Stop, heeded
-from lslam.core.untrusted import parse_json
 from lslam.registration.residuals import RESIDUALS, residual_named
 
 if TYPE_CHECKING:
     from lslam.core.config import Config
     from lslam.core.types.sequence import Sequence
-    from lslam.core.types.trajectory import Trajectory
-    from lslam.pipeline.watch import RunOutcome, Watch
 
 
 @click.command(
@@ -35,9 +29,16 @@ if TYPE_CHECKING:
     "          lslam run my_scans --poses theirs.tum --out runs/theirs\n"
     "          lslam run my_scans --osm town.osm --origin 49.0112,8.4229\n"
     "          lslam run sample_data --method loam --metrics thesis\n"
+    "          lslam run --again runs/first --out runs/again\n"
     "          lslam run 2011_09_26_drive_0005_sync --set map.voxel=0.1 --json"
 )
-@click.argument("sequence")
+@click.argument("sequence", required=False)
+@click.option(
+    "--again",
+    type=click.Path(path_type=Path),
+    metavar="RUN",
+    help="Make this run again, by its folder alone, and compare the results; SEQUENCE says where its recording is now.",
+)
 @options.method
 @options.preset
 @click.option("--residual", metavar="NAME", help=f"Residual of icp: {', '.join(RESIDUALS)} [default: plane].")
@@ -85,20 +86,27 @@ if TYPE_CHECKING:
 @options.configuration
 @options.as_json
 @options.verbosity
-def command(sequence: str, **given: Any) -> None:
+def command(sequence: str | None, **given: Any) -> None:
     """Estimate a trajectory and build a map.
 
     SEQUENCE is a path (a folder or a bag), a name under --data-root: seq07, 07, kitti/07, 2011_09_26_drive_0005_sync, or
     a URL of storage: s3://bucket/drive7.bag.
     """
     setup_logging(given["verbose"], given["quiet"])
+    if given["again"] is not None:
+        from lslam.cli.again import run_again
+
+        run_again(given["again"], sequence, given)
+        return
+    if sequence is None:
+        raise click.UsageError("Missing argument 'SEQUENCE'.")
     from lslam.core.types.warned import hearing
     from lslam.pipeline.precompile import helped, start_helper
 
     with hearing(), helped():
         _check_folder(given)
         ahead = None if given["dry_run"] else partial(start_helper, if_cold=True)
-        with rarely_collecting():
+        with progress("opening"), rarely_collecting():
             opened, config = opened_with({**given, "sequence": sequence}, ahead)
             from lslam.pipeline.run import plan, run
             from lslam.pipeline.run_folder import default_folder
@@ -111,27 +119,6 @@ def command(sequence: str, **given: Any) -> None:
         reading = {name: text for name, text in options.reading_of(given).items() if text is not None}
         with arguments_of(out, given) as arguments:
             run(opened, config, ground_truth=truth, reading=reading, **arguments)
-
-
-@contextmanager
-def arguments_of(out: Path, given: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Context with the arguments of `lslam.pipeline.run.run`; prints the result of a run that is finished already."""
-    from lslam.cli.profiling import profiled
-
-    try:
-        with heeded() as stop, profiled(given.get("profile")), ExitStack() as stack:
-            watch = watch_of(stack, stop, lambda outcome: _print_result(outcome, out, given["as_json"]))
-            command = shlex.join(["lslam", *sys.argv[1:]])
-            yield {
-                "out": out,
-                "overwrite": given["overwrite"],
-                "resume": given["resume"],
-                "command": command,
-                "watch": watch,
-            }
-    except RunFinishedError as finished:
-        log.info("%s", finished)
-        _print_finished(out, given["as_json"])
 
 
 def opened_with(given: dict[str, Any], meanwhile: Callable[[Config], None] | None = None) -> tuple[Sequence, Config]:
@@ -221,7 +208,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
         "loops.use": None if given["loops"] is None else str(given["loops"]).lower(),
         **options.manual_settings(given["loops_file"], given["control"]),
         "gnss.mode": given["gnss"],
-        "osm.extract": None if given["osm"] is None else json.dumps(given["osm"], ensure_ascii=False),
+        "osm.extract": _place_of(None if given["osm"] == "auto" else given["osm"]) or given["osm"],
         "osm.origin": None
         if given["origin"] is None
         else json.dumps([*options.place("--origin", given["origin"]), 0.0][:3]),
@@ -231,8 +218,13 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
     if given["poses"] is not None:
         if given["method"] not in (None, "poses"):
             raise UsageError(f"--poses replaces odometry: drop --method {given['method']}")
-        flags |= {"odometry.method": "poses", "odometry.poses": json.dumps(str(given["poses"]), ensure_ascii=False)}
+        flags |= {"odometry.method": "poses", "odometry.poses": _place_of(given["poses"])}
     return flags
+
+
+def _place_of(path: str | Path | None) -> str | None:
+    """Absolute path as a setting, so that the run's copy of the configuration is valid anywhere."""
+    return None if path is None else json.dumps(str(Path(path).expanduser().absolute()), ensure_ascii=False)
 
 
 def _resolve(given: dict[str, Any], flags: dict[str, Any]) -> Config:
@@ -246,39 +238,6 @@ def _resolve(given: dict[str, Any], flags: dict[str, Any]) -> Config:
     return config
 
 
-def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
-    """Ground truth of --gt; the poses of a file without stamps take those of the sequence, one per scan."""
-    if path is None:
-        return None
-    from dataclasses import replace
-
-    from lslam.io.formats.trajectory_files import read_trajectory
-
-    truth = read_trajectory(path)
-    if not truth.has_stamps and len(truth) == len(sequence):
-        return replace(truth, stamps_ns=sequence.stamps_ns, has_stamps=True)
-    return truth
-
-
-def watch_of(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
-    """Watch with progress bars that stops the run after the current scan on a signal."""
-    from lslam.pipeline.watch import Watch
-
-    bar = stack.enter_context(ExitStack())
-    advance: list[Any] = []
-
-    def on_start(stage: str, total: int) -> None:
-        bar.close()
-        advance[:] = [bar.enter_context(progress(stage, total))]
-        stop.is_gentle = True
-
-    def on_end(outcome: RunOutcome) -> None:
-        bar.close()
-        finish(outcome)
-
-    return Watch(on_start, lambda: advance[0](), on_end, stop)
-
-
 def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) -> None:
     from lslam.core.config import to_toml
 
@@ -290,31 +249,3 @@ def _print_plan(sequence: Sequence, config: Config, out: Path, as_json: bool) ->
     lines = [f"# {sequence.name}: {len(sequence)} scans, {sequence.kind}, {sequence.path}", f"# output: {out}"]
     lines += [f"# {note}" for note in sequence.notes] + [f"# problem: {problem}" for problem in sequence.problems]
     show("\n".join(lines) + "\n" + to_toml(config))
-
-
-def _print_finished(out: Path, as_json: bool) -> None:
-    """Print the existing result for --json; the log states that nothing was done."""
-    if not as_json:
-        return
-    evaluation = out / "evaluation.json"
-    score = parse_json(evaluation.read_text(encoding="utf-8")) if evaluation.exists() else None
-    document = {
-        "folder": str(out),
-        "manifest": parse_json((out / "manifest.json").read_text("utf-8")),
-        "evaluation": score,
-    }
-    show(json.dumps(document, allow_nan=False) + "\n")
-
-
-def _print_result(outcome: RunOutcome, out: Path, as_json: bool) -> None:
-    """The summary, or the document of --json."""
-    if not as_json:
-        from lslam.reports.text import summary
-
-        show(summary(outcome.record, outcome.evaluation))
-        return
-    from lslam.reports.evaluations import run_document
-
-    score = run_document(outcome.record, outcome.evaluation)
-    document = {"folder": str(out), "manifest": outcome.record.manifest, "evaluation": score}
-    show(json.dumps(document, default=str, allow_nan=False) + "\n")

@@ -187,7 +187,7 @@ def command(
     if plan is not None:
         written.append(_draw(drive, plan))
     if out is not None:
-        written.append(_record(drive, out, overwrite, resume, is_labelled, is_filmed))
+        written.append(record_drive(drive, out, overwrite, resume, is_labelled, is_filmed))
     _print(written, as_json)
 
 
@@ -246,9 +246,15 @@ def _write_plan(path: Path, plan: ScenePlan) -> Written:
     return Written(text, {"plan": str(path), "plan_size_m": [float(width), float(depth)]})
 
 
-def _record(
-    drive: SimulatedDrive, out: Path, overwrite: bool, resume: bool, is_labelled: bool, is_filmed: bool
+def record_drive(
+    drive: SimulatedDrive,
+    out: Path,
+    overwrite: bool,
+    resume: bool = False,
+    is_labelled: bool = False,
+    is_filmed: bool = False,
 ) -> Written:
+    """Record the drive in `out` with a progress bar, until a signal comes; arguments as of the command."""
     from lslam.core.stopping import heeded
     from lslam.simulation.record import record
 

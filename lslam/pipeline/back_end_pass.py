@@ -63,12 +63,14 @@ def optimise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
         candidates: list[LoopCandidate] = []
         try:
             if config.loops.use or manual.pairs:
+                job.watch.on_start("loops", 0)
                 with manifest.timed("loops_s"):
                     pairs = keyframe_pairs(manual.pairs, record.results, store.keyframes)
                     candidates, said = _loops(job, record.results, pairs, clocks)
                     manifest.problems += [*pairs.problems, *said]
             if job.watch.should_stop():
                 raise InterruptedRunError("interrupted before the pose graph")
+            job.watch.on_start("pose graph", 0)
             with asking(job.watch.should_stop, "interrupted before the pose graph was solved"):
                 done = run_back_end(
                     job.sequence,

@@ -81,6 +81,7 @@ def _followed(
     view = LocalView(prior_map, config.registration, 1.2 * config.preprocess.range_max)
     reanchor = Reanchoring(search, results)
     if known is None:
+        watch.on_start("search", 0)
         start = _find_start(sequence, prior_map, search, config, watch)
         follower = MapFollower(view, *_at_first_scan(start, search.store, results, config), config, reanchor)
         fixes: list[MapFix] = []

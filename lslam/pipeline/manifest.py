@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import sys
 import time
@@ -30,7 +31,8 @@ from lslam.reports.facts import describe
 SCHEMA = 1
 # Share of the scans that may leave a direction open before the run counts as degraded.
 MOST_DEGENERATE = 0.1
-LIBRARIES = ("numpy", "numba", "scipy", "kiss-icp")
+# Those whose version may change a byte of a result.
+LIBRARIES = ("numpy", "numba", "llvmlite", "scipy", "gtsam", "kiss-icp", "shapely", "pyproj", "laspy", "lazrs")
 
 
 class Manifest:
@@ -39,6 +41,7 @@ class Manifest:
     outcome : done, degraded (a scan was bridged or skipped, or input was dropped, replaced or refused), diverged or
         interrupted
     reading : what else than its path the sequence was opened with: topics, extrinsics
+    truth_file : of ground truth that replaces the recording's own
     unscored : why a known ground truth gave no score, empty where it did
     deskew : treatment of the motion within a scan, `describe_deskew`
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
@@ -62,6 +65,7 @@ class Manifest:
         self.pose_time = Span().instant
         self.started = datetime.now(UTC)
         self.reading: dict[str, str] = {}
+        self.truth_file = ""
         self.timings: dict[str, float] = {}
         self.problems: list[str] = []
         self.unscored = ""
@@ -161,6 +165,7 @@ class Manifest:
             **({"unscored": self.unscored} if self.unscored else {}),
             "command": self.command,
             "lslam": __version__,
+            **({"ground_truth": self.truth_file} if self.truth_file else {}),
             **({"identity": dict(self.identity)} if self.identity else {}),
             "method": self.config.odometry.method,
             "sequence": {
@@ -202,12 +207,18 @@ class Manifest:
             "peak_memory_mb": peak_memory_mb(),
             "started": self.started.isoformat(timespec="seconds"),
             "written": datetime.now(UTC).isoformat(timespec="seconds"),
-            "machine": {
-                "python": sys.version.split()[0],
-                "platform": platform.platform(),
-                **{name: _version(name) for name in LIBRARIES},
-            },
+            "machine": machine_facts(),
         }
+
+
+def machine_facts() -> dict[str, str | None]:
+    """Python, system, a digest of lslam's own code, and versions of libraries; None for one that is not installed."""
+    return {
+        "code": _code_digest(),
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        **{name: _version(name) for name in LIBRARIES},
+    }
 
 
 def describe_deskew(sequence: Sequence, config: Config, has_times: bool, how: str) -> tuple[str, bool]:
@@ -238,6 +249,14 @@ def peak_memory_mb() -> float | None:
         return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return round(peak / (1e6 if sys.platform == "darwin" else 1e3), 1)
+
+
+@cache
+def _code_digest() -> str:
+    digest, package = hashlib.sha256(), Path(__file__).parents[1]
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 @cache

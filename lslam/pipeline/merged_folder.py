@@ -75,13 +75,18 @@ def merge_into(
     if config.map.colour:
         raise UsageError("map.colour: merged maps have no colours; those of their runs have, by lslam map RUN --colour")
     folders = expanded(folders)
+
+    def on_stage(stage: str) -> None:
+        log.info("merge: %s", stage)
+        watch.on_start(stage, 0)
+
     with RunFolder(out, overwrite or resume, resume) as folder:
         manifest: dict[str, Any] = {"schema": SCHEMA, "kind": "merge", "lslam": __version__, "command": command}
         folder.write_text("config.toml", config_text(config))
         folder.write_manifest({**manifest, "status": "running"})
         kept = Checkpoints(folder.path / CHECKPOINT, "merge", config.odometry.checkpoint_s)
         try:
-            merged = merge_runs(folders, config, watch.should_stop, lambda stage: log.info("merge: %s", stage), kept)
+            merged = merge_runs(folders, config, watch.should_stop, on_stage, kept)
             manifest |= _fill(folder, merged, config, watch)
         except BaseException as error:
             status = "interrupted" if isinstance(error, InterruptedRunError) else "failed"
@@ -121,6 +126,7 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
         )
         write_map(folder.path / f"map.{config.map.format}", built.merged, note, georeference)
         about["map_points"] = len(built.merged)
+    watch.on_start("report", 0)
     views, shown = _views(merged, trajectories), (None, None) if built is None else (built.view, built.sample)
     write_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, _ties(merged), *shown)
     for problem in problems:

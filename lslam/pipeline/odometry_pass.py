@@ -69,6 +69,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
         osm.begin(None if folder is None else folder / REPLIES)
     stationary = _stationary(config)
     monitor = IntegrityMonitor(config.preprocess) if config.odometry.integrity else None
+    watch.on_start("kernels", 0)
     _warm_up(job, stationary, monitor)
 
     if osm is not None and checkpoints is not None:

@@ -37,6 +37,17 @@ from lslam.pipeline.run_folder import MANIFEST, require_odometry
 
 # Keys that change no byte of the result, or only which of its metrics are shown.
 FREE = ("input.threads", "odometry.checkpoint_s", "keyframes.deflate", "eval.metrics")
+# What it means that a digest of `run_identity` is another.
+INPUTS = {
+    "input": "the recording or its ground truth is another or was changed",
+    "reading": "the recording is read in another way (times, extrinsics, topic)",
+    "imu": "the IMU's samples are others",
+    "wheels": "the readings of --wheels are others",
+    "gnss": "the satellite fixes are others",
+    "osm": "the extract of OpenStreetMap is another",
+    "poses": "the poses of --poses are others",
+    "manual": "the pairs of --loops-file or the points of --control are others",
+}
 # Sections that odometry does not look at.
 FREE_SECTIONS = ("loops", "graph", "gnss", "osm", "map", "eval", "report")
 
@@ -132,7 +143,9 @@ def run_identity(
     reading = hashlib.sha256(np.ascontiguousarray(sequence.stamps_ns).tobytes())
     for name, T in sorted(sequence.calibration.extrinsics.items()):
         reading.update(f"{name} {None if T is None else np.asarray(T).tolist()}".encode())
-    reading.update(repr((sequence.kind, sequence.motion_compensated, sequence.notes)).encode(errors="surrogateescape"))
+    # Not how the reader was found: a path of the recording itself and one above it are read alike.
+    notes = [note for note in sequence.notes if not note.startswith("format ")]
+    reading.update(repr((sequence.kind, sequence.motion_compensated, notes)).encode(errors="surrogateescape"))
     gnss = sequence.gnss if config.gnss.mode != "off" else None
     return {
         "input": input_digest(sequence, truth),
@@ -206,17 +219,7 @@ def _difference(
     if changed:
         said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
         return f"the configuration differs: {', '.join(said)}{', ...' if len(changed) > 3 else ''}"
-    named = {
-        "input": "the recording or its ground truth is another or was changed",
-        "reading": "the recording is read in another way (times, extrinsics, topic)",
-        "imu": "the IMU's samples are others",
-        "wheels": "the readings of --wheels are others",
-        "gnss": "the satellite fixes are others",
-        "osm": "the extract of OpenStreetMap is another",
-        "poses": "the poses of --poses are others",
-        "manual": "the pairs of --loops-file or the points of --control are others",
-    }
-    return "; ".join(text for name, text in named.items() if known.get(name, "") != identity[name])
+    return "; ".join(text for name, text in INPUTS.items() if known.get(name, "") != identity[name])
 
 
 def _refuse_finished(folder: Path, status: str, manifest: dict[str, Any], config: Config) -> None:

@@ -64,15 +64,19 @@ def run(
     watch = watch or Watch()
     config = config or Config()
     with hearing() as heard, helped(), jit.announced(log, partial(start_helper, config)):
+        watch.on_start("preparing", 0)
         job = prepare(sequence, config, ground_truth, command, watch)
         if earlier is not None and not np.array_equal(job.sequence.stamps_ns, earlier.trajectory.stamps_ns):
             count = len(job.sequence)
             raise InputError(f"{job.sequence.path} does not fit {earlier.folder}: its {count} scans have other stamps")
+        if ground_truth is not None and Path(ground_truth.source).is_file():
+            job.manifest.truth_file = str(Path(ground_truth.source).absolute())
         job.manifest.reading, job.manifest.warnings = dict(reading or {}), heard
         with in_folder(job, None if out is None else as_path(out), overwrite, resume, earlier) as job:
             announce(job)
             record = estimate_poses(job)
             done = finalise_poses(job, record)
+            watch.on_start("results", 0)
             evaluation = score(record, job.sequence, job.config)
             write_results(job, record, done, evaluation)
     outcome = RunOutcome(record, evaluation)

@@ -73,7 +73,7 @@ def _load(job: PreparedRun, *parts: str) -> None:
     """After a cold start, compile or load the kernels of these parts. At others each is loaded when it is called."""
     if not jit.has_compiled():
         return
-    with job.manifest.timed("compile_s"), rarely_collecting():
+    with job.manifest.timed("compile_s"), rarely_collecting(), jit.counted(log, None):
         load_parts(job.config, parts)
 
 
@@ -152,6 +152,7 @@ def make_feature_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> 
 def make_report(folder: RunFolder, job: PreparedRun, record: RunRecord, evaluation: Evaluation | None) -> None:
     """Write report.html. The record's manifest is final then, including the report's own time."""
     manifest = job.manifest
+    job.watch.on_start("report", 0)
     manifest.take_over(record)
     record.manifest = manifest.conclude()
     with manifest.timed("report_s"):

@@ -79,8 +79,8 @@ class RunOutcome:
 class Watch:
     """Progress callbacks of a run, and a way to stop it early.
 
-    on_start(stage, scans), then on_step() per scan; on_end(outcome) also when the run then raises because it diverged,
-    was interrupted or missed a gate
+    on_start(stage, scans, 0 for a stage without any), then on_step() per scan; on_end(outcome) also when the run then raises
+    because it diverged, was interrupted or missed a gate
     """
 
     on_start: Callable[[str, int], None] = lambda stage, total: None

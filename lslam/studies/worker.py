@@ -223,8 +223,8 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     stop = current()
 
     def be_gentle(stage: str, scans: int) -> None:
-        """Let a signal end the run after the scan in work, from the first stage on."""
-        stop.is_gentle = True
+        """Let a signal end the run after the scan in work, from the first stage of scans on."""
+        stop.is_gentle = stop.is_gentle or scans > 0
 
     watch = Watch(be_gentle, on_end=ended.append, should_stop=stop)
 

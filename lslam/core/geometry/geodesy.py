@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,39 @@ def frame_change(old: NDArray[Any], new: NDArray[Any]) -> Floats:
     ahead = to_local(from_local(at[None] + [[0.0, 1000.0, 0.0]], old), new)[0]
     R = so3.exp(np.array([0.0, 0.0, np.arctan2(-ahead[0], ahead[1])]))
     return se3.make(R, -R @ at)
+
+
+def installed_grids() -> dict[str, Any]:
+    """What PROJ has on this machine: its version, folders, whether it asks the network, and grids by their purpose.
+
+    `vertical` are those of heights by PROJ's own list, `others` those of positions and of no list.
+    """
+    import sqlite3
+    from contextlib import closing
+
+    import pyproj
+    import pyproj.network
+
+    stubs: Any = pyproj  # two of these names are missing in its own
+    folders = [Path(text) for text in pyproj.datadir.get_data_dir().split(os.pathsep)]
+    folders.append(Path(stubs.datadir.get_user_data_dir()))
+    found = {file.name for folder in folders for file in folder.glob("*") if file.suffix in (".tif", ".gtx", ".gsb")}
+    database = next((folder / "proj.db" for folder in folders if (folder / "proj.db").is_file()), None)
+    of_heights: set[str] = set()
+    if database is not None:
+        query = (
+            "SELECT proj_grid_name, old_proj_grid_name FROM grid_alternatives "
+            "WHERE proj_method IN ('geoid_like', 'vgridshift')"
+        )
+        with closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True)) as known:
+            of_heights = {name for row in known.execute(query) for name in row}
+    return {
+        "version": pyproj.proj_version_str,
+        "folders": [str(folder) for folder in folders],
+        "network": stubs.network.is_network_enabled(),
+        "vertical": sorted(found & of_heights),
+        "others": sorted(found - of_heights),
+    }
 
 
 def crs_of(epsg: int, height_epsg: int | None = None) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -61,7 +62,8 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wra
 _compiled = _OnFirst(_hasten)
 _register: Callable[..., None] = event.register
 _register("numba:compile", _compiled)
-_when_ready: list[Callable[[], None]] = []
+# Called with the name of a kernel, and whether it is compiled or loaded; else it is about to be compiled, here or elsewhere.
+_when_ready: list[Callable[[str, bool], None]] = []
 
 
 def has_compiled() -> bool:
@@ -85,7 +87,7 @@ def _share(compiled: Any) -> None:
     A damaged or full cache means to compile again: numba passes on every error of unpickling and writing.
     """
     cache, held = compiled._cache, contextlib.ExitStack()
-    save = cache.save_overload
+    save, name = cache.save_overload, compiled.py_func.__qualname__
 
     def found(signature: Any, context: Any) -> Any:
         try:
@@ -102,13 +104,14 @@ def _share(compiled: Any) -> None:
     def load_or_wait(*args: Any) -> Any:
         kept = found(*args)
         if kept is None:
+            _tell(name, False)
             held.close()  # numba's own lock is held here: of this process, no other thread compiles
             with contextlib.suppress(OSError, ImportError):  # where there are no locks, several compile
-                _wait_for(held, Path(cache.cache_path), compiled.py_func.__qualname__)
+                _wait_for(held, Path(cache.cache_path), name)
             kept = found(*args)
         if kept is not None:
             held.close()
-            _tell()
+            _tell(name, True)
         return kept
 
     def save_if_possible(*args: Any) -> None:
@@ -117,7 +120,7 @@ def _share(compiled: Any) -> None:
         except Exception as error:
             _log.debug("a kernel is not kept in the cache: %s", error)
         held.close()
-        _tell()
+        _tell(name, True)
 
     cache.load_overload, cache.save_overload = load_or_wait, save_if_possible
 
@@ -129,9 +132,9 @@ def _wait_for(held: contextlib.ExitStack, folder: Path, name: str) -> None:
     fcntl.flock(held.enter_context((folder / f"{name}.lock").open("a")), fcntl.LOCK_EX)
 
 
-def _tell() -> None:
+def _tell(name: str, is_ready: bool) -> None:
     for call in _when_ready:
-        call()
+        call(name, is_ready)
 
 
 def inline(function: F) -> F:
@@ -173,7 +176,9 @@ def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) 
 
     def announce() -> None:
         log.info(
-            "compiling kernels, %s", "for this run only" if _folder is None else f"once; they are kept in {_folder}"
+            "compiling kernels, %s",
+            "for this run only" if _folder is None else f"once; they are kept in {_folder}",
+            extra={"event": {"event": "compile"}},
         )
         on_first()
 
@@ -183,18 +188,21 @@ def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) 
 
 @contextlib.contextmanager
 def counted(log: logging.Logger, total: int | None, every_s: float = 2.0) -> Iterator[None]:
-    """Log, every now and then, how many kernels are compiled or loaded within the block; `total` : of how many, if known.
+    """Log, every now and then within the block, which kernel is compiled, and how many are ready; `total` : of how many.
 
-    Loading all of them takes less than `every_s`.
+    Loading says nothing.
     """
-    done, last = 0, time.monotonic()
+    done, last = 0, -math.inf
 
-    def ready() -> None:
+    def ready(name: str, is_ready: bool) -> None:
         nonlocal done, last
-        done += 1
-        if time.monotonic() - last >= every_s:
+        done += is_ready
+        if not is_ready and time.monotonic() - last >= every_s:
             last = time.monotonic()
-            log.info("compiling kernels, once: %d%s", done, "" if total is None else f" of {max(done, total)}")
+            of = None if total is None else max(done + 1, total)
+            facts = {"event": "compile", "kernel": name, "done": done, "of": of}
+            text = f"{name} ({done + 1}{'' if of is None else f' of {of}'})"
+            log.info("compiling kernels, once: %s", text, extra={"event": facts})
 
     _when_ready.append(ready)
     try:

@@ -167,11 +167,13 @@ def test_only_compiling_is_announced_and_once(caplog: pytest.LogCaptureFixture) 
     assert caplog.messages[0].startswith("compiling kernels")
 
 
-def test_what_is_ready_is_counted(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_is_compiled_is_named_and_what_is_ready_counted(caplog: pytest.LogCaptureFixture) -> None:
     @jit.kernel
     def thrice(value: float) -> float:
         return 3.0 * value
 
+    thrice._cache.flush()  # type: ignore[attr-defined]  # of an earlier run of this test
+    name = thrice.py_func.__qualname__  # type: ignore[attr-defined]
     log = logging.getLogger(__name__)
     with caplog.at_level("INFO", __name__):
         for total in (5, None, 1):
@@ -180,8 +182,9 @@ def test_what_is_ready_is_counted(caplog: pytest.LogCaptureFixture) -> None:
             thrice = jit.kernel(thrice.py_func)  # type: ignore[attr-defined]
         with jit.counted(log, 5):
             thrice(1.0)
-    said = [("1 of 5", "2 of 5"), ("1", "2"), ("1 of 1", "2 of 2")]
-    assert caplog.messages == [f"compiling kernels, once: {text}" for pair in said for text in pair]
+    assert caplog.messages == [f"compiling kernels, once: {name} ({n} of 5)" for n in (1, 2)], "the others are loaded"
+    events = [vars(record)["event"] for record in caplog.records]
+    assert events == [{"event": "compile", "kernel": name, "done": n, "of": 5} for n in (0, 1)]
 
 
 def test_functions_compiled_into_kernels_are_their_source_for_python() -> None:

@@ -1,0 +1,163 @@
+"""A run made again from its folder alone: what it was made of, what is other today, and whether its files came out the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lslam.core.config import Config, load_config
+from lslam.core.errors import InputError, input_errors
+from lslam.core.types.sequence import Sequence, select
+from lslam.core.types.trajectory import Trajectory
+from lslam.core.untrusted import MISFIT, parse_json
+from lslam.core.version import __version__
+from lslam.io.remote import as_path
+from lslam.osm.source import AUTO
+from lslam.pipeline.manifest import machine_facts
+from lslam.pipeline.resume import INPUTS, input_digest
+from lslam.pipeline.run_folder import MANIFEST, OURS, REPLIES, require_run
+
+# Files that hold times or the names of folders.
+_ALWAYS_OTHER = {MANIFEST, "config.toml", "log.txt", "timing.csv", "report.html"}
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a run was made of.
+
+    path : of its recording; reading : options with which that was opened; truth : file of `--gt`, None without
+    identity : digests of its input, as of `run_identity`; has_moved : whether `path` is another than that of the run
+    """
+
+    folder: Path
+    manifest: Mapping[str, Any]
+    config: Config
+    path: Path
+    reading: Mapping[str, str]
+    truth: Path | None
+    identity: Mapping[str, str]
+    has_moved: bool = False
+
+
+@dataclass(frozen=True)
+class ComparedResults:
+    """Names of result files that are the same in both runs, that differ, and that one of them lacks."""
+
+    same: list[str] = field(default_factory=list)
+    differing: list[str] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
+
+    @property
+    def is_same(self) -> bool:
+        """Whether there are files, and all are the same."""
+        return bool(self.same) and not self.differing and not self.lacking
+
+
+def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
+    """Read what the run in `folder` was made of; `recording` : where its recording is now.
+
+    Raises InputError naming what is missing, damaged or no run of a recording.
+    """
+    require_run(folder)
+    file = folder / MANIFEST
+    try:
+        with input_errors(file):
+            manifest = parse_json(file.read_text(encoding="utf-8"))
+        if manifest.get("kind") == "merge":
+            raise InputError(
+                f"{folder} is a merge of several runs: make it again by its command, {manifest['command']}"
+            )
+        section = manifest["sequence"]
+        path, reading = str(section["path"]), {name: str(text) for name, text in section.get("reading", {}).items()}
+        truth = manifest.get("ground_truth")
+        identity = {name: str(digest) for name, digest in manifest.get("identity", {}).items()}
+    except (AttributeError, *MISFIT) as error:
+        raise InputError(
+            f"{file} does not say what was run, it is damaged or cut off ({error}): run the sequence again"
+        ) from None
+    config = load_config(folder / "config.toml", environ={})
+    if config.osm.extract == AUTO:
+        # What the server said then stands in the run; today it may say something else.
+        replies = (folder / REPLIES).absolute()
+        config = config.model_copy(update={"osm": config.osm.model_copy(update={"extract": str(replies)})})
+    place = as_path(path) if recording is None else recording
+    if not place.exists():
+        raise InputError(
+            f"the recording of {folder} is gone: {place} does not exist; say where it is: lslam run RECORDING --again {folder}"
+        )
+    has_moved = recording is not None and recording.absolute() != Path(path)
+    return Recipe(folder, manifest, config, place, reading, None if truth is None else Path(truth), identity, has_moved)
+
+
+def unfinished(recipe: Recipe) -> list[str]:
+    """A sentence where the run did not come to its end."""
+    status = recipe.manifest.get("status")
+    said = f"the run in {recipe.folder} did not come to its end ({status}): only what it wrote can be compared"
+    return [] if status in ("done", "degraded", "diverged") else [said]
+
+
+def other_programs(recipe: Recipe) -> list[str]:
+    """A sentence for lslam and each library whose version is another than at the run."""
+    then = recipe.manifest.get("machine", {})
+    before = {"lslam": recipe.manifest.get("lslam"), **(then if isinstance(then, dict) else {})}
+    now = {"lslam": __version__, **machine_facts()}
+    other = [name for name in now if name in before and before[name] != now[name]]
+    said = [
+        f"{name} was {before[name] or 'not installed'} at the run and is {now[name] or 'not installed'} now"
+        for name in other
+        if name != "code"
+    ]
+    if "code" in other and "lslam" not in other:
+        said.append(f"lslam's code is another than at the run, with the same version {__version__}")
+    return said
+
+
+def other_recording(recipe: Recipe, opened: Sequence, truth: Trajectory | None) -> list[str]:
+    """A sentence where the files of the recording are others than at the run, told by sizes and times before all is read."""
+    if recipe.has_moved:
+        return [
+            f"the recording is read from {recipe.path}, not from {recipe.manifest['sequence']['path']}: whether its files are "
+            "the same is not known before the results"
+        ]
+    section = recipe.config.input
+    chosen = select(opened, section.start, section.count, section.skip_frames)
+    is_known = recipe.identity.get("input") in (None, input_digest(chosen, truth))
+    return [] if is_known else [f"{INPUTS['input']}, since the run in {recipe.folder}"]
+
+
+def other_inputs(recipe: Recipe, identity: Mapping[str, str]) -> list[str]:
+    """A sentence for each input beside the recording's files that is another; identity : of the run that was made again."""
+    unknown = {"input", "osm"} if recipe.config.osm.extract.endswith(REPLIES) else {"input"}
+    if recipe.has_moved:
+        unknown.add("reading")  # which names the place
+    return [
+        text
+        for name, text in INPUTS.items()
+        if name not in unknown and recipe.identity.get(name, "") != identity.get(name, "")
+    ]
+
+
+def compare_results(old: Path, new: Path) -> ComparedResults:
+    """Compare the result files of two runs, byte by byte."""
+    found = ComparedResults()
+    for name in OURS:
+        files = [folder / name for folder in (old, new)]
+        if name in _ALWAYS_OTHER or not any(file.exists() for file in files):
+            continue
+        if not all(file.exists() for file in files):
+            found.lacking.append(name)
+            continue
+        first, second = (_content(file) for file in files)
+        (found.same if first == second else found.differing).append(name)
+    return found
+
+
+def _content(file: Path) -> bytes:
+    """Bytes of a file; of evaluation.json without the place of the ground truth."""
+    with input_errors(file):
+        known = file.read_bytes()
+    if file.suffix != ".json":
+        return known
+    return b"\n".join(line for line in known.split(b"\n") if not line.lstrip().startswith(b'"ground_truth":'))
