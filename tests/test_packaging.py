@@ -269,6 +269,38 @@ def test_installers_of_programs_install_a_command_that_runs(
     assert json.loads(run.stdout)["manifest"]["counts"]["ok"] == 5
 
 
+def test_a_wheel_needs_no_checkout_for_the_demo(tmp_path: Path) -> None:
+    """Its libraries are those of the tests, which are first asked for lslam: what the wheel lacks is missing here."""
+    source, site = tmp_path / "source", tmp_path / "site"
+    for path in files():
+        if path.is_relative_to(ROOT / "lslam") or path.parent == ROOT:
+            (source / path.relative_to(ROOT)).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, source / path.relative_to(ROOT))
+    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    wheel = [*pip, "wheel", "--no-deps", "-w", str(tmp_path), str(source)]
+    made = subprocess.run(wheel, capture_output=True, text=True, check=False)
+    if "No matching distribution found for setuptools" in made.stderr:
+        pytest.skip("no index of packages is within reach")
+    assert made.returncode == 0, made.stderr
+    (built,) = tmp_path.glob("lslam-*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--no-index", "--target", str(site), str(built)], check=True)
+    shutil.rmtree(source)
+    env = {**os.environ, "PYTHONPATH": str(site), "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    start = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "lslam", "demo", "--no-open", "--json"],
+        env=env, cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    end = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["manifest"]["counts"]["ok"] == 95
+    assert (tmp_path / "lslam-demo/run/report.html").is_file()
+    kept = {path.parent.name.rpartition("_")[0] for path in (tmp_path / "kernels").rglob("*.nbi")}
+    assert kept, "kernels of the wheel's own files are compiled"
+    # Of both cores, with an empty cache: a minute of the clock where nothing else runs.
+    assert end.ru_utime - start.ru_utime < 60
+
+
 def test_help_is_instant() -> None:
     def seconds() -> float:
         """Of a core, not of the clock: a busy machine is not a slow command."""

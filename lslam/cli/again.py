@@ -35,7 +35,6 @@ def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> Non
         other_programs,
         other_recording,
         read_recipe,
-        unfinished,
     )
     from lslam.pipeline.precompile import helped
     from lslam.pipeline.resume import require_another
@@ -74,7 +73,7 @@ def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> Non
             raise GateError(f"--strict: {out} differs from {folder}: {said}")
 
     with hearing(), helped():
-        tell([*unfinished(recipe), *other_programs(recipe)])
+        tell([*recipe.notes, *other_programs(recipe)])
         with progress("opening"):
             opened = open_sequence(
                 recipe.path,

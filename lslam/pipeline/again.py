@@ -29,6 +29,7 @@ class Recipe:
 
     path : of its recording; reading : options with which that was opened; truth : file of `--gt`, None without
     identity : digests of its input, as of `run_identity`; has_moved : whether `path` is another than that of the run
+    notes : sentences about what cannot be as it was
     """
 
     folder: Path
@@ -39,6 +40,7 @@ class Recipe:
     truth: Path | None
     identity: Mapping[str, str]
     has_moved: bool = False
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -77,25 +79,26 @@ def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
         raise InputError(
             f"{file} does not say what was run, it is damaged or cut off ({error}): run the sequence again"
         ) from None
+    notes = []
+    if (status := manifest.get("status")) not in ("done", "degraded", "diverged"):
+        notes.append(f"the run in {folder} did not come to its end ({status}): only what it wrote can be compared")
     config = load_config(folder / "config.toml", environ={})
     if config.osm.extract == AUTO:
         # What the server said then stands in the run; today it may say something else.
         replies = (folder / REPLIES).absolute()
-        config = config.model_copy(update={"osm": config.osm.model_copy(update={"extract": str(replies)})})
+        known: dict[str, str | None] = {"extract": str(replies)}
+        if not any(replies.glob("*.json")):
+            notes.append(f"the run in {folder} had no reply of the server of --osm auto: it is made without buildings")
+            known = {"extract": "", "origin": None, "heading_deg": None}
+        config = config.model_copy(update={"osm": config.osm.model_copy(update=known)})
     place = as_path(path) if recording is None else recording
     if not place.exists():
         raise InputError(
             f"the recording of {folder} is gone: {place} does not exist; say where it is: lslam run RECORDING --again {folder}"
         )
     has_moved = recording is not None and recording.absolute() != Path(path)
-    return Recipe(folder, manifest, config, place, reading, None if truth is None else Path(truth), identity, has_moved)
-
-
-def unfinished(recipe: Recipe) -> list[str]:
-    """A sentence where the run did not come to its end."""
-    status = recipe.manifest.get("status")
-    said = f"the run in {recipe.folder} did not come to its end ({status}): only what it wrote can be compared"
-    return [] if status in ("done", "degraded", "diverged") else [said]
+    of_truth = None if truth is None else Path(truth)
+    return Recipe(folder, manifest, config, place, reading, of_truth, identity, has_moved, tuple(notes))
 
 
 def other_programs(recipe: Recipe) -> list[str]:
@@ -129,7 +132,8 @@ def other_recording(recipe: Recipe, opened: Sequence, truth: Trajectory | None) 
 
 def other_inputs(recipe: Recipe, identity: Mapping[str, str]) -> list[str]:
     """A sentence for each input beside the recording's files that is another; identity : of the run that was made again."""
-    unknown = {"input", "osm"} if recipe.config.osm.extract.endswith(REPLIES) else {"input"}
+    # Of `--osm auto` the server is no more; the recording's files are told of before.
+    unknown = {"input", "osm"} if recipe.identity.get("osm") == AUTO else {"input"}
     if recipe.has_moved:
         unknown.add("reading")  # which names the place
     return [

@@ -12,6 +12,10 @@ import numpy as np
 import pytest
 from calling import SAMPLE, Done, lslam
 
+from lslam.core.errors import InputError
+from lslam.io.formats.osm_files import read_osm
+from lslam.osm import source
+
 SAME_BYTES = re.compile(r"^  again +same bytes: (\d+) files$", re.MULTILINE)
 
 
@@ -177,3 +181,49 @@ def test_poses_of_another_program(run: Path, recording: Path, tmp_path: Path) ->
     done = again(first, "--out", tmp_path / "gone")
     assert done.returncode == 3
     assert str(poses) in done.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize("is_answered", [True, False])
+def test_buildings_of_a_server_are_those_of_then(
+    is_answered: bool, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = read_osm(recording / "sequences/00/map.osm")
+    elements: list[dict[str, Any]] = [
+        {"type": "node", "id": n, "lat": lat, "lon": lon} for n, (lat, lon) in data.nodes.items()
+    ]
+    elements += [{"type": "way", "id": w.id, "nodes": list(w.nodes), "tags": dict(w.tags)} for w in data.ways.values()]
+
+    def answer(*_: object, **__: object) -> dict[str, Any]:
+        if not is_answered:
+            raise InputError("the line is dead")
+        return {"elements": elements}
+
+    monkeypatch.setattr(source, "fetch_buildings", answer)
+    words = ("run", recording / "sequences/00", "--count", "24", "--osm", "auto", "--origin", "49.0,8.3999,115")
+    done = lslam(*words, "--set", "osm.start_radius=20", "--out", tmp_path / "first")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "first/buildings.geojson").exists() is is_answered
+    monkeypatch.setattr(source, "fetch_buildings", lambda *_, **__: pytest.fail("the server is asked again"))
+    done = again(tmp_path / "first", "--out", tmp_path / "again")
+    assert SAME_BYTES.search(done.stdout), done.stdout + done.stderr
+    assert ("had no reply of the server" in done.stderr) is not is_answered
+    assert "OpenStreetMap is another" not in done.stderr
+
+
+def test_other_commands_that_make_runs_are_made_again(recording: Path, tmp_path: Path) -> None:
+    """A drive located in a map, and a graph that was optimised once more: all of it, odometry too."""
+    where = recording / "sequences/00"
+    first, graph, located = (tmp_path / name for name in ("first", "graph", "located"))
+    loops = tmp_path / "pairs.csv"
+    loops.write_text("scan_a,scan_b,verdict\n0,20,forbidden\n")
+    for words in (
+        ("run", where, "--count", "24", "--out", first),
+        ("graph", first, "--loops", "pairs.csv", "--out", graph),
+        ("localize", where, "--map", "first", "--count", "12", "--start", "0,0,0", "--out", located),
+    ):
+        done = lslam(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    for folder in (graph, located):
+        done = again(folder, cwd=recording)
+        assert SAME_BYTES.search(done.stdout), done.stdout + done.stderr
+        assert "are others" not in done.stderr
