@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import sys
 import time
@@ -51,11 +52,14 @@ class TimeLeft:
 
     @property
     def usual(self) -> float:
-        """Duration of a step, s: the median of the means of nine equal parts of all; nan before the first is done.
+        """Duration of a step, s: the median of the means of nine equal parts of all; nan before a second of them is seen.
 
-        So a few steps that wait for something else do not count, and many that take longer than most do.
+        So a few steps that wait for something else do not count, and many that take longer than most do. Scans that were
+        held back at the start come all at once: they say nothing.
         """
-        took = self._took[self.at_once :] or self._took or [float("nan")]
+        took = self._took[self.at_once :] or self._took
+        if sum(took) < _LEAST_S:
+            return math.nan
         parts = min(len(took), _PARTS)
         return median(fmean(took[k * len(took) // parts : (k + 1) * len(took) // parts]) for k in range(parts))
 
@@ -80,16 +84,20 @@ class TimeLeft:
     @property
     def pace(self) -> str:
         """Text of the time per step, and of the number at once."""
-        return f"{self.usual:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
+        usual = self.usual
+        said = f"{usual:.1f} s each" + (f", {self.at_once} at once" if self.at_once > 1 else "")
+        return "" if math.isnan(usual) else said
 
     @property
     def text(self) -> str:
-        """Text of the remaining time; empty before the first step is done."""
-        return f"about {lasting(self.seconds)} left" if self._done else ""
+        """Text of the remaining time; empty before it is known."""
+        seconds = self.seconds
+        return "" if math.isnan(seconds) else f"about {lasting(seconds)} left"
 
 
 log = logging.getLogger("lslam")
 _PARTS = 9  # of the steps that are done, for the time left
+_LEAST_S = 1.0  # of steps, before a word on the time left
 _EVERY_S = 1.0  # between two events of a stage
 
 
@@ -185,7 +193,7 @@ def _plain(title: str, total: int, unit: str, left: TimeLeft) -> Advance:
             end = "compiling" if done == 1 and unit == "scans" else left.text
         elif unit == "scans":
             pace = f"{done / max(now - began, 1e-9):.1f} {unit}/s"
-        log.info("%s %d/%d, %s, %s%s", title, done, total, pace, end, note and f", {note}")
+        log.info("%s %d/%d, %s", title, done, total, ", ".join(part for part in (pace, end, note) if part))
 
     return plain
 
@@ -212,7 +220,9 @@ def _told(to: Events, title: str, total: int, unit: str, left: TimeLeft) -> Iter
         left.step()
         if time.monotonic() - last >= _EVERY_S and done < total:
             last = time.monotonic()
-            tell("progress", left_s=round(left.seconds, 1), **({"note": note} if note else {}))
+            seconds = left.seconds
+            left_s = None if math.isnan(seconds) else round(seconds, 1)
+            tell("progress", left_s=left_s, **({"note": note} if note else {}))
 
     tell("begin")
     try:

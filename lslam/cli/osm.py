@@ -57,6 +57,7 @@ Examples:
 @click.option("--offline", is_flag=True, help="Use the cache alone.")
 @options.data_root
 @options.configuration
+@options.as_json
 @options.verbosity
 def fetch(
     bbox: str | None,
@@ -72,6 +73,7 @@ def fetch(
     data_root: Path | None,
     config_file: Path | None,
     settings: tuple[str, ...],
+    as_json: bool,
     verbose: bool,
     quiet: bool,
 ) -> None:
@@ -108,7 +110,7 @@ def fetch(
 
     with console.progress("fetching"):
         reply = fetch_buildings(bounds, config, reply_folder())
-    _write(out, reply)
+    _write(out, reply, as_json)
 
 
 def _box(text: str) -> list[float]:
@@ -132,7 +134,9 @@ def _bounds(
     return bounds.around(positions_along(along, data_root, at), radius)
 
 
-def _write(out: Path, reply: OverpassReply) -> None:
+def _write(out: Path, reply: OverpassReply, as_json: bool) -> None:
+    import json
+
     from lslam.io.formats.atomic import atomic_write
     from lslam.io.formats.osm_buildings import buildings_of, middle_of
     from lslam.io.formats.osm_files import write_osm
@@ -147,7 +151,10 @@ def _write(out: Path, reply: OverpassReply) -> None:
     found = len(buildings_of(data, middle_of(data), str(out)).buildings)
     if not found:
         console.log.warning("there is no building in that place")
-    click.echo(f"{out}: {found} buildings. {data.attribution}")
+    if as_json:
+        click.echo(json.dumps({"file": str(out), "buildings": found, "attribution": data.attribution}))
+    else:
+        click.echo(f"{out}: {found} buildings. {data.attribution}")
 
 
 @command.command(epilog="Example: lslam osm show town.osm --png town.png")

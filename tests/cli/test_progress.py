@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -117,6 +118,46 @@ def test_other_commands_tell_of_their_stages(told: tuple[Path, list[Event]], tmp
         done = lslam(*words, "--progress", "json")
         assert done.returncode == 0, done.stderr
         assert stages <= set(check_stages(events(done.stderr)))
+
+
+def test_a_study_and_a_merge_tell_of_runs_and_stages(told: tuple[Path, list[Event]], tmp_path: Path) -> None:
+    folder, _ = told
+    out = tmp_path / "two"
+    done = lslam(
+        "compare", SAMPLE, "--methods", "icp,icp-svd", "--count", "4", "--out", out, "--progress", "json", "--json"
+    )
+    assert done.returncode == 0, done.stderr
+    json.loads(done.stdout)
+    found = events(done.stderr)
+    assert check_stages(found) == ["comparing"]
+    (end,) = [event for event in found if event["event"] == "end"]
+    assert (end["done"], end["steps"], end["unit"], end["share"]) == (2, 2, "runs", 1.0)
+    again = tmp_path / "again"
+    assert lslam("run", SAMPLE, "--count", "60", "-q", "--out", again, "--set", "map.write=false").returncode == 0
+    done = lslam("merge", folder, again, "--out", tmp_path / "merged", "--progress", "json")
+    assert done.returncode == 0, done.stderr
+    assert check_stages(events(done.stderr)) == ["tie", "loops", "graph", "map", "report"]
+
+
+def test_the_page_has_every_event_with_its_fields(told: tuple[Path, list[Event]]) -> None:
+    text = (SAMPLE.parent / "docs/tasks/running.md").read_text()
+    rows = re.findall(
+        r"^\| ((?:`\w+`(?:, )?)+) \| (.+) \|$", text.partition("| event |")[2].partition("\n\n")[0], re.MULTILINE
+    )
+    known = {name: set(re.findall(r"`(\w+)`", said)) for names, said in rows for name in re.findall(r"`(\w+)`", names)}
+    assert set(known) == {"begin", "progress", "end", "compile", "info", "warning", "error"}
+    known["progress"] |= known["begin"]
+    known["end"] |= known["begin"]
+    lines = text.partition("```json\n")[2].partition("```")[0]
+    shown = events(lines)
+    assert {"compile", "begin", "progress", "end", "info"} == {event["event"] for event in shown}
+    for event in [*shown, *told[1][:-1]]:
+        assert set(event) - {"event", "elapsed_s"} <= known[event["event"]]
+    in_text = re.search(r"Those of a run are ([^;]*?), as far", text.replace("\n", " "))
+    assert in_text
+    listed = re.split(r", | and ", in_text.group(1))
+    assert [stage for stage in listed if stage in STAGES] == STAGES
+    assert set(listed) - set(STAGES) == {"refinement", "feature map"}
 
 
 def test_who_is_killed_leaves_whole_lines(tmp_path: Path) -> None:

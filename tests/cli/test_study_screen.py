@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import io
 import logging
+import math
 import random
 import sys
 from contextlib import ExitStack
@@ -116,6 +117,32 @@ def test_the_first_of_many_scans_is_not_the_rate(
     assert caplog.messages[0] == "odometry 1/200, 30.0 s each, compiling"
     assert caplog.messages[1] == "odometry 101/200, 10.0 scans/s, about 10 s left"
     assert caplog.messages[-1] == "odometry 200/200, 4.0 scans/s, 49.9 s"
+
+
+def after(durations: list[float], total: int) -> TimeLeft:
+    """The estimate after steps that took so long, one after the other."""
+    now = [0.0]
+    left = TimeLeft(total, 1, lambda: now[0])
+    for duration in durations:
+        now[0] += duration
+        left.step()
+    return left
+
+
+def test_a_step_that_waited_for_something_else_does_not_count_and_one_in_twenty_that_is_long_does() -> None:
+    waited = after([30.0] + [0.1] * 90 + [60.0] + [0.1] * 109, 1201)
+    assert waited.seconds == pytest.approx(100.0, rel=0.01)
+    often = after([30.0] + ([0.1] * 19 + [2.0]) * 9, 1181)
+    assert often.seconds == pytest.approx(1000 * (0.1 * 19 + 2.0) / 20, rel=0.01)
+
+
+def test_nothing_is_said_of_scans_that_were_held_back_and_come_at_once() -> None:
+    for begun in ([5.0], [5.0] + [0.0] * 9, [5.0] + [0.0] * 9 + [0.1] * 9):
+        left = after(begun, 1000)
+        assert (left.text == "") is (len(begun) > 1), "the first alone is a guess, and the worst"
+        assert math.isnan(left.seconds) is (len(begun) > 1)
+    left = after([5.0] + [0.0] * 9 + [0.1] * 40, 1050)
+    assert left.seconds == pytest.approx(100.0, rel=0.05)
 
 
 def test_a_plain_line_says_how_long_is_left(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
