@@ -50,6 +50,7 @@ def edited(run: Path, to: Path, **changes: Any) -> Path:
     return to
 
 
+@pytest.mark.quick
 def test_a_run_is_made_again_from_anywhere_with_the_same_bytes(run: Path, tmp_path: Path) -> None:
     done = again(run, "--out", "again", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -63,6 +63,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Event]]:
     return folder, [*events(done.stderr), {"event": "over", "elapsed_s": time.monotonic() - began}]
 
 
+@pytest.mark.quick
 def test_the_stages_of_a_run_cover_it(told: tuple[Path, list[Event]]) -> None:
     *found, over = told[1]
     assert check_stages(found) == STAGES
@@ -160,6 +161,7 @@ def test_the_page_has_every_event_with_its_fields(told: tuple[Path, list[Event]]
     assert set(listed) - set(STAGES) == {"refinement", "feature map"}
 
 
+@pytest.mark.quick
 def test_who_is_killed_leaves_whole_lines(tmp_path: Path) -> None:
     words = ("run", SAMPLE, "--progress", "json", "--out", tmp_path / "run")
     with subprocess.Popen(
