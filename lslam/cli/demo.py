@@ -61,8 +61,8 @@ def command(out: Path, no_open: bool, **given: Any) -> None:
     is_shown = not no_open and open_page(page)
     if given["as_json"]:
         return
-    where = "is open in your browser" if is_shown else "open it in a browser"
-    show(f"\nThe page, {where}: {page.absolute()}\n\nTo go on:\n")
+    where = "is open in your browser" if is_shown else "is to be opened in a browser"
+    show(f"\nThe page {where}: {page.absolute()}\n\nTo go on:\n")
     for words in (
         ("info", recording),
         ("run", recording, "--gnss", "--set", "map.format=laz", "--out", out / "georeferenced"),

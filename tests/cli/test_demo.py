@@ -8,7 +8,7 @@ import webbrowser
 from pathlib import Path
 
 import pytest
-from calling import lslam
+from calling import SAMPLE, lslam
 
 from lslam.cli import console, demo
 
@@ -31,9 +31,10 @@ def test_it_makes_a_recording_and_a_run_and_its_commands_work(tmp_path: Path, mo
     manifest = json.loads((folder / "run/manifest.json").read_text())
     assert manifest["counts"]["ok"] == 12
     assert "status       done" in done.stdout
-    assert f"The page, open it in a browser: {page}" in done.stdout
+    assert f"The page is to be opened in a browser: {page}" in done.stdout
     lines = done.stdout.partition("To go on:\n")[2].splitlines()
     assert len(lines) == 3
+    assert "\n".join(lines) in (SAMPLE.parent / "docs/tasks/installing.md").read_text()
     for line in lines:
         name, *words = shlex.split(line)
         assert name == "lslam"
@@ -55,7 +56,7 @@ def test_the_page_opens_where_there_is_a_display(tmp_path: Path, monkeypatch: py
     done = lslam("demo", "--out", out)
     assert done.returncode == 0, done.stderr
     assert opened == [(out / "run/report.html").as_uri()]
-    assert "The page, is open in your browser" in done.stdout
+    assert "The page is open in your browser" in done.stdout
     assert f"lslam info '{out}/recording'" in done.stdout
     shut = lslam("demo", "--out", out, "--no-open", "--overwrite", "--json")
     assert len(opened) == 1

@@ -43,6 +43,8 @@ def test_it_tells_every_part_in_a_second() -> None:
     assert [line.split()[0] for line in done.stdout.splitlines() if not line.startswith(" ")] == list(found)
     for name in found["extras"]:
         assert f"{name} " in done.stdout
+    shown = (ROOT / "docs/tasks/installing.md").read_text().partition("```text\nlslam ")[2].partition("```")[0]
+    assert [line.split()[0] for line in f"lslam {shown}".splitlines() if not line.startswith(" ")] == list(found)
 
 
 def test_one_of_a_sequence_and_the_machine() -> None:
