@@ -95,7 +95,8 @@ def test_flags_exist(shown: Page) -> None:
     from lslam.cli.main import COMMANDS as NAMES
     from lslam.cli.main import cli
 
-    known = {"--help", "--version", "--nworkers", "--nthreads"}  # the last two of `dask worker`
+    known = {"--help", "--version", "--nworkers", "--nthreads", "--no-compile", "--file"}
+    # Of `dask worker`, `pip install` and `pyproj sync`.
     for command_name in NAMES:
         command = cli.get_command(click.Context(cli), command_name)
         assert command is not None
