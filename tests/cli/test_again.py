@@ -31,7 +31,7 @@ def run(recording: Path) -> Path:
     """With all that comes from beside the recording, told by paths as they are seen from its folder."""
     shutil.copy(recording / "poses/00.txt", recording / "truth.txt")
     done = lslam(
-        "run", "sequences/00", "--gt", "truth.txt", "--start", "2", "--count", "24", "--imu", "--gnss",
+        "run", "../sample", "--gt", "truth.txt", "--start", "2", "--count", "24", "--imu", "--gnss",
         "--osm", "sequences/00/map.osm", "--set", "map.voxel=0.4", "--out", "../first", cwd=recording,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

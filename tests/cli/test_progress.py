@@ -21,7 +21,20 @@ from lslam.cli.main import COMMANDS, cli
 Event = dict[str, Any]
 # Of the stages of a run with loops, in their order.
 STAGES = ["opening", "preparing", "kernels", "odometry", "loops", "pose graph", "results", "map", "report"]
-LONG = ["demo", "run", "deliver", "localize", "graph", "merge", "compare", "batch", "sweep", "simulate", "convert", "map"]
+LONG = [
+    "demo",
+    "run",
+    "deliver",
+    "localize",
+    "graph",
+    "merge",
+    "compare",
+    "batch",
+    "sweep",
+    "simulate",
+    "convert",
+    "map",
+]
 
 
 def events(stderr: str) -> list[Event]:
