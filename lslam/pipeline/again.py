@@ -19,6 +19,8 @@ from lslam.pipeline.manifest import machine_facts
 from lslam.pipeline.resume import INPUTS, input_digest
 from lslam.pipeline.run_folder import MANIFEST, OURS, REPLIES, require_run
 
+# Options with which a recording is opened.
+READING = ("lidar_topic", "lidar_frame", "imu_topic", "gnss_topic", "point_times", "extrinsics")
 # Files that hold times or the names of folders.
 _ALWAYS_OTHER = {MANIFEST, "config.toml", "log.txt", "timing.csv", "report.html"}
 
@@ -72,8 +74,9 @@ def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
                 f"{folder} is a merge of several runs: make it again by its command, {manifest['command']}"
             )
         section = manifest["sequence"]
-        path, reading = str(section["path"]), {name: str(text) for name, text in section.get("reading", {}).items()}
-        truth = manifest.get("ground_truth")
+        path, told = str(section["path"]), section.get("reading", {})
+        reading = {name: str(told[name]) for name in READING if name in told}
+        truth = None if manifest.get("ground_truth") is None else Path(manifest["ground_truth"])
         identity = {name: str(digest) for name, digest in manifest.get("identity", {}).items()}
     except (AttributeError, *MISFIT) as error:
         raise InputError(
@@ -97,8 +100,7 @@ def read_recipe(folder: Path, recording: Path | None = None) -> Recipe:
             f"the recording of {folder} is gone: {place} does not exist; say where it is: lslam run RECORDING --again {folder}"
         )
     has_moved = recording is not None and recording.absolute() != Path(path)
-    of_truth = None if truth is None else Path(truth)
-    return Recipe(folder, manifest, config, place, reading, of_truth, identity, has_moved, tuple(notes))
+    return Recipe(folder, manifest, config, place, reading, truth, identity, has_moved, tuple(notes))
 
 
 def other_programs(recipe: Recipe) -> list[str]:

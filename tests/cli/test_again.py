@@ -15,6 +15,7 @@ from calling import SAMPLE, Done, lslam
 from lslam.core.errors import InputError
 from lslam.io.formats.osm_files import read_osm
 from lslam.osm import source
+from lslam.pipeline.again import other_inputs, other_programs, read_recipe
 
 SAME_BYTES = re.compile(r"^  again +same bytes: (\d+) files$", re.MULTILINE)
 
@@ -162,6 +163,35 @@ def test_a_folder_that_does_not_say_what_was_run(run: Path, tmp_path: Path) -> N
     done = again(folder, "--out", tmp_path / "again")
     assert done.returncode in (2, 3)
     assert "config.toml" in done.stderr.splitlines()[-1]
+
+
+def test_a_manifest_of_nonsense_is_no_crash(tmp_path: Path) -> None:
+    """Every part replaced by each of some things that are none: what comes is the sentence, or the run as far as it is told."""
+    good: dict[str, Any] = {
+        "sequence": {"path": str(SAMPLE), "reading": {"lidar_topic": "/a", "what": "is this"}, "decisions": []},
+        "identity": {"input": "1"}, "machine": {"numpy": "1"}, "ground_truth": "a.txt", "lslam": "0", "status": "done",
+    }  # fmt: skip
+    (tmp_path / "config.toml").touch()
+    said: list[str] = []
+    for part in ("sequence", "sequence.path", "sequence.reading", *good):
+        for junk in (None, 3, "x", [], {}, [1], {"a": [2]}, True):
+            tree = json.loads(json.dumps(good))
+            place, _, key = part.partition(".")
+            if key:
+                tree[place][key] = junk
+            else:
+                tree[place] = junk
+            (tmp_path / "manifest.json").write_text(json.dumps(tree))
+            try:
+                recipe = read_recipe(tmp_path)
+            except InputError as error:
+                said.append(str(error))
+                continue
+            other_programs(recipe)
+            other_inputs(recipe, {})
+            assert set(recipe.reading) <= {"lidar_topic"}
+    assert said
+    assert all(str(tmp_path) in text for text in said)
 
 
 def test_poses_of_another_program(run: Path, recording: Path, tmp_path: Path) -> None:

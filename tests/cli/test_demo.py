@@ -8,7 +8,7 @@ import webbrowser
 from pathlib import Path
 
 import pytest
-from calling import SAMPLE, lslam
+from calling import SAMPLE, assert_one_sentence, lslam
 
 from lslam.cli import console, demo
 
@@ -44,6 +44,7 @@ def test_it_makes_a_recording_and_a_run_and_its_commands_work(tmp_path: Path, mo
     assert (folder / "compared/compare.html").is_file()
     once_more = lslam("demo", cwd=tmp_path)
     assert once_more.returncode == 2
+    assert_one_sentence(once_more.stderr)
     assert "--overwrite" in once_more.stderr
     assert lslam("demo", "--overwrite", "-q", cwd=tmp_path).stderr == ""
 
