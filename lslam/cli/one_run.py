@@ -63,13 +63,13 @@ def read_truth(path: Path | None, sequence: Sequence) -> Trajectory | None:
 
 def watch_of(stack: ExitStack, stop: Stop, finish: Callable[[RunOutcome], None]) -> Watch:
     """Watch with progress bars that stops the run after the current scan on a signal."""
-    from lslam.pipeline.watch import Watch
+    from lslam.pipeline.watch import BEFORE_SCANS, Watch
 
     stages = Stages(stack)
 
     def on_start(stage: str, total: int) -> None:
         stages.begin(stage, total)
-        stop.is_gentle = stop.is_gentle or total > 0  # a stage without steps asks seldom
+        stop.is_gentle = stage not in BEFORE_SCANS
 
     def on_end(outcome: RunOutcome) -> None:
         stages.end()

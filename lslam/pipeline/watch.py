@@ -20,6 +20,9 @@ from lslam.reports.picture import WIDTH, as_html, drawn
 from lslam.reports.plots import first_available
 from lslam.reports.text import summary
 
+# Stages before the first scan: what is asked to stop there need not wait for the end of anything.
+BEFORE_SCANS = ("preparing", "kernels")
+
 
 @dataclass(frozen=True)
 class RunOutcome:

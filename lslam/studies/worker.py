@@ -205,7 +205,7 @@ def _waited_s() -> float:
 def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
     """Status and reason of a run that came to its end."""
     from lslam.pipeline.run import run
-    from lslam.pipeline.watch import RunOutcome, Watch
+    from lslam.pipeline.watch import BEFORE_SCANS, RunOutcome, Watch
 
     if job.refusal:
         raise InputError(job.refusal)
@@ -224,7 +224,7 @@ def _run(job: Job, is_persistent: bool) -> tuple[str, str]:
 
     def be_gentle(stage: str, scans: int) -> None:
         """Let a signal end the run after the scan in work, from the first stage of scans on."""
-        stop.is_gentle = stop.is_gentle or scans > 0
+        stop.is_gentle = stage not in BEFORE_SCANS
 
     watch = Watch(be_gentle, on_end=ended.append, should_stop=stop)
 
