@@ -20,7 +20,7 @@ CGROUP, CGROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
 EXTRAS = {
     "open3d": ("map.denoise, map.mesh, method open3d-gicp", ("open3d",)),
     "parquet": ("results.parquet of studies", ("pyarrow",)),
-    "view": ("lslam view, for the rerun viewer", ("rerun",)),
+    "view": ("lslam view RUN --rerun FILE, for the rerun viewer", ("rerun",)),
     "small-gicp": ("method small-gicp", ("small_gicp",)),
     "geo": ("lslam convert to KML, GPX and GeoPackage", ("fastkml", "fudgeo", "gpxpy", "pygeoif")),
     "cluster": ("--cluster and --scheduler", ("dask", "distributed")),
