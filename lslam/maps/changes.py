@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,6 +19,8 @@ Kind = Literal["appeared", "vanished"]
 
 # Cells in a thing, at most, that noise explains: what is smaller than a cell lies in up to eight of them.
 NOISE_CELLS = 8
+# Cells along an edge of the squares, seen from above, in which a finished map must have a point for it to be known there.
+KNOWN_CELLS = 5
 
 
 @dataclass(frozen=True)
@@ -138,6 +141,47 @@ def changed_cells(new: Evidence, old: Evidence) -> ChangedCells:
     )
 
 
+def differences(found: Evidence, cloud: Floats) -> tuple[MapChange, ...]:
+    """Objects by which a drive differs from a finished map (N, 3), m, in the world of the drive.
+
+    A map tells where surfaces are, not where nothing is. So what `vanished` stood where beams of the drive passed and none
+    ended, and what `appeared` is new, or was hidden when the map was made; only squares in which the map has points count.
+    """
+    cells = np.floor(cloud / found.voxel).astype(np.int64)
+    known, none = np.unique(_keys(cells, found.origin)), np.zeros(0, np.int64)
+    drive = _drive(found)
+    drive = replace(drive, blocked=found.keys[found.was_hit])
+    gone = _things("vanished", _Drive(known, known, known, none, known), drive, found)
+    new = drive.occupied[~_beside(drive.occupied, known)]
+    new = new[np.isin(_squares(_cells(new, found)), np.unique(_squares(cells)))]
+    return (*_objects("appeared", new, _among(new, drive.certain), found), *gone)
+
+
+def _squares(cells: Longs) -> Longs:
+    """Number of the square, seen from above, of each cell (M, 3)."""
+    x, y = (cells[:, :2] // KNOWN_CELLS).T
+    return np.asarray((x << 32) + y)
+
+
+def points_in(cloud: Floats, changes: Iterable[MapChange], found: Evidence) -> Bools:
+    """(N,) which points (N, 3), m, lie in cells of the changes."""
+    parts = [change.cells for change in changes]
+    if not parts:
+        return np.zeros(len(cloud), np.bool_)
+    cells = np.floor(cloud / found.voxel).astype(np.int64)
+    return _among(_keys(cells, found.origin), np.sort(_keys(np.concatenate(parts), found.origin)))
+
+
+def _keys(cells: Longs, origin: Longs) -> Keys:
+    """Key of each cell (M, 3), -1 beyond the range of keys."""
+    from lslam.maps.kernels.voxel_average import AXIS_BITS, HALF
+
+    places = cells - origin + HALF
+    is_inside = ((places >= 0) & (places < 2 * HALF)).all(axis=1)
+    x, y, z = places.T
+    return np.where(is_inside, (x << 2 * AXIS_BITS) | (y << AXIS_BITS) | z, -1)
+
+
 def _drive(found: Evidence) -> _Drive:
     lowest, highest = int(MODEL[2]), int(MODEL[3])
     in_the_end, in_the_sum = found.log_odds, found.sums
@@ -155,11 +199,16 @@ def _things(kind: Kind, here: _Drive, there: _Drive, found: Evidence) -> list[Ma
     passed = here.occupied[_among(here.occupied, there.free)]
     alone = passed[~_beside(passed, there.blocked) & _open(passed, there.seen)]
     cells = passed[_beside(passed, alone)]
+    return _objects(kind, cells, _among(cells, here.certain) & _among(cells, alone), found)
+
+
+def _objects(kind: Kind, cells: Keys, certain: Bools, found: Evidence) -> list[MapChange]:
+    """Connected cells, of which at least one is `certain`, and more of them than noise makes; the largest first."""
     if not len(cells):
         return []
     labels = _components(cells)
     sizes = np.bincount(labels)
-    is_certain = np.bincount(labels, _among(cells, here.certain) & _among(cells, alone)) > 0
+    is_certain = np.bincount(labels, certain) > 0
     kept = np.flatnonzero((sizes > NOISE_CELLS) & is_certain)
     kept = kept[np.argsort(-sizes[kept], kind="stable")]
     return [MapChange(kind, _cells(cells[labels == label], found), found.voxel) for label in kept]

@@ -62,6 +62,15 @@ class Evidence:
     def __len__(self) -> int:
         return len(self.keys)
 
+    @property
+    def was_hit(self) -> Bools:
+        """(M,) whether any beam ended in a cell, as foliage that most beams pass.
+
+        A sum is that of hits less what misses take, so it tells the hits modulo a miss: a multiple of that counts as none.
+        """
+        hit, miss = int(MODEL[0]), -int(MODEL[1])
+        return np.asarray(self.sums * pow(hit, -1, miss) % miss != 0)
+
 
 class OccupancyMapper:
     """Updates cells by rays; a scan updates a cell once, and a hit overrides a miss.

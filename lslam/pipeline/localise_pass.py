@@ -36,6 +36,7 @@ from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import motion_within
 from lslam.pipeline.prior_map_files import read_prior_map
+from lslam.pipeline.prior_map_view import view_prior_map
 from lslam.pipeline.watch import Watch
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
@@ -66,6 +67,13 @@ def localise_poses(job: PreparedRun, record: RunRecord) -> None:
             return
     _deliver(record, prior_map, fixes, config)
     _tell(record, prior_map, start, config, manifest)
+    if job.folder is None or not config.report.html:
+        return
+    with manifest.timed("differences_s"):
+        try:
+            view_prior_map(job, record, prior_map)
+        except InterruptedRunError as error:
+            manifest.interrupt(str(error))
 
 
 def _followed(

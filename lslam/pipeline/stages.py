@@ -122,9 +122,10 @@ def make_map(folder: RunFolder, job: PreparedRun, record: RunRecord) -> None:
         )
         score = crispness(built.merged) if config.map.voxel else None
         outputs.write_map(folder, built, config.map, record)
-        record.map_file, record.map_sample = f"map.{config.map.format}", built.sample
-        record.map_image, record.map_heights = built.view.image, built.view.heights
-        record.map_extent = built.view.extent
+        record.map_file = f"map.{config.map.format}"
+        if not record.map_fixes:  # else the page shows the drive on the map that it was located in
+            record.map_sample, record.map_extent = built.sample, built.view.extent
+            record.map_image, record.map_heights = built.view.image, built.view.heights
         record.crispness = score
         manifest.map_points, manifest.map_colour = len(built.merged), built.colour
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from lslam.core.errors import ConfigError, InterruptedRunError
 from lslam.core.geometry import se3
 from lslam.core.stopping import asking
-from lslam.maps.changes import ChangedCells, MapChange, changed_cells
-from lslam.maps.occupancy import Evidence, OccupancyMapper
+from lslam.maps.changes import ChangedCells, MapChange, changed_cells, differences, points_in
+from lslam.maps.occupancy import MODEL, Evidence, OccupancyMapper
 
 VOXEL = 0.4
 ORIGIN = np.zeros(3, np.int64)
@@ -140,3 +140,37 @@ def test_sums_know_no_order_and_keys_no_mapper() -> None:
     assert np.array_equal(a.sums, b.sums)
     assert not np.array_equal(a.log_odds, b.log_odds)
     assert 9 * (85 - 41) in a.sums.tolist()
+
+
+def plate(low: tuple[float, float, float], high: tuple[float, float, float]) -> Floats:
+    """Points 0.1 m apart between two corners, m."""
+    axes = [np.arange(a, b + 1e-9, 0.1) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
+
+
+WALL, FLOOR = plate((-9, 10.1, -2.3), (9, 10.1, 2.5)), plate((-9, 1, -2.6), (9, 10, -2.6))
+FRONT = plate((-1, 5.1, -1.1), (1, 5.1, 0.3))
+
+
+def test_a_finished_map_tells_what_is_gone_and_what_is_not_in_it() -> None:
+    same = drive()
+    assert differences(same, np.concatenate([WALL, FLOOR])) == ()
+    cloud = np.concatenate([WALL, FLOOR, FRONT])
+    (gone,) = differences(same, cloud)
+    assert gone.kind == "vanished"
+    assert np.array_equal(points_in(cloud, [gone], same), np.arange(len(cloud)) >= len(WALL) + len(FLOOR))
+    boxed = drive(box=True)
+    (new,) = differences(boxed, np.concatenate([WALL, FLOOR]))
+    assert new.kind == "appeared"
+    assert (new.cells.min(0) == np.floor(BOX[0] / VOXEL)).all()
+    # Where the map has nothing at all it does not say that there was nothing.
+    assert differences(boxed, WALL) == ()
+    assert points_in(cloud, [], boxed).sum() == 0
+
+
+def test_what_any_beam_met_is_not_gone() -> None:
+    """As foliage, which most beams pass: the cells are free in the end."""
+    found = drive(box=lambda k: k == 8)
+    free = found.log_odds <= MODEL[2]
+    assert (free & found.was_hit).sum() > 10
+    assert differences(found, np.concatenate([WALL, FLOOR, FRONT])) == ()

@@ -68,6 +68,15 @@ class PriorMap:
         parts = [self.points[self._begins[row + low[1]] : self._begins[row + high[1] + 1]] for row in rows]
         return np.concatenate(parts)
 
+    def along(self, positions: Floats, reach: float) -> Points:
+        """Points (M, 3), m, within `reach` m horizontally of the blocks that positions (N, 3) lie in, level axes."""
+        entered = np.unique(np.floor(positions[:, :2] / BLOCK_M).astype(np.int64), axis=0)
+        steps = np.arange(-int(np.ceil(reach / BLOCK_M)), int(np.ceil(reach / BLOCK_M)) + 1)
+        near = entered[:, None] + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) - self._low
+        near = near[((near >= 0) & (near < self._shape)).all(axis=-1)]
+        parts = [self.points[self._begins[n] : self._begins[n + 1]] for n in np.unique(near @ [self._shape[1], 1])]
+        return np.concatenate([self.points[:0], *parts])
+
 
 def make_prior_map(
     points: Floats,

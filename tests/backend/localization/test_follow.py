@@ -142,3 +142,16 @@ def test_what_is_searched_is_near_the_map(world: Revisited) -> None:
     beyond = np.array([high[0] + 30.0, 0.5 * (low + high)[1]])
     assert not search.is_near(beyond, 20.0)
     assert search.is_near(beyond, 30.0 + float(high[0] - low[0]))
+
+
+def test_the_part_of_the_map_along_a_drive_has_all_points_within_reach_and_none_far_away() -> None:
+    rng = np.random.default_rng(1)
+    prior_map = PriorMap(rng.uniform((-200, -150, 0), (200, 150, 9), (40_000, 3)).astype(np.float32), np.eye(4))
+    drive = np.stack([np.linspace(-60, 70, 40), np.linspace(0, 90, 40), np.zeros(40)], 1)
+    found = prior_map.along(drive, 40.0)
+    away = np.linalg.norm(prior_map.points[:, None, :2] - drive[None, :, :2], axis=2).min(axis=1)
+    known = {point.tobytes() for point in found}
+    assert len(known) == len(found)
+    assert all(point.tobytes() in known for point in prior_map.points[away < 40.0])
+    assert all(point.tobytes() not in known for point in prior_map.points[away > 40.0 + 3 * 32.0])
+    assert len(prior_map.along(drive + 5000.0, 40.0)) == 0
