@@ -13,7 +13,7 @@ from lslam.core.types.comparison import Table
 from lslam.core.types.run_record import LoopView, RunRecord
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
-from lslam.reports.page_data import PIXELS, Crop, crop_images
+from lslam.reports.crops import PIXELS, Crop, crop_images
 from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
 from lslam.reports.png import data_uri, density_png
 from lslam.reports.svg import WIDTH, By, Track, plane_chart

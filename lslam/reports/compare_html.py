@@ -13,19 +13,23 @@ import numpy as np
 
 from lslam.core.errors import LslamError
 from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud, thinned
 from lslam.core.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.point_files import read_cloud
+from lslam.maps.floor_plan import top_view
 from lslam.reports import svg
-from lslam.reports.compare_table import recipes, tables
+from lslam.reports.compare_table import TITLES, recipes, stage_times, tables
+from lslam.reports.crops import Crop, choose_crops, crop_images
 from lslam.reports.html import flatten
-from lslam.reports.page_data import Crop, choose_crops, crop_images
+from lslam.reports.page_data import cloud_data, map_figure, ways_data
 from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
-from lslam.reports.png import data_uri, density_png
-from lslam.reports.shell import render
+from lslam.reports.png import VIRIDIS, data_uri, density_png
+from lslam.reports.shell import MAP, render
 from lslam.reports.svg import Track, plane_chart
 
-WIDEST = 125  # characters of a table that the page shows without scrolling
+MAP_POINTS = 100_000  # under the trajectories
+WIDEST = 165  # characters of a table that the page shows without scrolling
 STYLES = 12
 SHADES = 8  # of grey, for stages: colours are those of methods
 _ROW, _BAR = 42, 18
@@ -33,12 +37,18 @@ _ROW, _BAR = 42, 18
 
 @dataclass(frozen=True)
 class SequenceSection:
-    """One sequence on the page: its figures, its map crops by place, links to the pages of its runs."""
+    """One sequence on the page.
+
+    It has figures of errors and trajectories, of times, map crops by place, links to the pages of its runs; and the first
+    with a map has this, as `map_section.html.j2` takes it.
+    """
 
     sequence: str
     figures: list[Figure]
+    time: Figure | None
     crops: list[list[Figure]]
     links: list[tuple[str, str]]
+    map: dict[str, Any] | None
 
 
 def write_page(
@@ -57,35 +67,76 @@ def render_page(
 ) -> str:
     """Page as text; links to runs are relative to `folder`."""
     place = None if crop is None else Crop(*crop)
-    sections = [_section(folder, comparison, name, drawings, place) for name in comparison.sequences]
+    sections: list[SequenceSection] = []
+    for name in comparison.sequences:
+        has_map = any(section.map for section in sections)
+        sections.append(_section(folder, comparison, name, drawings, place, not has_map))
+    short, times = stage_times(comparison)
+    shown = tables(short, WIDEST)
+    is_first = [t.title in ("", *TITLES.values(), *(b.title for b in comparison.beside)) for t in shown]
     return render(
         "compare.html.j2",
+        MAP,
         comparison=comparison,
-        tables=tables(comparison, WIDEST),
+        tables=[t for t, first in zip(shown, is_first, strict=True) if first],
+        more=[t for t, first in zip(shown, is_first, strict=True) if not first],
+        times=times,
         recipes=recipes(comparison),
         sections=sections,
         styles={method: style_of(method, comparison.methods) for method in comparison.methods},
+        colours=VIRIDIS,
+        map_note="",
         machine=_machine(comparison),
         configs=_configs(comparison),
     )
 
 
 def _section(
-    folder: Path, comparison: Comparison, sequence: str, drawings: Sequence[Drawing], crop: Crop | None
+    folder: Path,
+    comparison: Comparison,
+    sequence: str,
+    drawings: Sequence[Drawing],
+    crop: Crop | None,
+    may_have_map: bool,
 ) -> SequenceSection:
-    figures: list[Figure | None] = []
+    figures: list[Figure] = []
     crops: list[list[Figure]] = []
+    map_shown = None
     for drawing in drawings:
         if drawing.sequence == sequence:
-            figures += [trajectory_figure(drawing, comparison.methods), error_figure(drawing, comparison.methods)]
-            crops = crop_figures(drawing, crop)
-    figures.append(time_figure(comparison, sequence))
+            clouds = [_cloud(run) for run in drawing.runs]
+            map_shown = method_map(drawing, comparison.methods, clouds) if may_have_map else None
+            figures += [] if (errors := error_figure(drawing, comparison.methods)) is None else [errors]
+            figures += [] if map_shown else [trajectory_figure(drawing, comparison.methods)]
+            crops = crop_figures(drawing, crop, clouds)
     links = [
         (f"{run.method}, seed {run.seed}", quote(page.relative_to(folder).as_posix()))
         for run in comparison.runs
         if run.sequence == sequence and (page := run.folder / "report.html").is_file()
     ]
-    return SequenceSection(sequence, [f for f in figures if f is not None], crops, links)
+    return SequenceSection(sequence, figures, time_figure(comparison, sequence), crops, links, map_shown)
+
+
+def method_map(drawing: Drawing, methods: Sequence[str], clouds: Sequence[Floats | None]) -> dict[str, Any] | None:
+    """Values for the template of a map: the first cloud there is, with every trajectory over it; None without a cloud."""
+    known = [(run.method, cloud) for run, cloud in zip(drawing.runs, clouds, strict=True) if cloud is not None]
+    if not known:
+        return None
+    method, points = known[0]
+    view, tracks = top_view(points), _tracks(drawing, methods)
+    about = f"{_sentence(f'seed {drawing.seed}, {drawing.recipe}')} Points: map of {method}."
+    legend = [(track.style, track.label) for track in tracks]
+    figure = map_figure(view.image, view.heights, view.extent, tracks, legend, about)
+    if figure is None:
+        return None
+    ways = [(run.method, style_of(run.method, methods), run.positions) for run in drawing.runs]
+    ways = ways if drawing.gt_positions is None else [("ground truth", "gt", drawing.gt_positions), *ways]  # underneath
+    return {
+        "map_figure": figure,
+        "map_extent": view.extent,
+        "cloud_data": cloud_data(thinned(ArrayCloud(points), MAP_POINTS)),
+        "sessions": {"sessions": ways_data(ways), "ties": "", "tied": 0},
+    }
 
 
 def _machine(comparison: Comparison) -> list[tuple[str, list[str]]]:
@@ -118,20 +169,24 @@ def style_of(method: str, methods: Sequence[str]) -> str:
     return f"s{methods.index(method) % STYLES + 1}"
 
 
+def _tracks(drawing: Drawing, methods: Sequence[str]) -> list[Track]:
+    """Trajectories of a drawing, ground truth last, dashed."""
+    tracks = [Track(run.method, run.positions[:, :2], style_of(run.method, methods)) for run in drawing.runs]
+    return (
+        tracks if drawing.gt_positions is None else [*tracks, Track("ground truth", drawing.gt_positions[:, :2], "gt")]
+    )
+
+
 def trajectory_figure(drawing: Drawing, methods: Sequence[str]) -> Figure:
     """All trajectories of a drawing from above, ground truth dashed."""
-    tracks = []
-    for run in drawing.runs:
-        tracks.append(Track(run.method, run.positions[:, :2], style_of(run.method, methods)))
-    if drawing.gt_positions is not None:
-        tracks.append(Track("ground truth", drawing.gt_positions[:, :2], "gt"))
+    tracks = _tracks(drawing, methods)
     chart = plane_chart(tracks, f"trajectories on {drawing.sequence} from above")
     legend = tuple((track.style, track.label) for track in tracks)
     return Figure("Trajectories from above", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
 
 
 def error_figure(drawing: Drawing, methods: Sequence[str]) -> Figure | None:
-    """Position error over distance, one line per method; None without ground truth."""
+    """Position error over distance, one line per method; without ground truth the distance from the first of them."""
     lines = [
         svg.Line(run.method, run.distance, run.errors, style_of(run.method, methods))
         for run in drawing.runs
@@ -139,9 +194,14 @@ def error_figure(drawing: Drawing, methods: Sequence[str]) -> Figure | None:
     ]
     if not lines:
         return None
-    chart = svg.line_chart(lines, DISTANCE, "position error, m", f"position error on {drawing.sequence}")
     legend = tuple((line.style, line.label) for line in lines)
-    return Figure("Position error", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
+    if not drawing.reference:
+        chart = svg.line_chart(lines, DISTANCE, "position error, m", f"position error on {drawing.sequence}")
+        return Figure("Position error", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
+    title, along = f"Distance from {drawing.reference}", f"distance along {drawing.reference}, m"
+    chart = svg.line_chart(lines, along, "distance, m", f"{title} on {drawing.sequence}")
+    said = f"Seed {drawing.seed}. No ground truth: from the same start, how far each is from {drawing.reference}, which"
+    return Figure(title, chart, legend, f"{said} may be the one that is wrong.")
 
 
 def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
@@ -172,9 +232,8 @@ def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
     )
 
 
-def crop_figures(drawing: Drawing, crop: Crop | None) -> list[list[Figure]]:
-    """For each place, one figure per method that has a map; places are chosen in the first method's map."""
-    clouds = [_cloud(run) for run in drawing.runs]
+def crop_figures(drawing: Drawing, crop: Crop | None, clouds: Sequence[Floats | None]) -> list[list[Figure]]:
+    """For each place, one figure per method that has a map; places are chosen in the first map of `clouds`."""
     known = [cloud for cloud in clouds if cloud is not None]
     if not known:
         return []

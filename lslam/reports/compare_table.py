@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,12 @@ def tables(comparison: Comparison, width: int | None = None) -> list[CompareTabl
         for table in (_pairs(comparison), _differences(comparison), _doubts(comparison), _failures(comparison))
         if table.rows
     ]
+
+
+def stage_times(comparison: Comparison) -> tuple[Comparison, CompareTable]:
+    """The comparison without the times of single stages, and these as a table of their own."""
+    rest = tuple(m for m in comparison.metrics if m.group != "time" or m.key.count(".") < 2)
+    return replace(comparison, metrics=rest), _methods_table(comparison, ("time",), TITLES["time"])
 
 
 def recipes(comparison: Comparison) -> list[str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lslam.core.printable import counted
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.comparison import Table
 from lslam.core.types.imu import XYZ
@@ -19,7 +20,9 @@ from lslam.reports import plots, svg
 from lslam.reports.back_end import back_end_figures, back_end_rows
 from lslam.reports.buildings import building_pages
 from lslam.reports.candidates import candidate_data
-from lslam.reports.facts import RunFacts, run_facts
+from lslam.reports.cards import map_cards, run_cards
+from lslam.reports.facts import run_facts
+from lslam.reports.localization import WORDS, changed_dots, localization_figures, localization_tracks
 from lslam.reports.page_data import MapFigure, cloud_data, feature_figures, map_figure, scan_data
 from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
@@ -113,15 +116,6 @@ MOST_ROWS = 100
 MAP_PARTS = {"cards": "map_cards.html.j2", "map": "map_section.html.j2", "manifest": "manifest_table.html.j2"}
 
 
-@dataclass(frozen=True)
-class Card:
-    """A headline number."""
-
-    value: str
-    unit: str
-    name: str
-
-
 def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -> None:
     """Write the HTML report of a run, atomically.
 
@@ -149,13 +143,14 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         facts=facts,
         scan_data=scan_data(record, evaluation),
         candidate_data=candidate_data(record),
-        cards=_cards(facts, evaluation),
+        cards=run_cards(record, facts, evaluation),
         failures=facts.failures[:MOST_ROWS],
         degenerate=facts.degenerate[:MOST_ROWS],
         evaluation=evaluation,
         has_truth=record.ground_truth is not None,
         trajectory=plots.trajectory_figures(record, evaluation),
         back_end=back_end_figures(record, evaluation),
+        localization=localization_figures(record),
         back_end_title="In the map" if record.map_fixes else "Pose graph",
         back_end_said=localization_rows(record, evaluation) + back_end_rows(record, evaluation),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
@@ -176,9 +171,9 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
 def map_context(record: RunRecord) -> dict[str, Any]:
     """Values for the templates `MAP_PARTS`."""
     return {
-        "map_cards": _map_cards(record.crispness),
+        "map_cards": map_cards(record),
         "map_figure": _map_figure(record),
-        "map_note": _map_note(record.manifest.get("map")),
+        "map_note": _map_note(record.manifest),
         "cloud_data": cloud_data(record.map_sample, record.trajectory),
         "map_extent": record.map_extent,
         "colours": VIRIDIS,
@@ -190,11 +185,22 @@ def map_context(record: RunRecord) -> dict[str, Any]:
 def _map_figure(record: RunRecord) -> MapFigure | None:
     if record.map_image is None:
         return None
-    tracks = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)]
-    legend = (("s2", "trajectory"), ("start", "start"), ("end", "end"))
+    tracks, legend = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)], [("s2", "trajectory")]
+    about = f"World of the estimate.{_entropy(record.crispness)}"
+    if record.map_fixes:
+        tracks, legend = localization_tracks(record)
+        tracks.append(Track("ends", record.trajectory.positions[:, :2], "none", ends=True))
+        about = f"World and points of {record.manifest.get('localization', {}).get('map', 'the map')}, which holds the drive."
+    legend += [("start", "start"), ("end", "end")]
+    dots = changed_dots(record.map_sample)
+    legend += [(style, WORDS[style]) for style, _ in dots]
     return map_figure(
-        record.map_image, record.map_heights, record.map_extent, tracks, legend, "World of the estimate.", by="own"
+        record.map_image, record.map_heights, record.map_extent, tracks, legend, about, by="own", dots=dots
     )
+
+
+def _entropy(score: Crispness | None) -> str:
+    return "" if score is None or score.entropy is None else f" Map entropy {score.entropy:.2f}: lower is crisper."
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:
@@ -224,42 +230,30 @@ def _plain(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _map_note(built: Any) -> str:
-    """Remark on a map that was built after the run; empty for the run's own."""
+def _map_note(manifest: Mapping[str, Any]) -> str:
+    """Remark on a map that was built after the run, or what differs in an old one; empty for the run's own."""
+    built, found = manifest.get("map"), manifest.get("localization", {}).get("differences")
     if not isinstance(built, Mapping):
-        return ""
+        return "" if found is None else _differences_note(found)
     done = built.get("done")
     said = "".join(f"; {text}" for text in done) if isinstance(done, list) else ""
     points = f"voxels of {_plain(built.get('voxel'))} m" if built.get("voxel") else "every point"
     return f"{built.get('file')}, built anew after the run with {points}{said}"
 
 
-def _map_cards(crispness: Crispness | None) -> list[Card]:
-    cards = []
-    if crispness is not None and crispness.entropy is not None:
-        cards.append(Card(f"{crispness.entropy:.2f}", "", "map entropy: lower is crisper"))
-    if crispness is not None and crispness.plane_variance is not None:
-        cards.append(Card(f"{100 * crispness.plane_variance**0.5:.1f}", "cm", "thickness of planes in the map"))
-    return cards
+def _differences_note(found: Mapping[str, Any]) -> str:
+    """What differs between drive and map, in words."""
+    new, gone = counted(found["not_in_the_map"], "thing"), counted(found["gone"], "thing")
+    return (
+        f"Against the map: {gone} gone, that beams passed through, and {new} not in it, new or hidden when it was made; by "
+        f"the scans that the map holds, in cells of {found['voxel_m']:g} m. lslam map --changes compares both drives by all "
+        "their beams."
+    )
 
 
 def _metric_tables(evaluation: Evaluation) -> list[Table]:
     tables = [table for metric in shown_metrics(evaluation) for table in metric.tables(evaluation)]
     return [table for table in tables if table.rows]
-
-
-def _cards(facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
-    cards = [
-        Card(f"{facts.registered}/{facts.scans}", "", "scans registered"),
-        Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s"),
-    ]
-    if evaluation is not None:
-        cards += [Card(*card) for metric in shown_metrics(evaluation) for card in metric.cards(evaluation)]
-    if facts.total is not None:
-        cards.append(Card(f"{1e3 * facts.total.median:.1f}", "ms", "median time per scan"))
-        if facts.real_time_factor:
-            cards.append(Card(f"{facts.real_time_factor:.1f}", "×", "real time"))
-    return cards
 
 
 def _config_text(folder: Path | None) -> str:

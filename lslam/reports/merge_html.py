@@ -14,13 +14,12 @@ from lslam.core.types.comparison import Table
 from lslam.io.formats.atomic import atomic_write
 from lslam.maps.floor_plan import TopView
 from lslam.reports.compare_html import style_of
-from lslam.reports.page_data import MapFigure, cloud_data, map_figure, packed
+from lslam.reports.page_data import MapFigure, cloud_data, map_figure, packed, ways_data
 from lslam.reports.plots import Figure
 from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import MAP, render
 from lslam.reports.svg import Track, plane_chart
 
-MOST_POSES = 5000  # of a session that the script draws
 RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
 
 
@@ -60,12 +59,13 @@ def write_page(
         names=[s.name for s in sessions],
         problems=problems,
         figures=[*after, _figure("Before the pose graph, from above", found, sessions, [s.before for s in sessions])],
+        styles=[(s.name, style_of(s.name, [s.name for s in sessions])) for s in sessions],
         table=_table(rows),
         sessions_data=_sessions_data(sessions, ties),
         map_figure=shown,
         map_extent=None if view is None else view.extent,
         map_note="",
-        cloud_data=cloud_data(sample),
+        cloud_data=cloud_data(sample, sessions=[s.after for s in sessions]),
         colours=VIRIDIS,
     )
     with atomic_write(path) as stream:
@@ -89,13 +89,10 @@ def _figure(title: str, caption: str, sessions: Sequence[SessionView], positions
 
 
 def _sessions_data(sessions: Sequence[SessionView], ties: Floats) -> dict[str, Any]:
-    """Data for the script: positions and scan numbers of each session, and the loops."""
+    """Data for the script: positions after and before, and scan numbers of each session; the loops."""
     names = [s.name for s in sessions]
-    shown = []
-    for s in sessions:
-        some = slice(None, None, -(-len(s.after) // MOST_POSES) or 1)
-        own = {"positions": packed(s.after[some], "<f4"), "index": packed(s.scans[some], "<i4")}
-        shown.append({"name": s.name, "style": style_of(s.name, names), **own})
+    ways = [(s.name, style_of(s.name, names), s.after) for s in sessions]
+    shown = ways_data(ways, [s.scans for s in sessions], [s.before for s in sessions])
     return {"sessions": shown, "ties": packed(ties, "<f4"), "tied": len(ties)}
 
 

@@ -1,4 +1,4 @@
-"""Data for a page's script: all scans, map points, and the map's image with crops. Numbers are base64."""
+"""Data for a page's script: all scans, map points, several trajectories; and the map's image. Numbers are base64."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from lslam.core.types.run_record import FeatureView, RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Trajectory
 from lslam.reports import svg
+from lslam.reports.crops import Crop, crop_images
+from lslam.reports.localization import STATES, state_codes
 from lslam.reports.plots import Figure, first_available
 from lslam.reports.png import VIRIDIS, coloured_png, data_uri, density_png, halved, usual_range
 from lslam.reports.svg import MOST_POINTS, By, Track, plane_chart
@@ -26,17 +28,11 @@ if TYPE_CHECKING:
 
 STATUSES = ("registered", "standing", "bridged", "skipped", "not known")
 FLAGS = {"degenerate": 8, "lost": 16}  # beside the status in one byte
+MOST_POSES = 5000  # of one of several trajectories on a map
 MOST_TRUTH = 5000  # points of ground truth under the map
 LONGEST_REASON = 160  # characters
 MOST_KINDS = 8  # labels that have a colour of their own
 QUANTA = 65535  # of a coordinate over the extent of the cloud
-SIZE_M = 20.0
-MOST_CROPS = 3
-PIXELS = 200
-# m; a column whose points reach this high is a wall, a trunk, a car: structure, and not ground.
-_RELIEF = 1.0
-_CELL = 0.5
-_STEP = 5.0
 
 
 def scan_data(record: RunRecord, evaluation: Evaluation | None) -> dict[str, Any] | None:
@@ -68,9 +64,17 @@ def scan_data(record: RunRecord, evaluation: Evaluation | None) -> dict[str, Any
         "reasons": {
             str(k): r.reason[:LONGEST_REASON] for k, r in enumerate(results) if r is not None and r.status != "ok"
         },
+        **_against_map(record),
         "loops": [record.keyframe_scans[[c.a, c.b]].tolist() for c in record.loops if c.is_accepted],
     }
     return data if evaluation is None else data | _truth(trajectory, evaluation)
+
+
+def _against_map(record: RunRecord) -> dict[str, Any]:
+    """State of each scan against the map that the run was located in; empty without one."""
+    if not record.map_fixes:
+        return {}
+    return {"fixes": packed(state_codes(record), "u1"), "states": [list(state) for state in STATES.values()]}
 
 
 def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
@@ -91,12 +95,16 @@ def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -> dict[str, Any] | None:
+def cloud_data(
+    cloud: ArrayCloud | None, trajectory: Trajectory | None = None, sessions: Sequence[Floats] = ()
+) -> dict[str, Any] | None:
     """Some points of the map for the script; None if the map is empty.
 
     points : (M, 3) int16 q, where a coordinate is `low` + `step` (q + 32768), m; nearest : (M,) the nearest pose
     height : usual range of heights, m; intensity : (M,) 0 to 255 over the range `values`, when the map has them
     rgb : (M, 3) colours; kind : (M,) index into `kinds`, the labels, most frequent first, when the map has them
+    session : (M,) which of the `sessions`, positions (N, 3) of each, m, comes nearest to it
+    change : (M,) int8, -1 gone, 0 as it was, 1 not in the map, of a drive in an old one
 
     Any first part of the points is spread over the whole map, so that a page can draw fewer while the map moves.
     """
@@ -126,8 +134,13 @@ def cloud_data(cloud: ArrayCloud | None, trajectory: Trajectory | None = None) -
         data["rgb"] = packed(np.column_stack([cloud.columns[name][order] for name in ("red", "green", "blue")]), "u1")
     if "class" in cloud.columns:
         data |= _kinds(cloud.columns["class"][order])
+    if "change" in cloud.columns and cloud.columns["change"].any():
+        data["change"] = packed(cloud.columns["change"][order], "i1")
     if trajectory is not None and len(trajectory):
         data["nearest"] = packed(_nearest(points, trajectory.positions), "<u2" if len(trajectory) <= QUANTA else "<u4")
+    if sessions:
+        owner = np.repeat(np.arange(len(sessions)), [len(positions) for positions in sessions])
+        data["session"] = packed(owner[_nearest(points, np.concatenate(sessions))], "u1")
     return data
 
 
@@ -140,6 +153,29 @@ def _kinds(labels: NDArray[Any]) -> dict[str, Any]:
     if len(names) > MOST_KINDS:
         names = [*names[: MOST_KINDS - 1], "others"]
     return {"kind": packed(np.minimum(rank, MOST_KINDS - 1)[which], "u1"), "kinds": names}
+
+
+def ways_data(
+    ways: Sequence[tuple[str, str, Floats]],
+    numbers: Sequence[Longs] | None = None,
+    before: Sequence[Floats] | None = None,
+) -> list[dict[str, Any]]:
+    """Several trajectories on one map for the script, thinned: of each its name, style and positions (N, 3), m.
+
+    numbers : (N,) of the scans of each, else they are counted; before : (N, 3) of each as it was before, m
+    """
+    shown = []
+    for k, (name, style, positions) in enumerate(ways):
+        some = slice(None, None, -(-len(positions) // MOST_POSES) or 1)
+        index = np.arange(len(positions)) if numbers is None else numbers[k]
+        data = {
+            "name": name,
+            "style": style,
+            "positions": packed(positions[some], "<f4"),
+            "index": packed(index[some], "<i4"),
+        }
+        shown.append(data if before is None else data | {"before": packed(before[k][some], "<f4")})
+    return shown
 
 
 def _nearest(points: Floats, positions: Floats) -> NDArray[np.intp]:
@@ -190,96 +226,6 @@ def packed(values: NDArray[Any], kind: str) -> str:
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
 
 
-@dataclass(frozen=True)
-class Crop:
-    """A square seen from above: its centre and edge, m, in the world of the drawing."""
-
-    x: float
-    y: float
-    size: float
-
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """Limits x_min, x_max, y_min, y_max, m."""
-        half = self.size / 2
-        return (self.x - half, self.x + half, self.y - half, self.y + half)
-
-    def inside(self, points: Floats) -> Floats:
-        """Points among (K, 2) or (K, 3), m, that lie in the square."""
-        x0, x1, y0, y1 = self.extent
-        return points[((points[:, :2] >= (x0, y0)) & (points[:, :2] <= (x1, y1))).all(axis=1)]
-
-
-def choose_crops(points: NDArray[Any], size: float = SIZE_M, most: int = MOST_CROPS) -> list[Crop]:
-    """At most `most` squares of `size` m that do not overlap, those with most structure first.
-
-    Structure is counted in columns of 0.5 m whose points span more than 1 m of height; a square with less than a third of the
-    best one's is not worth showing. Empty without any.
-
-    Parameters
-    ----------
-    points : (M, 3) m; rows that are not finite are ignored
-    """
-    counts, low = _structure(points)
-    window, step = round(size / _CELL), round(_STEP / _CELL)
-    sums = _window_sums(counts, window, step)
-    crops: list[Crop] = []
-    best = sums.max(initial=0)
-    while len(crops) < most:
-        row, column = np.unravel_index(int(np.argmax(sums)), sums.shape)
-        if sums[row, column] <= best / 3 or sums[row, column] == 0:
-            break
-        x, y = low + _CELL * (step * np.array([row, column]) + window / 2)
-        crops.append(Crop(float(x), float(y), size))
-        reach = -(-window // step)
-        sums[max(row - reach + 1, 0) : row + reach, max(column - reach + 1, 0) : column + reach] = 0
-    return crops
-
-
-def crop_images(clouds: Sequence[NDArray[Any] | None], crop: Crop) -> tuple[list[NDArray[np.float32] | None], float]:
-    """Images of the square, points per pixel of each cloud (M, 3), row 0 at the largest y; and the common count drawn black.
-
-    None stays None; the count is the largest of the images' 99.5th percentiles of occupied pixels, at least 1.
-    """
-    images = [None if cloud is None else _image(cloud, crop) for cloud in clouds]
-    tops = [float(np.percentile(image[image > 0], 99.5)) for image in images if image is not None and image.any()]
-    return images, max([1.0, *tops])
-
-
-def _structure(points: NDArray[Any]) -> tuple[Longs, Floats]:
-    """Grid (x, y) of columns with relief, 0 or 1, and the grid's lower corner, m."""
-    xyz = np.asarray(points, np.float64)
-    xyz = xyz[np.isfinite(xyz).all(1)]
-    if not len(xyz):
-        return np.zeros((1, 1), np.int64), np.zeros(2)
-    low, high = np.percentile(xyz[:, :2], [0.1, 99.9], axis=0)
-    low = np.floor(low / _STEP) * _STEP
-    shape = np.maximum(np.ceil((high - low) / _CELL).astype(int), round(SIZE_M / _CELL))
-    cell = np.floor((xyz[:, :2] - low) / _CELL).astype(int)
-    inside = ((cell >= 0) & (cell < shape)).all(1)
-    index = np.ravel_multi_index(tuple(cell[inside].T), tuple(shape))
-    bottom, top = np.full(shape.prod(), np.inf), np.full(shape.prod(), -np.inf)
-    np.minimum.at(bottom, index, xyz[inside, 2])
-    np.maximum.at(top, index, xyz[inside, 2])
-    return (top - bottom > _RELIEF).astype(np.int64).reshape(shape), low
-
-
-def _window_sums(counts: Longs, window: int, step: int) -> Longs:
-    """Sums over windows of `window` x `window` cells, placed every `step` cells."""
-    padded = np.pad(counts, ((0, max(window - counts.shape[0], 0)), (0, max(window - counts.shape[1], 0))))
-    table = np.zeros((padded.shape[0] + 1, padded.shape[1] + 1), np.int64)
-    table[1:, 1:] = padded.cumsum(0).cumsum(1)
-    sums = table[window:, window:] - table[:-window, window:] - table[window:, :-window] + table[:-window, :-window]
-    return sums[::step, ::step].copy()
-
-
-def _image(cloud: NDArray[Any], crop: Crop) -> NDArray[np.float32]:
-    x0, x1, y0, y1 = crop.extent
-    counts, _, _ = np.histogram2d(cloud[:, 1], cloud[:, 0], bins=PIXELS, range=((y0, y1), (x0, x1)))
-    image: NDArray[np.float32] = counts[::-1].astype(np.float32)
-    return image
-
-
 WIDTH, HEIGHT = 980, 700
 MOST_PICTURE = 1_500_000  # bytes of the map from above, so that the page stays below 6 MB
 FROM_ABOVE = "The more voxels of a column are occupied, the stronger it is drawn from above."
@@ -305,11 +251,12 @@ def map_figure(
     legend: Sequence[tuple[str, str]],
     world: str,
     by: By = "",
+    dots: Sequence[tuple[str, NDArray[Any]]] = (),
 ) -> MapFigure | None:
     """Map from above with trajectories; None if the image has no points.
 
     image : (H, W) points per pixel, row 0 at the largest y; heights : (H, W) their mean z, m; grey without
-    extent : x_min, x_max, y_min, y_max, m; world : a sentence that says whose frame it is; by : as of a plane chart
+    extent : x_min, x_max, y_min, y_max, m; world : a sentence that says whose frame it is; by, dots : as of a plane chart
     """
     if not (image > 0).any():
         return None
@@ -330,6 +277,7 @@ def map_figure(
         width=WIDTH,
         tallest=HEIGHT,
         by=by,
+        dots=dots,
     )
     return MapFigure(Figure("Map", chart, tuple(legend), f"{world} {FROM_ABOVE}"), span, pixel)
 

@@ -125,10 +125,23 @@ def _available(errors: list[AbsoluteError]) -> AbsoluteError:
 
 
 def _in_own_world(sequence: str, seed: int, runs: Sequence[Finished]) -> Drawing:
-    drawn = tuple(
-        DrawnRun(run.job.method, run.trajectory.positions, None, None, np.eye(4), _map_file(run)) for run in runs
-    )
-    return Drawing(sequence, seed, None, drawn, "in the world of the LiDAR at the first scan")
+    """Without ground truth: every run from the start that all share, and how far it is from the first, scan by scan."""
+    drawn = []
+    for run in runs:
+        distance, errors = (None, None) if run is runs[0] else _apart(run, runs[0])
+        positions, file = run.trajectory.positions, _map_file(run)
+        drawn.append(DrawnRun(run.job.method, positions, distance, errors, np.eye(4), file))
+    recipe = "in the world of the LiDAR at the first scan"
+    return Drawing(sequence, seed, None, tuple(drawn), recipe, runs[0].job.method)
+
+
+def _apart(run: Finished, other: Finished) -> tuple[Floats | None, Floats | None]:
+    """m along another run and from it at the poses that both have, from the same start; None where they share none."""
+    try:
+        score = evaluate(run.trajectory, other.trajectory, EvalConfig(align=("origin",)))
+    except LslamError:  # `_differences` says so
+        return None, None
+    return score.distance, np.linalg.norm(score.ate["origin"].errors, axis=1)
 
 
 def _map_file(run: Finished) -> Path | None:

@@ -113,9 +113,9 @@ def test_a_map_built_anew_renews_what_the_run_says_of_its_map(run: Path) -> None
     }
 
     after = (run / "report.html").read_text()
-    assert f"<b>{score['map']['entropy']:.2f}</b>" in page
-    assert f"<b>{new['map']['entropy']:.2f}</b>" in after
-    assert f"<b>{score['map']['entropy']:.2f}</b>" not in after
+    assert f"Map entropy {score['map']['entropy']:.2f}:" in page
+    assert f"Map entropy {new['map']['entropy']:.2f}:" in after
+    assert f"Map entropy {score['map']['entropy']:.2f}:" not in after
     assert "map.ply, built anew after the run with voxels of 0.3 m; cleaned: " in after
     picture = re.compile(r"data:image/png;base64,[^\"]*")
     assert picture.findall(page) != picture.findall(after)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -11,7 +13,9 @@ import pytest
 from calling import SAMPLE, assert_one_sentence, lslam, strict_json
 from made_once import MadeOnce
 from numpy.typing import NDArray
+from point_writers import write_points
 from revisits import place_visits, town_poses, visit_drive
+from scipy.spatial import cKDTree
 
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import umeyama
@@ -103,6 +107,54 @@ def test_a_box_is_found_where_it_stands(new: str, old: str, kind: str, drives: P
     cloud = (tmp_path / "out" / "changes.ply").read_bytes()
     assert b"property float change" in cloud
     assert b"property uchar red" in cloud
+
+
+def cloud_of(page: Path) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """Points (N, 3), m, of a page's map and what became of each: -1 gone, 0 as it was, 1 not in the map."""
+    found = re.search(r'<script type="application/json" id="cloud">(.*?)</script>', page.read_text(), re.S)
+    assert found
+    data = json.loads(found[1])
+    q = np.frombuffer(base64.b64decode(data["points"]), "<i2").reshape(-1, 3)
+    points = np.array(data["low"]) + np.array(data["step"]) * (q + 32768.0)
+    change = data.get("change")
+    return points, np.zeros(len(q), np.int8) if change is None else np.frombuffer(base64.b64decode(change), "i1")
+
+
+def test_the_page_of_localize_shows_the_old_map_and_the_box_that_is_not_in_it_or_gone(
+    drives: Path, tmp_path: Path
+) -> None:
+    foot = np.load(drives / "foot.npy")
+    old = read_points(drives / "old" / "map.ply").points
+    for name, kind in (("tuesday", 0), ("boxed", 1)):
+        points, change = cloud_of(drives / f"{name}-run" / "report.html")
+        is_old = change == 0
+        assert is_old.sum() > 50_000
+        assert cKDTree(old).query(points[is_old][::50])[0].max() < 0.02
+        assert set(change.tolist()) == {0, kind}
+        found = json.loads((drives / f"{name}-run" / "manifest.json").read_text())["localization"]["differences"]
+        assert (found["gone"], found["not_in_the_map"]) == (0, kind)
+    new = points[change == 1]
+    assert np.linalg.norm(new[:, :2].mean(axis=0) - foot[:2]) < 0.5
+    assert np.ptp(new, axis=0)[:2].max() < max(BOX) + 2 * 0.4
+    # The other way round: the map has the box, and the drive does not.
+    with_it = np.concatenate([old, _surface(foot)])
+    write_points(tmp_path / "boxed.ply", with_it)
+    words = ("--map", tmp_path / "boxed.ply", "--count", 50, "--out", tmp_path / "run", "-q")
+    assert lslam("localize", drives / "tuesday", *words).returncode == 0
+    points, change = cloud_of(tmp_path / "run" / "report.html")
+    gone = points[change == -1]
+    assert set(change.tolist()) == {0, -1}
+    assert np.linalg.norm(gone[:, :2].mean(axis=0) - foot[:2]) < 0.5
+    off = np.abs(gone - foot - [0, 0, BOX[2] / 2]) - BOX / 2
+    assert off.max() < 0.4 + 0.2, "only what lies in cells of the box"
+
+
+def _surface(foot: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points 0.1 m apart on the sides and the top of the box."""
+    x, y, z = (np.arange(-half, half, 0.1) for half in BOX / 2)
+    grid = np.stack(np.meshgrid(x, y, z + BOX[2] / 2), -1).reshape(-1, 3)
+    shell = (np.abs(grid - [0, 0, BOX[2] / 2]) > BOX / 2 - 0.15).any(axis=1)
+    return foot + grid[shell]
 
 
 def test_the_table_and_the_rules_of_overwriting(drives: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from lslam.core.types.cloud import ArrayCloud
 from lslam.io.formats.point_files import read_cloud, write_cloud
 from lslam.pipeline.localise_pass import Reanchoring
 from lslam.pipeline.prior_map_files import read_prior_map
+from lslam.pipeline.prior_map_view import spread_out
 from lslam.pipeline.watch import Watch
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_data" / "sequences" / "00"
@@ -72,6 +74,42 @@ def test_an_interrupted_localisation_goes_on_to_the_same_bytes(
     assert not (tmp_path / "out" / "localization.csv").exists()
     lslam.run(SAMPLE, config(map_run), out=tmp_path / "out", resume=True)
     same(whole, tmp_path / "out")
+
+
+def test_an_interrupted_comparison_with_the_map_goes_on_where_it_was_and_to_the_same_page(
+    map_run: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    shown = config(map_run, "report.html=true")
+    lslam.run(SAMPLE, shown, out=tmp_path / "whole")
+    seen = [0]
+
+    def look() -> bool:
+        seen[0] += sys._getframe(1).f_code.co_name == "scans_again"
+        return seen[0] > 30
+
+    with pytest.raises(InterruptedRunError, match="compared with the map"):
+        lslam.run(SAMPLE, shown, out=tmp_path / "out", watch=Watch(should_stop=look))
+    with caplog.at_level("INFO", "lslam"):
+        lslam.run(SAMPLE, shown, out=tmp_path / "out", resume=True)
+    assert "comparison with the map: going on after 30 scans" in caplog.text
+    same(tmp_path / "whole", tmp_path / "out")
+    maps = [
+        re.search(r"<!-- begin map -->.*<!-- end map -->", (tmp_path / name / "report.html").read_text(), re.S)
+        for name in ("whole", "out")
+    ]
+    assert maps[0]
+    assert maps[1]
+    assert maps[0][0] == maps[1][0]
+    assert '"change"' not in maps[0][0], "nothing differs on the way that made the map"
+
+
+def test_what_differs_is_told_by_a_scan_a_metre_or_by_all_of_a_short_drive() -> None:
+    way = np.arange(0.0, 500.0, 0.3)
+    chosen = way[spread_out(way)]
+    assert np.diff(chosen).min() >= 0.69
+    assert np.diff(chosen).max() <= 1.31
+    assert spread_out(np.linspace(0, 5, 50)).all()
+    assert spread_out(np.zeros(3)).tolist() == [True, False, False]
 
 
 def test_a_map_that_is_another_by_then_is_searched_anew(map_run: Path, whole: Path, tmp_path: Path) -> None:

@@ -13,13 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from comparisons import comparison, drawing, row, walls
+from point_writers import write_points
+from scipy.spatial import cKDTree
 from test_html import parse
+from test_page_data import data_of, unpack
 
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.types.comparison import Spread
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
-from lslam.reports.page_data import Crop, choose_crops, crop_images
+from lslam.reports.crops import Crop, choose_crops, crop_images
 from lslam.studies.results import metrics_of
 
 
@@ -138,7 +141,7 @@ def test_the_page_nests_shows_everything_and_needs_nothing_else(tmp_path: Path) 
     (tmp_path / "a" / "report.html").write_text("")
     parsed = parse(render_page(tmp_path, c, [drawing(tmp_path)]))
     assert not parsed.open
-    assert [kind for kind, _ in parsed.scripts] == [""]
+    assert [kind for kind, _ in parsed.scripts] == ["application/json", "application/json", ""]
     assert not parsed.handlers
     assert all(a.startswith("data:image/png;base64,") or a == "a/report.html" for a in parsed.addresses)
     assert "a/report.html" in parsed.addresses
@@ -160,10 +163,68 @@ def test_the_page_of_a_comparison_in_which_all_failed_says_so(tmp_path: Path) ->
     assert "No run on this sequence has a result" in parsed.text
 
 
-def test_without_ground_truth_no_errors_are_drawn(tmp_path: Path) -> None:
-    page = render_page(tmp_path, comparison(tmp_path), [drawing(tmp_path, has_truth=False)])
+def test_without_ground_truth_the_distance_from_the_first_is_drawn_and_not_called_an_error(tmp_path: Path) -> None:
+    bare = drawing(tmp_path, has_truth=False)
+    page = render_page(tmp_path, comparison(tmp_path), [bare])
     assert "Position error" not in page
+    assert "Distance from" not in page
+    first, second = bare.runs
+    apart = replace(second, distance=np.linspace(0, 60, 50), errors=np.full(50, 0.7))
+    page = render_page(tmp_path, comparison(tmp_path), [replace(bare, runs=(first, apart), reference="icp")])
+    assert "Position error" not in page
+    (figure,) = re.findall(r"<h3>Distance from icp</h3>.*?</figure>", page, re.S)
+    assert figure.count('class="line s2"') == 2, "one line and its entry in the legend"
+    assert 'class="line s1"' not in figure
+    assert (
+        "No ground truth: from the same start, how far each is from icp, which may be the one that is wrong" in figure
+    )
+
+
+def test_all_trajectories_and_the_ground_truth_lie_on_the_map_of_the_first_method(tmp_path: Path) -> None:
+    shown = drawing(tmp_path)
+    page = render_page(tmp_path, comparison(tmp_path), [shown])
+    ways = data_of(page, "sessions")["sessions"]
+    assert [(way["name"], way["style"]) for way in ways] == [("ground truth", "gt"), ("icp", "s1"), ("kiss-icp", "s2")]
+    assert shown.gt_positions is not None
+    for way, positions in zip(ways, [shown.gt_positions, *(run.positions for run in shown.runs)], strict=True):
+        np.testing.assert_allclose(unpack(way["positions"], "<f4").reshape(-1, 3), positions, atol=1e-5)
+    cloud = data_of(page, "cloud")
+    q = unpack(cloud["points"], "<i2").reshape(-1, 3)
+    shown_points = np.array(cloud["low"]) + np.array(cloud["step"]) * (q + 32768.0)
+    assert len(shown_points) == len(walls())
+    assert cKDTree(walls()).query(shown_points)[0].max() < 0.01
+    assert "Points: map of icp" in page
+    # Another sequence has its chart: one cloud is as much as a page carries.
+    both = [shown, replace(shown, sequence="dark")]
+    assert render_page(tmp_path, comparison(tmp_path), both).count('id="cloud"') == 1
+    assert "Trajectories from above" in render_page(tmp_path, comparison(tmp_path), both)
+    bare = replace(shown, runs=tuple(replace(run, map_file=None) for run in shown.runs))
+    page = render_page(tmp_path, comparison(tmp_path), [bare])
+    assert 'id="cloud"' not in page
     assert "Trajectories from above" in page
+
+
+def test_the_first_table_has_no_time_of_a_single_stage_and_a_table_below_has_them(tmp_path: Path) -> None:
+    page = render_page(tmp_path, comparison(tmp_path), [])
+    heads = [
+        re.findall(r'<th scope="col"[^>]*>([^<]+)', table)
+        for table in re.findall(r"<table class=\"sortable\">.*?</table>", page, re.S)
+    ]
+    first, stages = heads
+    assert "ATE se3, m".replace(", ", ",\u00a0") in first
+    assert not [head for head in first if head.startswith("read")]
+    assert [head for head in stages if head.startswith("read")]
+
+
+def test_ten_thousand_scans_of_two_methods_stay_small(tmp_path: Path) -> None:
+    shown = drawing(tmp_path)
+    along = np.linspace(0, 9000, 10_000)
+    way = np.stack([along, 50 * np.sin(along / 99), along / 300], 1)
+    cloud = np.random.default_rng(0).uniform((-50, -60, 0), (9050, 60, 40), (400_000, 3))
+    write_points(tmp_path / "icp.ply", cloud)
+    runs = tuple(replace(run, positions=way, distance=along, errors=along / 1000) for run in shown.runs)
+    page = render_page(tmp_path, comparison(tmp_path), [replace(shown, runs=runs, gt_positions=way)])
+    assert len(page) < 6_000_000
 
 
 def test_crops_lie_on_structure_and_never_on_bare_ground() -> None:
@@ -188,7 +249,7 @@ def test_several_crops_do_not_overlap() -> None:
 def test_maps_are_compared_at_the_same_place_in_one_world_and_one_grey(tmp_path: Path) -> None:
     """The second map lies 5 m off in its own world and is moved there by T_drawing_world: the pictures are equal."""
     page = render_page(tmp_path, comparison(tmp_path), [drawing(tmp_path)], (30.04, 10.03, 20.0))
-    images = re.findall(r"data:image/png;base64,([^\"]+)", page)
+    images = re.findall(r"data:image/png;base64,([^\"]+)", page.partition("The same places in each map")[2])
     assert len(images) == 2
     assert base64.b64decode(images[0]) == base64.b64decode(images[1])
     faint = walls()[::3]

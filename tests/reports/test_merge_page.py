@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from merged_sessions import sessions, ties, write
 
-from lslam.reports.merge_html import MOST_POSES
+from lslam.reports.page_data import MOST_POSES
 
 
 def told(page: Path, name: str) -> dict[str, Any]:
@@ -34,6 +34,23 @@ def test_the_script_knows_every_session_and_what_ties_them(tmp_path: Path) -> No
         assert unpacked(told_one["index"], "<i4").tolist() == one.scans.tolist()
     np.testing.assert_allclose(unpacked(data["ties"], "<f4").reshape(-1, 2, 3), ties(), atol=1e-5)
     assert data["tied"] == len(ties())
+
+
+def test_every_point_belongs_to_the_session_that_came_nearest(tmp_path: Path) -> None:
+    page = write(tmp_path / "report.html")
+    cloud, views = told(page, "cloud"), sessions()
+    q = unpacked(cloud["points"], "<i2").reshape(-1, 3)
+    points = (np.array(cloud["low"]) + np.array(cloud["step"]) * (q + 32768.0))[::37]
+    away = [np.linalg.norm(points[:, None] - view.after, axis=2).min(axis=1) for view in views]
+    is_clear = np.abs(away[0] - away[1]) > 0.02
+    found = unpacked(cloud["session"], "u1")[::37]
+    assert is_clear.sum() > 1000
+    assert np.array_equal(found[is_clear], np.argmin(away, axis=0)[is_clear])
+
+
+def test_the_script_knows_where_the_sessions_were_before(tmp_path: Path) -> None:
+    for told_one, one in zip(told(write(tmp_path / "report.html"), "sessions")["sessions"], sessions(), strict=True):
+        np.testing.assert_allclose(unpacked(told_one["before"], "<f4").reshape(-1, 3), one.before, atol=1e-5)
 
 
 def test_long_sessions_are_thinned_with_their_numbers(tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def test_a_comparison_zooms(browser: Any, tmp_path: Path) -> None:
     load(browser, page, 400)
     assert browser.get_log("browser") == []
     assert browser.execute_script("return document.documentElement.scrollWidth") <= 400
-    chart = find(browser, "svg.plane")
+    chart = find(browser, ".half > svg")
     before = [tick.text for tick in chart.find_elements("css selector", "g.ticks text")]
     chart.send_keys("+++")
     assert [tick.text for tick in chart.find_elements("css selector", "g.ticks text")] != before

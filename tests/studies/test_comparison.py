@@ -17,7 +17,7 @@ import pytest
 
 import lslam
 from lslam.core.errors import InputError, InterruptedRunError, OutputExistsError, UsageError
-from lslam.core.geometry import se3
+from lslam.core.geometry import se3, so3
 from lslam.core.types.comparison import Comparison, RunScore
 from lslam.core.types.trajectory import Trajectory
 from lslam.evaluation.evaluate import evaluate
@@ -26,7 +26,7 @@ from lslam.io.readers import open_sequence
 from lslam.pipeline.watch import Watch
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import simulate
-from lslam.studies.compare import _in_world_of_truth, compare
+from lslam.studies.compare import _in_own_world, _in_world_of_truth, compare
 from lslam.studies.grid import Job
 from lslam.studies.jobs import finished, run_jobs
 from lslam.studies.plan import Plan, check_plan
@@ -253,3 +253,32 @@ def test_maps_beside_a_nearly_straight_path_are_not_turned_about_it(
     assert alignment in drawn.recipe
     wall = np.array([30.0, 30.0, 0.0])
     assert np.linalg.norm(se3.apply(drawn.runs[0].T_drawing_world, wall[None])[0] - wall) < 0.5
+
+
+def test_without_ground_truth_every_run_is_as_far_from_the_first_as_it_is_from_the_same_start(tmp_path: Path) -> None:
+    """The second turns by a degree, and lacks scans at the start, which both must share to be compared."""
+    along = np.linspace(0.0, 60.0, 61)
+    first = np.tile(np.eye(4), (61, 1, 1))
+    first[:, 0, 3] = along
+    turned = se3.make(so3.exp(np.array([0.0, 0.0, np.deg2rad(1.0)])), np.array([3.0, 2.0, 0.0])) @ first
+    bent = turned.copy()
+    bent[31:, 1, 3] += 0.5
+    stamps = np.arange(61) * 10**8
+
+    def run(method: str, poses: np.ndarray[Any, Any], some: slice) -> Any:
+        job = SimpleNamespace(method=method, folder=tmp_path)
+        return SimpleNamespace(trajectory=Trajectory(stamps[some], poses[some]), job=job)
+
+    shown = _in_own_world("drive", 0, [run("icp", first, slice(None)), run("gicp", bent, slice(5, None))])
+    assert shown.reference == "icp"
+    assert shown.gt_positions is None
+    reference, other = shown.runs
+    assert reference.errors is None
+    assert other.distance is not None
+    assert other.errors is not None
+    np.testing.assert_allclose(other.distance, along[5:] - along[5], atol=1e-6)
+    np.testing.assert_allclose(other.errors[:26], 0.0, atol=1e-6)
+    np.testing.assert_allclose(other.errors[26:], 0.5, atol=1e-6)
+    apart = run("late", first, slice(None))
+    apart = SimpleNamespace(trajectory=Trajectory(stamps + 10**12, first), job=apart.job)
+    assert _in_own_world("drive", 0, [run("icp", first, slice(None)), apart]).runs[1].errors is None

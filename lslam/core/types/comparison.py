@@ -136,7 +136,7 @@ class Difference:
 class DrawnRun:
     """One run as the page draws it, in the world of its drawing.
 
-    positions : (N, 3) m; distance, errors : (M,) m along the ground truth and from it, None without ground truth
+    positions : (N, 3) m; distance, errors : (M,) m along the ground truth and from it, or the drawing's reference; else None
     T_drawing_world : (4, 4) from the run's world; map_file : its merged map, or None
     """
 
@@ -153,6 +153,7 @@ class Drawing:
     """The runs of one sequence and seed in one world: the ground truth's, or that of the LiDAR at the first scan.
 
     gt_positions : (N, 3) m or None; recipe : how the runs were brought there
+    reference : without ground truth the method that `distance` and `errors` of the others are along and from, else empty
     """
 
     sequence: str
@@ -160,6 +161,7 @@ class Drawing:
     gt_positions: Floats | None
     runs: tuple[DrawnRun, ...]
     recipe: str
+    reference: str = ""
 
 
 @dataclass(frozen=True)

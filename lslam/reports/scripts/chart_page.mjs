@@ -2,9 +2,11 @@
 import { startBar, startPrinting } from "./bar.mjs";
 import { startCharts } from "./charts.mjs";
 import { startPictures } from "./picture.mjs";
+import { startSorting } from "./sortable.mjs";
 
 startBar();
 startPrinting();
 for (const hint of document.querySelectorAll(".hint")) hint.hidden = false;
 startCharts();
 startPictures();
+startSorting();

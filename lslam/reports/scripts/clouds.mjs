@@ -12,6 +12,8 @@ export function cloudOf(data, scanCount = 0) {
     intensity: column("intensity", Uint8Array),
     rgb: column("rgb", Uint8Array),
     kind: column("kind", Uint8Array),
+    session: column("session", Uint8Array),
+    change: column("change", Int8Array),
     nearest: column("nearest", scanCount <= QUANTA ? Uint16Array : Uint32Array),
   };
 }

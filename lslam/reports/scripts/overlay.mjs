@@ -1,8 +1,9 @@
 // What is drawn over the points of the map: ground truth, trajectory, loops, failed scans, the marked scan, scale and axes;
 // of merged runs the trajectory of each, and the loops between them. Lines hide behind points in 3D, signs do not.
+import { partsOf } from "./against_map.mjs";
 import { clamp } from "./numbers.mjs";
 import { marked, scans } from "./scans.mjs";
-import { sessions } from "./sessions.mjs";
+import { placesOf, sessions } from "./sessions.mjs";
 
 const HIDDEN = 0.25; // opacity of a line behind points
 
@@ -20,19 +21,25 @@ export function linesOf(view, colour) {
   }
   if (scans) {
     if (scans.truth) add(scans.truth, colour("truth"), 1.5);
-    add(scans.positions, colour("c2"), 2);
+    for (const { style, points } of wayParts()) add(points, colour(style === "carried" ? "ink" : style.replace("s", "c")), 2);
     add(loopLines(), colour("c1"), 2, true);
   }
   if (sessions) {
     const style = (session) => getComputedStyle(view.figure.querySelector(`.legend .${session.style}`)).color;
-    for (const session of sessions.sessions) add(session.positions, style(session), 2);
-    add(sessions.ties, colour("ink"), 1, true);
+    for (const session of sessions.sessions) if (!session.isHidden) add(placesOf(session), style(session), 2);
+    if (!sessions.isBefore) add(sessions.ties, colour("ink"), 1, true);
   }
   for (const lines of view.liners) found.push(...lines(view, colour, add));
   return found;
 }
 
-let loopEnds = null;
+let [loopEnds, parts] = [null, null];
+
+/** The trajectory in one style, or of a drive in an old map in those of its states. */
+function wayParts() {
+  parts ||= scans.fixes ? partsOf(scans.positions, scans.fixes, scans.states) : [{ style: "s2", points: scans.positions }];
+  return parts;
+}
 
 /** Both ends of each closed loop, x, y, z. */
 function loopLines() {
@@ -109,8 +116,11 @@ export function filled(pen, fill, rim, draw) {
 
 /** Merged runs: the scan under the pointer. */
 function drawPointed(pen, view, colour) {
-  for (const session of sessions.sessions) session.way = view.project(session.positions);
-  if (!view.pointed) return;
+  for (const session of sessions.sessions) {
+    session.way = view.project(placesOf(session));
+    if (session.isHidden) session.way.fill(NaN);
+  }
+  if (!view.pointed || view.pointed.session.isHidden) return;
   const { session, k } = view.pointed;
   const [x, y] = [session.way[2 * k], session.way[2 * k + 1]];
   filled(pen, colour("ink"), colour("paper"), () => pen.arc(x, y, 6, 0, 7));

@@ -24,6 +24,7 @@ export const scans = (() => {
     failed: Array.from(status.keys()).filter((k) => failed.includes(status[k] & 7)),
     angles: unpack(data.angles, Float32Array),
     posedBy: unpack(data.posed_by, Uint8Array),
+    fixes: data.fixes ? unpack(data.fixes, Uint8Array) : null,
     error: data.error ? unpack(data.error, Float32Array) : null,
     truth: data.truth ? unpack(data.truth, Float32Array) : null,
   };
@@ -51,6 +52,7 @@ export function tell(k) {
     ["roll, pitch, yaw", `${three(scans.angles, 2)}°`],
   ];
   if (scans.error) rows.push([`error (${scans.alignment})`, Number.isFinite(scans.error[k]) ? `${fixed(scans.error[k], 3)} m` : "not matched"]);
+  if (scans.fixes) rows.push(["map", scans.states[scans.fixes[k]][0]]);
   rows.push(["status", statusOf(k)]);
   return rows;
 }

@@ -46,7 +46,7 @@ export function startTools(view) {
   const slices = new Slices(view, find("section"), find("width"), output);
   showEnds();
   tools.hidden = false;
-  tools.querySelector("details").open = matchMedia("(min-width: 700px)").matches;
+  tools.querySelector("details").open = view.figure.clientWidth > 700; // not on a phone, nor beside a chart
 }
 
 if (mapView?.drawer) startTools(mapView);

@@ -1,5 +1,6 @@
 // The map as points that turn, with the trajectory over them. Without WebGL 2 the drawing of the page stays.
 import { Camera } from "./camera.mjs";
+import { kindsOf } from "./categories.mjs";
 import { cloudOf, coordinates } from "./clouds.mjs";
 import { BY, colourings, percentile } from "./colours.mjs";
 import { KEYS, make, read } from "./elements.mjs";
@@ -36,7 +37,8 @@ export class MapView {
     this.cloud = cloudOf(data, scans ? scans.count : 0);
     this.drawer.add("map", this.cloud);
     this.names = ["map"]; // clouds that are drawn
-    this.known = colourings(this.cloud, scans);
+    const colourOf = ({ style }) => getComputedStyle(figure.querySelector(`.legend .${style}`)).color;
+    this.known = { ...kindsOf(this.cloud, sessions?.sessions, colourOf), ...colourings(this.cloud, scans) };
     this.camera = new Camera();
     [this.size, this.isShaded, this.share] = [1, true, Math.min(1, FIRST / this.cloud.count)];
     [this.painters, this.liners, this.leavers] = [[], [], []];
@@ -55,7 +57,7 @@ export class MapView {
       click: (x, y) => this.onClick?.(x, y),
     });
     this.lines.addEventListener("contextmenu", (event) => event.preventDefault());
-    this.colour("height");
+    this.colour(Object.keys(this.known)[0]);
     this.reset();
     watchers.push(() => this.drawSigns());
     new ResizeObserver(() => this.fit()).observe(this.stage);
