@@ -203,7 +203,7 @@ def test_without_scripts_or_webgl_and_on_paper_the_drawing_stands(browser: Any, 
         assert seen(".stage svg")
         assert not seen(".now")
         assert not seen(".tools")
-        assert browser.find_elements("css selector", "canvas") == []
+        assert browser.find_elements("css selector", ".stage canvas") == []
         assert "too few <b>inliers</b>" in find(browser, "section.first").text
     finally:
         browser.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
@@ -213,7 +213,7 @@ def test_without_scripts_or_webgl_and_on_paper_the_drawing_stands(browser: Any, 
         load(browser, run[0])
         assert browser.get_log("browser") == []
         assert seen(".stage svg")
-        assert browser.find_elements("css selector", "canvas") == []
+        assert browser.find_elements("css selector", ".stage canvas") == []
         chart = find(browser, ".stage svg")
         chart.send_keys("+")
         assert "moved" in chart.get_attribute("class")
