@@ -31,6 +31,7 @@ FLAGS = {"degenerate": 8, "lost": 16}  # beside the status in one byte
 MOST_POSES = 5000  # of one of several trajectories on a map
 MOST_TRUTH = 5000  # points of ground truth under the map
 LONGEST_REASON = 160  # characters
+MOST_ASKED = 2000  # points whose neighbour is looked for
 MOST_KINDS = 8  # labels that have a colour of their own
 QUANTA = 65535  # of a coordinate over the extent of the cloud
 
@@ -101,6 +102,7 @@ def cloud_data(
     """Some points of the map for the script; None if the map is empty.
 
     points : (M, 3) int16 q, where a coordinate is `low` + `step` (q + 32768), m; nearest : (M,) the nearest pose
+    spacing : m from a point to the next, in the median
     height : usual range of heights, m; intensity : (M,) 0 to 255 over the range `values`, when the map has them
     rgb : (M, 3) colours; kind : (M,) index into `kinds`, the labels, most frequent first, when the map has them
     session : (M,) which of the `sessions`, positions (N, 3) of each, m, comes nearest to it
@@ -123,6 +125,7 @@ def cloud_data(
         "low": low.tolist(),
         "step": step.tolist(),
         "height": usual_range(points[:, 2]),
+        "spacing": _spacing(points),
         "colours": VIRIDIS,
     }
     if cloud.intensity is not None and np.ptp(cloud.intensity[order]) > 0:
@@ -142,6 +145,16 @@ def cloud_data(
         owner = np.repeat(np.arange(len(sessions)), [len(positions) for positions in sessions])
         data["session"] = packed(owner[_nearest(points, np.concatenate(sessions))], "u1")
     return data
+
+
+def _spacing(points: Floats) -> float:
+    """Median distance, m, from some of the points to the nearest other one; 0 for one point."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 2:
+        return 0.0
+    away, _ = cKDTree(points).query(points[:MOST_ASKED], k=2)
+    return float(np.median(away[:, 1]))
 
 
 def _kinds(labels: NDArray[Any]) -> dict[str, Any]:
@@ -235,12 +248,11 @@ FROM_ABOVE = "The more voxels of a column are occupied, the stronger it is drawn
 class MapFigure:
     """A map from above.
 
-    It has an image, the range of heights that colours stand for, m (None for a grey one), and the pixel size, m.
+    It has an image, and the range of heights that colours stand for, m (None for a grey one).
     """
 
     figure: Figure
     heights: tuple[float, float] | None
-    pixel: float
 
 
 def map_figure(
@@ -260,7 +272,6 @@ def map_figure(
     """
     if not (image > 0).any():
         return None
-    pixel = (extent[1] - extent[0]) / image.shape[1]
     if heights is None:
         span, png, style = None, density_png(image), "density"
     else:
@@ -279,7 +290,7 @@ def map_figure(
         by=by,
         dots=dots,
     )
-    return MapFigure(Figure("Map", chart, tuple(legend), f"{world} {FROM_ABOVE}"), span, pixel)
+    return MapFigure(Figure("Map", chart, tuple(legend), f"{world} {FROM_ABOVE}"), span)
 
 
 # m about the sensor that are drawn of one scan: beyond, sixteen beams leave points that no eye puts together.

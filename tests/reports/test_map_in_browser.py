@@ -122,7 +122,7 @@ def test_a_section_along_a_line_shows_the_wall_from_the_side(browser: Any, page:
     wall = np.array([230, 159, 0])  # second colour: the less frequent label
     rows, columns = np.nonzero(np.abs(shown - wall).max(axis=2) < 60)
     # A wall of 50 m by 6 m fills its rectangle, and points reach beyond it by half their size.
-    size = browser.execute_script("return 1.5 * mapView.figure.dataset.voxel / mapView.camera.metres")
+    size = browser.execute_script("return 2 * mapView.spacing / mapView.camera.metres")
     assert (np.ptp(columns) - size) / (np.ptp(rows) - size) == pytest.approx(50 / 6, rel=0.05)
     click(browser, "[data-do=flat]")
     assert find(browser, ".tools [name=section]").get_attribute("value") == ""

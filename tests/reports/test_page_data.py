@@ -125,6 +125,16 @@ def test_colours_and_labels_stay_with_their_points() -> None:
     assert named.tolist() == expected
 
 
+def test_spacing_is_that_of_a_lattice_and_none_of_a_point() -> None:
+    lattice = 0.2 * np.stack(np.meshgrid(np.arange(90), np.arange(70), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+    data = cloud_data(ArrayCloud.of(lattice))
+    assert data is not None
+    assert data["spacing"] == pytest.approx(0.2)
+    alone = cloud_data(ArrayCloud.of([[1.0, 2.0, 3.0]]))
+    assert alone is not None
+    assert alone["spacing"] == 0
+
+
 def test_points_that_are_alike_have_no_intensity(make_record: MakeRecord) -> None:
     trajectory = make_record(5).trajectory
     data = cloud_data(ArrayCloud.of(np.ones((4, 3)), np.ones(4)), trajectory)

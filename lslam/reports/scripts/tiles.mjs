@@ -56,6 +56,7 @@ export class Tiles {
       this.held.delete(name); // the last seen are the last of the map
       this.held.set(name, cloud);
     }
+    view.spacing = this.spacingOf(there);
     const names = ["map", ...there];
     const isOther = names.join() !== view.names.join();
     view.names = names;
@@ -64,6 +65,13 @@ export class Tiles {
     this.loadSome();
     const points = there.reduce((sum, name) => sum + this.tree.nodes[name], 0);
     this.said.textContent = `Of all ${this.tree.points.toLocaleString("en")} points ${points.toLocaleString("en")} more are drawn, nearer ones as they are seen.`;
+  }
+
+  /** m between points where nodes `there` are drawn: that of the finest, and not less than that of the whole map, which is of surfaces. */
+  spacingOf(there) {
+    const { spacing, count } = this.view.cloud;
+    const finest = Math.min(spacing, ...there.map((name) => this.tree.edge / 2 ** (name.length - 1) / this.tree.cells));
+    return Math.max(finest, spacing * Math.sqrt(count / this.tree.points));
   }
 
   /** The map anew, once for all nodes that come in a moment. */

@@ -13,6 +13,7 @@ import { sessionAt, sessions } from "./sessions.mjs";
 
 const SHADING = 8; // of edges by depth, in 3D
 const REST_MS = 150; // without a gesture until more points are drawn
+const WIDE = 2; // of the distance between points that a point covers
 const LEAST_PX = 1.5; // of a point
 const FRAME_MS = 40; // of a frame, by drawing fewer points
 const FIRST = 200_000; // points of the first one
@@ -36,6 +37,7 @@ export class MapView {
     figure.classList.add("live");
     this.cloud = cloudOf(data, scans ? scans.count : 0);
     this.drawer.add("map", this.cloud);
+    this.spacing = data.spacing; // m between the points that are drawn
     this.names = ["map"]; // clouds that are drawn
     const colourOf = ({ style }) => getComputedStyle(figure.querySelector(`.legend .${style}`)).color;
     this.known = { ...kindsOf(this.cloud, sessions?.sessions, colourOf), ...colourings(this.cloud, scans) };
@@ -216,12 +218,11 @@ export class MapView {
     const { camera, ratio } = this;
     const colour = this.colourOf();
     const reach = Math.hypot(...[0, 1, 2].map((k) => 65535 * this.cloud.step[k] + Math.abs(camera.centre[k] - this.cloud.low[k])));
-    const voxel = Number(this.figure.dataset.voxel);
     const [from, to] = [this.drawn, Math.min(1, this.drawn + this.share)];
     const isWhole = to === 1;
     this.drawer.draw({
       view: camera.matrix(reach), centre: camera.centre, by: this.by, range: this.range, ratio, names: this.names, from, to,
-      size: Math.max((1.5 * voxel) / camera.metres, LEAST_PX) * this.size * ratio, least: LEAST_PX * Math.min(this.size, 1) * ratio,
+      size: Math.max((WIDE * (this.section ? this.cloud.spacing : this.spacing)) / camera.metres, LEAST_PX) * this.size * ratio, least: LEAST_PX * Math.min(this.size, 1) * ratio,
       strength: isWhole && this.isShaded && !(camera.isFlat && !this.section) ? SHADING : 0, lines: linesOf(this, colour),
     });
     this.drawn = to;
