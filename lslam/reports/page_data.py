@@ -153,7 +153,7 @@ def _spacing(points: Floats) -> float:
 
     if len(points) < 2:
         return 0.0
-    away, _ = cKDTree(points).query(points[:MOST_ASKED], k=2)
+    away = np.asarray(cKDTree(points).query(points[:MOST_ASKED], k=2)[0])
     return float(np.median(away[:, 1]))
 
 

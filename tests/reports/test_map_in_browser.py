@@ -164,11 +164,13 @@ def test_a_million_points_turn_by_software_and_rest_whole(
     load(browser, tmp_path / "report.html", 1280)
     click(browser, "[data-do=turn]")
     browser.set_script_timeout(60)
-    frames = browser.execute_async_script(
-        "const done = arguments[0]; const times = []; const turn = (now) => { times.push(now); mapView.move(4, 0, false);"
-        " if (now - times[0] < 5000) requestAnimationFrame(turn); else done(times); }; requestAnimationFrame(turn);"
+    painted = browser.execute_async_script(
+        "const done = arguments[0]; const times = []; const paint = mapView.paint.bind(mapView); const began = performance.now();"
+        "mapView.paint = () => { times.push(performance.now() - began); paint(); };"
+        "const turn = () => { mapView.move(4, 0, false);"
+        " if (performance.now() - began < 5000) requestAnimationFrame(turn); else done(times); }; requestAnimationFrame(turn);"
     )
-    late = [time for time in frames if time - frames[0] > 2500]
+    late = [time for time in painted if time > 2500]
     assert (len(late) - 1) / (late[-1] - late[0]) * 1000 >= FRAMES_A_SECOND
     settle(browser)
     low = palette()[0].astype(int)

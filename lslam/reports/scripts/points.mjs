@@ -194,6 +194,18 @@ export class PointDrawer {
     gl.bindTexture(gl.TEXTURE_2D, this.depths);
     for (const line of lines) this.drawLine(line, ratio);
     gl.bindVertexArray(null);
+    this.fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+  }
+
+  /** Whether the last picture is there. */
+  isDone() {
+    const { gl, fence } = this;
+    if (!fence) return true;
+    if (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED && !gl.isContextLost()) return false;
+    gl.deleteSync(fence);
+    this.fence = null;
+    return true;
   }
 
   drawCloud({ cloud, array }, centre, by, range, from, to) {

@@ -15,7 +15,7 @@ const SHADING = 8; // of edges by depth, in 3D
 const REST_MS = 150; // without a gesture until more points are drawn
 const WIDE = 2; // of the distance between points that a point covers
 const LEAST_PX = 1.5; // of a point
-const FRAME_MS = 40; // of a frame, by drawing fewer points
+const FRAME_MS = 70; // of a frame, by drawing fewer points
 const FIRST = 200_000; // points of the first one
 
 export class MapView {
@@ -204,14 +204,21 @@ export class MapView {
   soon() {
     if (this.isDue || !this.isFitted) return;
     this.isDue = true;
-    requestAnimationFrame((now) => {
+    const frame = (now) => {
+      // What was asked of the graphics unit before must be done: it takes what it is given, and falls behind.
+      if (!this.drawer.isDone()) {
+        requestAnimationFrame(frame);
+        return;
+      }
       this.isDue = false;
       if (this.last) this.share = clamp(this.share * clamp(FRAME_MS / (now - this.last), 0.3, 1.5), 0.02, 1);
       this.paint();
-      this.last = this.drawn < 1 || performance.now() - this.movedAt < REST_MS ? now : 0;
-      if (this.drawn < 1 && performance.now() - this.movedAt < REST_MS) setTimeout(() => this.soon(), REST_MS);
+      const isMoving = now - this.movedAt < REST_MS;
+      this.last = this.drawn < 1 || isMoving ? now : 0;
+      if (this.drawn < 1 && isMoving) setTimeout(() => this.soon(), REST_MS);
       else if (this.drawn < 1) this.soon();
-    });
+    };
+    requestAnimationFrame(frame);
   }
 
   paint() {
