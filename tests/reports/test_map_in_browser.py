@@ -155,6 +155,18 @@ def test_edges_are_shaded_by_depth(browser: Any, page: Path) -> None:
     assert np.median(np.abs(shaded - bare)) == 0
 
 
+def test_the_drawing_comes_back_when_the_graphics_unit_goes(browser: Any, page: Path) -> None:
+    load(browser, page)
+    assert not find(browser, ".stage svg").is_displayed()
+    browser.execute_script("mapView.drawer.gl.getExtension('WEBGL_lose_context').loseContext()")
+    browser.execute_async_script("setTimeout(arguments[0], 200)")
+    browser.execute_script("mapView.zoom(2); mapView.reset()")
+    settle(browser)
+    assert find(browser, ".stage svg").is_displayed()
+    assert browser.find_elements("css selector", ".stage canvas") == []
+    assert not find(browser, ".tools").is_displayed()
+
+
 def test_a_million_points_turn_by_software_and_rest_whole(
     browser: Any, make_record: Callable[..., RunRecord], tmp_path: Path
 ) -> None:

@@ -35,6 +35,7 @@ export class MapView {
       return;
     }
     figure.classList.add("live");
+    this.canvas.addEventListener("webglcontextlost", () => this.giveUp());
     this.cloud = cloudOf(data, scans ? scans.count : 0);
     this.drawer.add("map", this.cloud);
     this.spacing = data.spacing; // m between the points that are drawn
@@ -64,6 +65,15 @@ export class MapView {
     watchers.push(() => this.drawSigns());
     new ResizeObserver(() => this.fit()).observe(this.stage);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+  }
+
+  /** The graphics unit was taken away: the drawing of the page comes back. */
+  giveUp() {
+    this.isFitted = false;
+    this.figure.classList.remove("live");
+    this.figure.querySelector(".tools").hidden = true;
+    this.canvas.remove();
+    this.lines.remove();
   }
 
   startLegend() {
@@ -166,7 +176,7 @@ export class MapView {
 
   fit() {
     const [width, height] = [this.stage.clientWidth, this.stage.clientHeight];
-    if (!width || !height) return;
+    if (!width || !height || !this.canvas.isConnected) return;
     this.camera.fit(width, height, this.section ? this.sides : this.home);
     if (this.isWhole) this.camera.metres = this.camera.widest;
     this.isWhole = false;
