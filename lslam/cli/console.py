@@ -51,21 +51,26 @@ class TimeLeft:
             self._begun.append(now)
 
     @property
-    def usual(self) -> float:
-        """Duration of a step, s: the median of the means of nine equal parts of all; nan before a second of them is seen.
+    def _counted(self) -> list[float]:
+        return self._took[self.at_once :] or self._took
 
-        So a few steps that wait for something else do not count, and many that take longer than most do. Scans that were
-        held back at the start come all at once: they say nothing.
+    @property
+    def usual(self) -> float:
+        """Duration of a step, s: the median of the means of nine equal parts of all; nan before the first is done.
+
+        So a few steps that wait for something else do not count, and many that take longer than most do.
         """
-        took = self._took[self.at_once :] or self._took
-        if sum(took) < _LEAST_S:
+        took = self._counted
+        if not took:
             return math.nan
         parts = min(len(took), _PARTS)
         return median(fmean(took[k * len(took) // parts : (k + 1) * len(took) // parts]) for k in range(parts))
 
     @property
     def seconds(self) -> float:
-        """Remaining time of all steps, s, if the others take the usual one; nan before the first is done.
+        """Remaining time of all steps, s, if the others take the usual one; nan before a second of them is seen.
+
+        Scans that were held back at the start come all at once: they say nothing.
 
         >>> now = [0.0]
         >>> left = TimeLeft(5, 2, lambda: now[0])
@@ -74,6 +79,8 @@ class TimeLeft:
         >>> left.seconds  # two now, and then the fifth
         20.0
         """
+        if sum(self._counted) < _LEAST_S:
+            return math.nan
         now, usual = self._clock(), self.usual
         rest = sorted(max(usual - (now - began), 0.0) for began in self._begun)
         if not rest:
