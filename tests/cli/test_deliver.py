@@ -434,6 +434,14 @@ def test_a_run_without_a_place_is_delivered_in_its_own_coordinates_and_says_so(t
         refused(2, said, run.folder, "--out", tmp_path / "no", flag, value)
 
 
+@pytest.mark.parametrize(("epsg", "times"), [(3857, "1.5"), (32661, "1.1")])
+def test_a_plane_that_stretches_lengths_is_none_for_a_survey(
+    run: MadeRun, tmp_path: Path, epsg: int, times: str
+) -> None:
+    refused(2, f"lengths in it are {times}", run.folder, "--crs", f"EPSG:{epsg}", "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_without_a_map_delivers_the_rest_and_says_it(tmp_path: Path) -> None:
     run = made(tmp_path / "town")
     map_of(run.folder).unlink()
