@@ -15,6 +15,7 @@ from lslam.backend.georeferencing import require_crs
 from lslam.core.config import Config
 from lslam.core.errors import InputError, UsageError, cause, nearest
 from lslam.core.geometry.crs_names import parse_crs
+from lslam.core.geometry.geodesy import crs_of
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import ControlPoint, ControlResidual, Instant, KnownPair, Manual, NamedPair
@@ -127,6 +128,10 @@ def read_control_points(path: Path) -> list[ControlPoint]:
             raise row.error(
                 f"crs = {row.text('crs')!r}: EPSG and a number, for example EPSG:25832, or EPSG:25832+7837 with heights"
             ) from None
+        try:
+            crs_of(epsg, height_epsg)
+        except UsageError as error:
+            raise row.error(str(error).replace("--crs", "crs")) from None
         sigma = row.size("sigma", "sigma_m")
         if sigma is None:
             raise row.error("sigma is empty: a point without it holds nothing")

@@ -78,10 +78,11 @@ def serve(run: Path, port: int, opens: bool) -> None:
     from lslam.pipeline.run_folder import require_run
 
     require_run(run)
-    from lslam.pipeline.view.page import require_page
+    from lslam.pipeline.view.page import require_one_run, require_page
     from lslam.pipeline.view.server import RunServer
     from lslam.pipeline.view.sites import ViewedSites
 
+    require_one_run(run)
     require_page(run)
     stop = current()
     # The server ends with its terminal, unless nohup says otherwise.

@@ -85,6 +85,7 @@ def test_what_is_wrong_with_pairs_is_said_with_its_line(tmp_path: Path, text: st
     ("row", "said"),
     [
         ("1,2,3,4,0.01,25832", "crs = '25832': EPSG and a number"),
+        ("1,2,3,4,0.01,EPSG:99999", "crs EPSG:99999: PROJ knows no such"),
         ("1,2,3,4,,EPSG:25832", "sigma is empty"),
         ("1,2,3,4,-1,EPSG:25832", "sigma = -1 must be above 0"),
         ("1,2,,4,1,EPSG:25832", "y or northing or .* is empty"),

@@ -12,7 +12,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -21,9 +21,11 @@ import numpy as np
 import pytest
 from calling import COMMAND, SAMPLE, environment, lslam
 
+from lslam.core.errors import InputError
 from lslam.core.geometry import se3
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.io.readers import open_sequence
+from lslam.pipeline.view.page import require_one_run
 from lslam.pipeline.view.server import RunServer
 from lslam.pipeline.view.sites import ViewedSites, change_between
 
@@ -211,9 +213,12 @@ def viewing(run: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], Cli
 
 
 def children(pid: int) -> list[int]:
-    """Of any of its threads: that which was asked begins a child."""
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return [int(word) for task in tasks for word in (task / "children").read_text().split()]
+    """Of any of its threads: that which was asked begins a child, and ends meanwhile."""
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):
+            found += [int(word) for word in (task / "children").read_text().split()]
+    return found
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
@@ -221,7 +226,10 @@ def test_it_ends_with_its_terminal_and_so_does_its_child(lost: Path, number: sig
     with viewing(lost) as (process, client):
         client.ask("api/edits", {"pairs": [{"scan_a": 0, "scan_b": 94, "verdict": "known"}], "points": []})
         out = client.ask("api/graph", {})["out"]
-        kin = children(process.pid)
+        for _ in range(100):
+            if kin := children(process.pid):
+                break
+            time.sleep(0.01)
         assert len(kin) == 1
         process.send_signal(number)
         assert process.wait(30) == 130
@@ -238,3 +246,15 @@ def test_a_run_that_is_none_and_a_port_in_use_are_said(lost: Path, tmp_path: Pat
         assert (done.returncode, done.stdout) == (2, "")
     assert lslam("view", lost, "--rerun", tmp_path / "a.rrd", "--port", 8000).returncode == 2
     assert lslam("view", lost, "--overwrite").returncode == 2
+
+
+def test_a_merge_and_a_run_without_a_pose_are_not_sent_in_a_circle(tmp_path: Path) -> None:
+    for name, manifest, said in (
+        ("merged", {"kind": "merge"}, "is a merge of several runs: open"),
+        ("nowhere", {"status": "failed"}, "ended before it had a pose"),
+    ):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "manifest.json").write_text(json.dumps(manifest))
+        with pytest.raises(InputError, match=said):
+            require_one_run(folder)

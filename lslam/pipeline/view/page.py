@@ -6,11 +6,13 @@ import logging
 from pathlib import Path
 
 from lslam.core.errors import InputError, input_errors
+from lslam.pipeline.map_files import read_json
+from lslam.pipeline.run_folder import MANIFEST
 from lslam.pipeline.view.server import Answer
 from lslam.reports.shell import RUN, policy, script_of
 
 log = logging.getLogger("lslam")
-REPORT = "report.html"
+REPORT, TRAJECTORY = "report.html", "trajectory.tum"
 TALKS = "connect-src 'self'"
 SERVED = '<script type="application/json" id="served">{}</script>\n'  # tells the page's script
 
@@ -34,6 +36,18 @@ def page_of(folder: Path) -> Answer:
 def is_ours(text: str) -> bool:
     """Whether a page has the script of this version."""
     return policy(script_of(RUN)) in text
+
+
+def require_one_run(folder: Path) -> None:
+    """Raise InputError for the folder of a merge, or of a run that ended without a pose: there is nothing to correct."""
+    if read_json(folder / MANIFEST).get("kind") == "merge":
+        raise InputError(
+            f"{folder} is a merge of several runs: open {folder / REPORT} in a browser, or name one of its runs"
+        )
+    if not (folder / TRAJECTORY).is_file():
+        raise InputError(
+            f"{folder} has no {TRAJECTORY}: the run ended before it had a pose, so there is nothing to show"
+        )
 
 
 def require_page(folder: Path) -> None:
