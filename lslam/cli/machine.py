@@ -22,7 +22,7 @@ EXTRAS = {
     "parquet": ("results.parquet of studies", ("pyarrow",)),
     "view": ("lslam view RUN --rerun FILE, for the rerun viewer", ("rerun",)),
     "small-gicp": ("method small-gicp", ("small_gicp",)),
-    "geo": ("lslam convert to KML, GPX and GeoPackage", ("fastkml", "fudgeo", "gpxpy", "pygeoif")),
+    "geo": ("lslam deliver; lslam convert to KML, GPX and GeoPackage", ("fastkml", "fudgeo", "gpxpy", "pygeoif")),
     "cluster": ("--cluster and --scheduler", ("dask", "distributed")),
     "cloud": ("s3:// and gs://", ("fsspec", "s3fs", "gcsfs")),
 }
