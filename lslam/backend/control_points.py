@@ -10,7 +10,7 @@ import numpy as np
 
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
 from lslam.backend.graph.consistency import Drift, judge_loops
-from lslam.backend.graph.gnss_alignment import refined
+from lslam.backend.graph.gnss_alignment import fit_pose
 from lslam.backend.graph.odometry_constraints import odometry_constraints
 from lslam.backend.graph.pose_graph import from_held
 from lslam.backend.graph.problem import PoseGraph, PositionFix
@@ -68,7 +68,7 @@ def with_control(
                 "takes two that lie apart",
             )
         tilt = LEVELLED if up is not None else UNLEVELLED
-        T = refined(T, own @ level.T, enu, sigmas, tilt)  # a slope under the first scan is no drift of odometry
+        T = fit_pose(T, own @ level.T, enu, sigmas, tilt)  # a slope under the first scan is no drift of odometry
         T_enu_world = T @ se3.make(level, np.zeros(3))
         reference = _in_crs(Georeference(on_earth[0], T_enu_world, method="control"), points, config)
     else:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lslam.core.types.arrays import Points
 from lslam.core.types.constraint import LoopCandidate, LoopStage
 from lslam.core.types.run_record import PairView, RunRecord
-from lslam.reports.page_data import QUANTA, packed
+from lslam.reports.page_data import pack_points
 
 MOST_CANDIDATES = 1000
 
@@ -48,19 +46,10 @@ def judgement(candidate: LoopCandidate) -> dict[str, Any]:
 
 
 def pair_data(view: PairView) -> dict[str, Any]:
-    """Both clouds as `_cloud` has them, and the rows (3, 4) of `before` and `after`."""
+    """Both clouds as `pack_points` has them, and the rows (3, 4) of `before` and `after`."""
     return {
-        "a": _cloud(view.a),
-        "b": _cloud(view.b),
+        "a": pack_points(view.a),
+        "b": pack_points(view.b),
         "before": view.before[:3].round(5).tolist(),
         "after": None if view.after is None else view.after[:3].round(5).tolist(),
     }
-
-
-def _cloud(points: Points) -> dict[str, Any]:
-    """Points (N, 3) as int16 q, where a coordinate is `low` + `step` (q + 32768), m."""
-    points = points[np.isfinite(points).all(1)].astype(np.float64)
-    low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.zeros(3))
-    step = np.maximum((high - low) / QUANTA, 1e-6)
-    quanta: NDArray[Any] = np.rint((points - low) / step) - (QUANTA + 1) // 2
-    return {"points": packed(quanta, "<i2"), "low": low.tolist(), "step": step.tolist(), "count": len(points)}

@@ -116,14 +116,8 @@ def cloud_data(
     points = cloud.points[order]
     if not len(points):
         return None
-    low = points.min(0)
-    step = np.maximum((points.max(0) - low) / QUANTA, 1e-6)
-    quanta = np.rint((points - low) / step) - (QUANTA + 1) // 2
     data: dict[str, Any] = {
-        "count": len(points),
-        "points": packed(quanta, "<i2"),
-        "low": low.tolist(),
-        "step": step.tolist(),
+        **pack_points(points),
         "height": usual_range(points[:, 2]),
         "spacing": _spacing(points),
         "colours": VIRIDIS,
@@ -145,6 +139,15 @@ def cloud_data(
         owner = np.repeat(np.arange(len(sessions)), [len(positions) for positions in sessions])
         data["session"] = packed(owner[_nearest(points, np.concatenate(sessions))], "u1")
     return data
+
+
+def pack_points(points: NDArray[np.floating]) -> dict[str, Any]:
+    """Points (N, 3) that are finite, m, as int16 q, where a coordinate is `low` + `step` (q + 32768); N is `count`."""
+    points = points[np.isfinite(points).all(1)].astype(np.float64)
+    low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.zeros(3))
+    step = np.maximum((high - low) / QUANTA, 1e-6)
+    quanta = np.rint((points - low) / step) - (QUANTA + 1) // 2
+    return {"count": len(points), "points": packed(quanta, "<i2"), "low": low.tolist(), "step": step.tolist()}
 
 
 def _spacing(points: Floats) -> float:

@@ -53,7 +53,7 @@ def align(
         inliers = _fits(T, a, fixes, judged)
         if inliers.sum() < max(min_fixes, MAJORITY_SHARE * len(a)):
             return None
-        T = refined(T, a[inliers], fixes[inliers], judged[inliers], up_sigma)
+        T = fit_pose(T, a[inliers], fixes[inliers], judged[inliers], up_sigma)
     T_enu_world = T @ se3.make(level, np.zeros(3))
     return GnssAlignment(T_enu_world, inliers, fixes - se3.apply(T_enu_world, antenna))
 
@@ -95,7 +95,7 @@ def _fits(T: Floats, a: Floats, fixes: Floats, sigmas: Floats) -> Bools:
     return np.asarray(np.nan_to_num(whitened.sum(1), nan=np.inf) <= quantile(0.999, 3))
 
 
-def refined(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: float) -> Floats:
+def fit_pose(T: Floats, a: Floats, fixes: Floats, sigmas: Floats, up_sigma: float) -> Floats:
     """Least squares over all six degrees of freedom, with the up direction as prior on the tilt."""
     from scipy.optimize import least_squares
 

@@ -27,8 +27,8 @@ from lslam.pipeline.run_folder import MANIFEST, SESSIONS, require_run
 FINISHED = ("done", "degraded")
 # Surveys of one mark differ by less, two marks by more.
 SAME_MARK_M = 0.05
-# Grids that states survey in are true to 1 in 1,000, web maps to no bound.
-DISTORTED = 0.01
+# Of a length. Grids that states survey in are true to 1 in 1,000, web maps to no bound.
+MOST_SCALE_ERROR = 0.01
 
 
 @dataclass(frozen=True)
@@ -138,10 +138,10 @@ def read_survey(folder: Path, crs: OutputCrs | None, check: Path | None = None, 
     projection = Projection(in_crs(first.georeference, crs))
     projection.check()
     _, scale = projection.convergence_and_scale
-    if abs(scale - 1) > DISTORTED:
+    if abs(scale - 1) > MOST_SCALE_ERROR:
         raise UsageError(
             f"--crs {projection.name}: lengths in it are {scale:.3g} times those on the ground here, which is no plane for a "
-            f"survey; leave --crs out for that of the run, or name one made for this place"
+            "survey; leave --crs out for that of the run, or name one made for this place"
         )
     survey = Survey(folder, manifest, drives, projection)
     used = _control(survey, projection)
