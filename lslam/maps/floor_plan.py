@@ -99,6 +99,15 @@ class TopView:
     extent: Extent
 
 
+def pixel_size(voxel: float, least: float = 0.2) -> float:
+    """Edge of pixels that hold whole columns of voxels of edge `voxel`, m, and are not under `least`; `least` without voxels.
+
+    >>> round(pixel_size(0.15), 9)
+    0.3
+    """
+    return voxel * math.ceil(least / voxel - 1e-9) if voxel else least
+
+
 def top_view(cloud: Cloud | NDArray[Any], pixel: float = 0.2, longest: int = 1600, trim: float = 0.001) -> TopView:
     """Number of points of a map in each vertical column, and their mean height.
 

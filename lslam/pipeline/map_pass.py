@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,7 +27,7 @@ from lslam.core.types.state import State
 from lslam.maps.clean import Cleaner, PosedScan
 from lslam.maps.colour import ColourCounts
 from lslam.maps.every_point import PointCollector
-from lslam.maps.floor_plan import TopView, top_view
+from lslam.maps.floor_plan import TopView, pixel_size, top_view
 from lslam.maps.merge import MapMerger
 from lslam.maps.mesh import denoise
 from lslam.maps.observations import Observations
@@ -198,8 +197,7 @@ class MapMaker:
         if self._section.denoise:
             before, merged = len(merged), denoise(in_memory(merged))
             done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
-        voxel = self._section.voxel
-        view = top_view(merged, pixel=voxel * math.ceil(0.2 / voxel - 1e-9) if voxel else 0.2)
+        view = top_view(merged, pixel_size(self._section.voxel))
         occupancy = None if self._occupancy is None else self._occupancy.result()
         return BuiltMap(merged, view, thinned(merged, SAMPLE, SHOWN), done, occupancy)
 

@@ -16,7 +16,7 @@ from lslam.core.types.cloud import ArrayCloud, thinned
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.maps.changes import MapChange, differences, points_in
-from lslam.maps.floor_plan import top_view
+from lslam.maps.floor_plan import pixel_size, top_view
 from lslam.maps.occupancy import Evidence, OccupancyMapper
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.map_pass import SAMPLE, map_checkpoints, scan_poser, scans_again
@@ -50,7 +50,7 @@ def view_prior_map(job: PreparedRun, record: RunRecord, prior_map: PriorMap) -> 
     parts = [same, *differing]
     change = np.repeat([0, -1, 1], [len(part) for part in parts])
     record.map_sample = ArrayCloud(np.concatenate(parts), columns={"change": change.astype(np.int8)})
-    view = top_view(ArrayCloud(near), pixel=max(0.2, section.voxel))
+    view = top_view(ArrayCloud(near), pixel_size(section.voxel))
     record.map_image, record.map_heights, record.map_extent = view.image, view.heights, view.extent
     job.manifest.localization["differences"] = {
         "voxel_m": found.voxel,

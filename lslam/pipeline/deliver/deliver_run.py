@@ -22,7 +22,7 @@ from lslam.io.formats.las_files import write_las
 from lslam.io.formats.point_files import open_map
 from lslam.io.formats.state_files import read_npz
 from lslam.io.formats.text_tables import is_unix_time
-from lslam.maps.floor_plan import UNKNOWN, Extent, floor_plan, top_view
+from lslam.maps.floor_plan import UNKNOWN, Extent, floor_plan, pixel_size, top_view
 from lslam.maps.georeference import ProjectedCloud, Projection
 from lslam.maps.occupancy import OccupancyGrid
 from lslam.pipeline.convert import check_beside, staged
@@ -139,8 +139,7 @@ def _write_plan(folder: Path, survey: Survey, files: dict[str, str]) -> tuple[ND
         places = np.concatenate([survey.frame.apply(run.trajectory.positions)[:, :2] for run in survey.drives.values()])
         (x, y), (east, north) = places.min(axis=0) - _PAPER_M, places.max(axis=0) + _PAPER_M
         return None, (float(x), float(east), float(y), float(north))
-    pixel = max(_PIXEL_M, _voxel(survey))
-    view = top_view(open_map(folder / MAP, ()), pixel, _LONGEST)
+    view = top_view(open_map(folder / MAP, ()), pixel_size(_voxel(survey), _PIXEL_M), _LONGEST)
     image, (west, east, _, north) = density_grey(view.image), view.extent
     size = (east - west) / image.shape[1]
     write_geotiff(folder / PLAN, image, np.array([[size, 0, west], [0, -size, north]]), survey.frame.epsg, _EMPTY)
