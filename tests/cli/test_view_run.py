@@ -197,12 +197,23 @@ def test_tiles_are_the_map_and_know_their_scan(served: Client, lost: Path) -> No
     np.testing.assert_array_equal(nearest[:50], away.argmin(1))
 
 
+def heed_hangup() -> None:
+    """A terminal that hangs up ends the process, though tests may run under `nohup`, which it would inherit."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
 @contextmanager
 def viewing(run: Path, *words: str) -> Iterator[tuple[subprocess.Popen[str], Client]]:
     """`lslam view` in a process of its own."""
     command = [*COMMAND, "view", str(run), "--no-browser", *words]
     with subprocess.Popen(
-        command, env=environment(), text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        command,
+        env=environment(),
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=heed_hangup,
     ) as child:
         try:
             assert child.stdout is not None
