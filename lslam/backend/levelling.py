@@ -24,7 +24,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Keyframe
-from lslam.registration.preprocessing.ground import Z, levelling, up_of
+from lslam.registration.preprocessing.ground import GROUND_TOLERANCE_M, Z, levelling, up_of
 from lslam.registration.preprocessing.up import NEAR_Z
 
 log = logging.getLogger("lslam")
@@ -110,8 +110,7 @@ def _up_by_ground(sequence: Sequence, results: list[ScanResult], config: Config)
         if result.status != "ok" or result.frame:
             continue
         with suppress(InputError):
-            tolerance, up = config.preprocess.ground_tolerance, up_of(config.preprocess)
-            R, height = levelling(sequence.scan(number).points, tolerance, CELLS, up)
+            R, height = levelling(sequence.scan(number).points, GROUND_TOLERANCE_M, CELLS, up_of(config.preprocess))
             return np.asarray(result.T_world_lidar[:3, :3] @ R[2]) if np.isfinite(height) else None
     return None
 

@@ -135,7 +135,7 @@ class FeatureMap(Stateful):
     ----------
     size : m, edge of a voxel of edges
     plane_size : m, edge of the smallest voxel of planar points; as `size` when absent
-    coarse_factor, min_points, planarity, count_cap, reach : of the planes, as in `LocalMap`
+    reach : m, voxels farther than this from the sensor are given back
     """
 
     STATE = ("planes", "edges")
@@ -145,22 +145,11 @@ class FeatureMap(Stateful):
         size: float,
         *,
         plane_size: float | None = None,
-        coarse_factor: int = 3,
-        min_points: int = 6,
-        planarity: float = 0.3,
-        count_cap: float = 200.0,
         reach: float = 150.0,
         capacity: int = 1 << 16,
     ) -> None:
-        self.planes = LocalMap(
-            plane_size or size,
-            coarse_factor=coarse_factor,
-            min_points=min_points,
-            planarity=planarity,
-            count_cap=count_cap,
-            reach=reach,
-        )
-        self.edges = GaussianMap(size, count_cap=count_cap, reach=reach, capacity=capacity // 4)
+        self.planes = LocalMap(plane_size or size, reach=reach)
+        self.edges = GaussianMap(size, reach=reach, capacity=capacity // 4)
         self._lines = _lines_for(self.edges)
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 from lslam.core.config.odometry import RecoveryConfig
 from lslam.odometry.feature_solver import remap_solution
 from lslam.odometry.feature_target import MIN_FEATURES
-from lslam.registration.attempt import Attempt, Policy
+from lslam.registration.attempt import RECOVER_M, Attempt, Policy
 from lslam.registration.policies import policies_of
 from lslam.registration.result import RegistrationResult
 
@@ -66,7 +66,7 @@ class AllPointsInstead:
         if points is None:
             return result
         start = attempt.start if attempt.is_young else None
-        is_far = not result.ok or result.prior_error[0] > c.recover_m
+        is_far = not result.ok or result.prior_error[0] > RECOVER_M
         if c.start_reach > 0 and (attempt.is_young or is_far):
             with attempt.clock.stage("start" if attempt.history.starting else "recover"):
                 result = points.confirm(attempt, attempt.T_prior if start is None else start.T_world_lidar, result)

@@ -27,7 +27,15 @@ from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.preprocessing.ground import Z
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing, is_more
+from lslam.registration.robust import (
+    COARSE_DECAY,
+    COARSE_KERNEL_M,
+    KERNEL_DECAY,
+    KERNEL_MIN_M,
+    START_ITERATIONS,
+    Annealing,
+    is_more,
+)
 from lslam.registration.start_search import MUCH_RATIO, START_STEP_M, start_offsets
 
 # Fewer inliers, ten per degree of freedom, are insignificant.
@@ -133,7 +141,7 @@ class FeatureTarget(Target):
         assert self.scan is not None
         features, noise, iterations, c = attempt.points, self.noise(attempt.history), 0, self.config
         if attempt.is_near:
-            annealing = replace(annealing, steps=c.start_iterations)
+            annealing = replace(annealing, steps=START_ITERATIONS)
         elif attempt.history.starting > 0:
             annealing = replace(annealing, start=c.kernel_max)
         result = RegistrationResult(T_start, ok=False)
@@ -172,7 +180,7 @@ class FeatureTarget(Target):
         """Edges, and centroids of the less planar points, on fine and coarse planes, judged."""
         c, noise = self.config, self.noise(attempt.history)
         points, scatter = thinned(attempt.points)
-        annealing = Annealing(c.kernel_max, c.kernel_min, c.kernel_decay, c.start_iterations)
+        annealing = Annealing(c.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, START_ITERATIONS)
         edges = attempt.points.edges.points
         problem = map_problem(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter)
         return attempt.judge(optimise(*problem))
@@ -201,7 +209,7 @@ class FeatureTarget(Target):
         target, noise = self._planes(), self.noise(history)
 
         def on_coarse(start: Floats, width: float) -> RegistrationResult:
-            slow = Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
+            slow = Annealing(width, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS)
             levels = target.planes.coarser[:1]
             problem = map_problem(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels)
             return attempt.judge(optimise(*problem))
@@ -213,7 +221,7 @@ class FeatureTarget(Target):
             problem = map_problem(target, edges, NONE, result.T_world_lidar, once, noise)
             return optimise(*problem).inliers if result.ok else -1
 
-        result = on_coarse(T_prior, c.coarse_kernel)
+        result = on_coarse(T_prior, COARSE_KERNEL_M)
         if history.inserted > 1 or not self._with_start_search:
             return result
         # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
@@ -234,14 +242,10 @@ class FeatureTarget(Target):
         return alone
 
     def _new_map(self, capacity: int) -> FeatureMap:
-        c, size = self.config, self.loam.feature_map_voxel
+        size = self.loam.feature_map_voxel
         return FeatureMap(
             size,
             plane_size=self._plane_size(size),
-            coarse_factor=c.coarse_factor,
-            min_points=c.min_points,
-            planarity=c.planarity,
-            count_cap=c.count_cap,
             reach=self._reach,
             capacity=capacity,
         )

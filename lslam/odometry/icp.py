@@ -22,7 +22,7 @@ from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_poi
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS, VoxelTarget
 
 
@@ -114,8 +114,8 @@ class Icp(MapMethod):
         began, registration = time.perf_counter(), self.registration
         attempt, c = registration.attempt(prepared, prior.pose, is_near), registration.config
         points = SweepPoints(prepared, registration.map.levels, c.sigma, c.blob_weight)
-        width = max(attempt.annealing.start, c.kernel_min)
-        annealing = Annealing(width, c.kernel_min, c.kernel_decay, c.max_iterations)
+        width = max(attempt.annealing.start, KERNEL_MIN_M)
+        annealing = Annealing(width, KERNEL_MIN_M, KERNEL_DECAY, c.max_iterations)
         elastic = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)
         result = attempt.judge(elastic.result)
         sweep = replace(elastic.sweep.prior, change=prior.change) if result.ok else None

@@ -18,6 +18,7 @@ from lslam.registration.optimiser import normal_equations
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
+from lslam.registration.robust import KERNEL_MIN_M
 
 
 def create(config: Config) -> LioMapping:
@@ -68,7 +69,7 @@ class LioMapping(FastLio2):
 
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
         """As registration weighs the points where it ends."""
-        target, width = self.registration.target, self.registration.config.kernel_min
+        target, width = self.registration.target, KERNEL_MIN_M
         terms, _, _, _, matches, *_ = target.problem(points, T, width, 1)
         return ScanEquations(stamp_ns, T, *normal_equations(terms, T, width, matches))
 

@@ -84,7 +84,6 @@ class PlaneExtractor:
         self._voxels = GaussianMap(
             VOXEL_M,
             min_points=LEAST_SEED,
-            planarity=0.3,
             count_cap=np.inf,
             reach=np.inf,
             capacity=1 << 13,

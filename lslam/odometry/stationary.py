@@ -13,11 +13,14 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import COARSE_FACTOR
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import KERNEL_DECAY, Annealing
 from lslam.registration.solver import solve
 
+# A scan that moved by less since the last registered one is stationary: several times the noise of a registration.
+STANDING_M, STANDING_DEG = 0.02, 0.1
 # Steps beyond these, m and deg, need no test of the next scan: it is not stationary.
 SLOW_M, SLOW_DEG = 0.1, 1.0
 # Least overlap and inlier share for a test.
@@ -39,14 +42,11 @@ class StationaryDetector(Stateful):
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess = preprocess
         self._config = registration.model_copy(update={"blob_weight": 0.0})
-        self._limit_m, self._limit_rad = preprocess.standing_m, float(np.deg2rad(preprocess.standing_deg))
+        self._limit_m, self._limit_rad = STANDING_M, float(np.deg2rad(STANDING_DEG))
         c = self._config
         # Of the reference, in voxels as coarse as those of a map's first scans: a ring is no plane.
         self._planes = GaussianMap(
-            c.voxel_size * c.coarse_factor,
-            min_points=c.min_points,
-            planarity=c.planarity,
-            count_cap=c.count_cap,
+            c.voxel_size * COARSE_FACTOR,
             reach=1.2 * preprocess.range_max,
         )
         # The pose of its own points on them after one step; None: there is no reference.
@@ -96,7 +96,7 @@ class StationaryDetector(Stateful):
 
     def _step(self, points: PreparedPoints) -> RegistrationResult:
         c = self._config
-        once = Annealing(c.kernel_max, c.kernel_max, c.kernel_decay, 1)
+        once = Annealing(c.kernel_max, c.kernel_max, KERNEL_DECAY, 1)
         return solve((self._planes,), points, np.eye(4), once, c)
 
     def _is_stationary(self, scan: Scan) -> bool:

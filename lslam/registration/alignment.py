@@ -16,7 +16,14 @@ from lslam.registration.preprocessing.ground import Z
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE, ResidualKind
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import (
+    COARSE_DECAY,
+    COARSE_KERNEL_M,
+    KERNEL_DECAY,
+    KERNEL_MIN_M,
+    START_ITERATIONS,
+    Annealing,
+)
 from lslam.registration.solver import prior_term, solve, voxel_terms
 
 
@@ -60,7 +67,7 @@ class MapAlignment:
         c, coarser = self.config, coarser or self.map.coarser
         coarser = coarser if self.kind.is_wide else coarser[:1]
         # The larger the planes, the farther their surface may be from them.
-        end = coarser[0].size / self.map.coarser[0].size * c.kernel_min
+        end = coarser[0].size / self.map.coarser[0].size * KERNEL_MIN_M
         width, end = (max(width, end), end) if c.inlier_distance is None else (c.inlier_distance,) * 2
         matches = self._remembered(len(points.source))
         arrays, levels = self.kind.points(points, c.sigma), (self.map.fine, *coarser)
@@ -69,7 +76,7 @@ class MapAlignment:
             terms.append(prior_term(start, information))
         limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, allowed=allowed)
         farthest = np.inf if c.inlier_distance is None else c.inlier_distance
-        return terms, start, Annealing(width, end, c.kernel_decay, steps), limits, matches, farthest, c.inlier_ratio
+        return terms, start, Annealing(width, end, KERNEL_DECAY, steps), limits, matches, farthest, c.inlier_ratio
 
     def _remembered(self, count: int) -> Correspondences:
         """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
@@ -84,13 +91,13 @@ class MapAlignment:
         ground these agree with any speed that the map was once made with.
         Few scans of a sparse sensor put single rings into fine voxels, which are no planes yet: the points there keep
         their coarse plane, the others take a fine one.
-        width : m, of the kernel at the start, where the prior is known better than `coarse_kernel`
+        width : m, of the kernel at the start, where the prior is known better than `COARSE_KERNEL_M`
         """
         c = self.config
         coarser = self.coarse_maps(points, T_prior)
-        coarse = solve(coarser[:1], points, T_prior, self.slowly(min(width, c.coarse_kernel)), c)
+        coarse = solve(coarser[:1], points, T_prior, self.slowly(min(width, COARSE_KERNEL_M)), c)
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = self.refine(points, start, c.kernel_max, c.start_iterations, coarser)
+        fine = self.refine(points, start, c.kernel_max, START_ITERATIONS, coarser)
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
     def coarse_maps(self, points: PreparedPoints, T_prior: Floats) -> tuple[GaussianMap, ...]:
@@ -99,7 +106,7 @@ class MapAlignment:
         From thirty metres above the ground the rings of one scan lie metres apart.
         """
         c, coarser = self.config, self.map.coarser
-        once = Annealing(c.coarse_kernel, c.coarse_kernel, c.coarse_decay, 1)
+        once = Annealing(COARSE_KERNEL_M, COARSE_KERNEL_M, COARSE_DECAY, 1)
         for k, level in enumerate(coarser):
             if solve((level,), points, T_prior, once, c).overlap >= c.min_overlap:
                 return coarser[k:]
@@ -107,8 +114,7 @@ class MapAlignment:
 
     def slowly(self, width: float) -> Annealing:
         """A kernel that closes from `width`, m, so slowly that coarse planes are followed."""
-        c = self.config
-        return Annealing(width, c.kernel_min, c.coarse_decay, c.start_iterations)
+        return Annealing(width, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS)
 
 
 def upright_directions(T_prior: Floats, up: Floats = Z) -> Floats:

@@ -16,10 +16,12 @@ from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.history import History
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import KERNEL_DECAY, KERNEL_MIN_M, START_ITERATIONS, Annealing
 
 # The kernel opens so many times its end width around a pose that is nearly right.
 NEAR_KERNEL_FACTOR = 2.0
+# Corrections of the prior beyond these are checked coarse to fine: priors of steady motion are better.
+RECOVER_M, RECOVER_DEG = 0.3, 3.0
 
 
 class Target(Stateful, ABC):
@@ -90,11 +92,11 @@ class Attempt:
     def annealing(self) -> Annealing:
         """The kernel's schedule: from the recent error of the motion prior, or narrow about one that is nearly right."""
         c, h = self.config, self.history
-        width = NEAR_KERNEL_FACTOR * c.kernel_min if self.is_near else h.threshold.width
+        width = NEAR_KERNEL_FACTOR * KERNEL_MIN_M if self.is_near else h.threshold.width
         steps = c.max_iterations * self.target.times_steps
         if not self.is_near and h.starting > 0:
-            steps = c.start_iterations
-        return Annealing(width, c.kernel_min, c.kernel_decay, steps)
+            steps = START_ITERATIONS
+        return Annealing(width, KERNEL_MIN_M, KERNEL_DECAY, steps)
 
     def judge(self, result: RegistrationResult, T_prior: Floats | None = None) -> RegistrationResult:
         """The result with its correction of the prior, or a failed one at the prior with the reason."""
@@ -121,7 +123,7 @@ class Attempt:
     def is_small(self, result: RegistrationResult) -> bool:
         """Whether the correction of the motion prior is within the prediction error that is expected of it."""
         move, turn = result.prior_error
-        return move < self.config.recover_m and turn < np.deg2rad(self.config.recover_deg)
+        return move < RECOVER_M and turn < np.deg2rad(RECOVER_DEG)
 
 
 class Policy(Protocol):

@@ -12,6 +12,12 @@ from lslam.core.types.state import State, Stateful
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR_M2 = 1e-4
+# Points that a voxel needs before it is matched: a plane has three unknowns, and six points give its thickness too.
+MIN_POINTS = 6
+# (l1 - l0) / l2 of the eigenvalues above which a voxel is a plane: 1 on a disc, 0 on a line or a ball.
+PLANARITY = 0.3
+# Points that a voxel remembers: older ones fade, so that the map follows what changes.
+COUNT_CAP = 200.0
 
 
 class GaussianMap(Stateful):
@@ -30,9 +36,9 @@ class GaussianMap(Stateful):
         self,
         size: float,
         *,
-        min_points: int = 6,
-        planarity: float = 0.3,
-        count_cap: float = 200.0,
+        min_points: int = MIN_POINTS,
+        planarity: float = PLANARITY,
+        count_cap: float = COUNT_CAP,
         reach: float = 150.0,
         capacity: int = 1 << 16,
         breadth: float = 0.0,

@@ -12,7 +12,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.state import Stateful
 from lslam.registration.rest import Rest
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
+from lslam.registration.robust import KERNEL_MIN_M, AdaptiveThreshold, UsualAgreement
 
 
 class History(Stateful):
@@ -29,7 +29,7 @@ class History(Stateful):
 
     def __init__(self, config: RegistrationConfig, preprocess: PreprocessConfig | None = None) -> None:
         self.start_scans = config.start_scans
-        self.threshold = AdaptiveThreshold(config.kernel_min, config.kernel_max)
+        self.threshold = AdaptiveThreshold(KERNEL_MIN_M, config.kernel_max)
         self.agreement, self.matches = (UsualAgreement(config.min_agreement) for _ in range(2))
         self.starting, self.inserted = config.start_scans, 0
         self.recent: tuple[tuple[NDArray[Any], Floats], ...] = ()

@@ -23,13 +23,15 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 # A plane must have been seen across its beams by so many times the standard deviation that it is thick, squared: below that, a
 # plane through the sensor explains its points as well, which is where the beams of one ring lie whatever they hit.
 LEAST_BREADTH = SIGNIFICANT_SIGMAS**2
+# Coarse voxels are so many times larger than fine ones: rings of sparse sensors share a voxel.
+COARSE_FACTOR = 3
 # Times the coarse voxels. Beams of two degrees lie two metres apart on a wall 60 m away, and on the ground 10 m ahead.
 WIDE_FACTORS = (2, 4)
 
 
 def surroundings_m(config: RegistrationConfig) -> float:
     """How far from a spot scans share no voxel with it but the widest: their rings hit other ground."""
-    return config.voxel_size * config.coarse_factor * WIDE_FACTORS[0]
+    return config.voxel_size * COARSE_FACTOR * WIDE_FACTORS[0]
 
 
 class LocalMap(Stateful):
@@ -37,34 +39,22 @@ class LocalMap(Stateful):
 
     Parameters
     ----------
-    size : m, edge of a fine voxel; coarse_factor : how many times larger a coarse one is
-    min_points, planarity, count_cap, reach, shared, breadth : as in `GaussianMap`; None: `LEAST_BREADTH`
+    size : m, edge of a fine voxel
+    reach, shared, breadth : as in `GaussianMap`; None: `LEAST_BREADTH`
     """
 
     def __init__(
         self,
         size: float,
         *,
-        coarse_factor: int,
-        min_points: int,
-        planarity: float,
-        count_cap: float,
         reach: float,
         shared: float = 0.0,
         breadth: float | None = None,
     ) -> None:
         breadth = LEAST_BREADTH if breadth is None else breadth
         self.levels = tuple(
-            GaussianMap(
-                edge,
-                min_points=min_points,
-                planarity=planarity,
-                count_cap=count_cap,
-                reach=reach,
-                breadth=breadth,
-                shared=shared,
-            )
-            for edge in (size, *(size * coarse_factor * wider for wider in (1, *WIDE_FACTORS)))
+            GaussianMap(edge, reach=reach, breadth=breadth, shared=shared)
+            for edge in (size, *(size * COARSE_FACTOR * wider for wider in (1, *WIDE_FACTORS)))
         )
         # How often the map has changed: what was looked up in it before is void then.
         self.changes = 0

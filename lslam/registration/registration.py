@@ -24,7 +24,7 @@ from lslam.registration.policies import policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.rest import RestDetector
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.voxel_target import VoxelTarget
 
 
@@ -134,8 +134,7 @@ class Registration(Stateful):
         It has the scale of the scene, the voxels and the noise in it: a share of 16 % is right in a small room, and wrong in a
         street.
         """
-        c = self.config
-        at_once = Annealing(c.kernel_min, c.kernel_min, c.kernel_decay, 1)
+        at_once = Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, 1)
         attempt = self.attempt(result.points, result.T_world_lidar)
         return float(self.target.align(attempt, result.T_world_lidar, at_once).inlier_share)
 

@@ -102,9 +102,9 @@ class PlanWalls:
         from scipy.spatial import cKDTree
 
         self._preprocess, self._sigma2, self._voxel_size = preprocess, sigma**2, voxel_size
-        ground = ground_of(cloud, preprocess.ground_slope, preprocess.ground_tolerance, up_of(preprocess))
+        ground = ground_of(cloud, up_of(preprocess))
         self._R = ground.R
-        high = cloud[ground.above(cloud, preprocess.ground_tolerance)].astype(np.float64) @ self._R.T
+        high = cloud[ground.above(cloud)].astype(np.float64) @ self._R.T
         self._tree = cKDTree(high[:, :2])
         pairs = self._tree.query_pairs(voxel_size, output_type="ndarray")
         own = np.arange(len(high))
@@ -125,9 +125,8 @@ class PlanWalls:
 
     def votes(self, cloud: NDArray[np.float32], motion: Floats) -> Votes:
         """How many things of a later scan (N, 3) fit better if the sensor stands, and how many if it came by `motion` (4, 4)."""
-        p = self._preprocess
-        ground = ground_of(cloud, p.ground_slope, p.ground_tolerance, up_of(p))
-        points = cloud[ground.above(cloud, p.ground_tolerance)].astype(np.float64)
+        ground = ground_of(cloud, up_of(self._preprocess))
+        points = cloud[ground.above(cloud)].astype(np.float64)
         if not len(self._mean) or not len(points):
             return Votes(0, 0)
         here, there = points @ self._R.T, se3.apply(motion, points) @ self._R.T

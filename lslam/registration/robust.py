@@ -10,6 +10,12 @@ from lslam.core.types.state import Stateful
 
 # Of what was lately, what stays from scan to scan: a memory of five.
 FORGETTING_FACTOR = 0.8
+# m; the kernel's width at the end, five sigma of a point, and its factor from step to step.
+KERNEL_MIN_M, KERNEL_DECAY = 0.15, 0.5
+# Coarse planes: the kernel's width at the start, m, which is the capture range, and its factor.
+COARSE_KERNEL_M, COARSE_DECAY = 5.0, 0.85
+# Steps of each stage while starting or recovering.
+START_ITERATIONS = 40
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from lslam.registration.preprocessing.ground import Ground, Z, above_ground, gro
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thin
 from lslam.registration.residuals import MEANS
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing, is_more
+from lslam.registration.robust import KERNEL_MIN_M, START_ITERATIONS, Annealing, is_more
 from lslam.registration.solver import solve, voxel_terms
 
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
@@ -52,7 +52,7 @@ class NonGroundPoints:
         self._cells = GaussianMap(NEAR_M, min_points=1, planarity=np.inf, reach=np.inf, capacity=1 << 12)
         self._up = up_of(preprocess)
         for points, T_world_lidar in scans:
-            index = above_ground(points, preprocess.ground_slope, preprocess.ground_tolerance, self._up)
+            index = above_ground(points, self._up)
             self._cells.insert(points[index], T_world_lidar)
 
     def agreeing(self, high: PreparedPoints, T_world_lidar: Floats) -> Bools:
@@ -78,7 +78,7 @@ class NonGroundPoints:
 
 def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground:
     """The ground under a scan."""
-    return ground_of(points.map_points, preprocess.ground_slope, preprocess.ground_tolerance, up_of(preprocess))
+    return ground_of(points.map_points, up_of(preprocess))
 
 
 def high_points(points: PreparedPoints, ground: Ground) -> PreparedPoints:
@@ -87,10 +87,10 @@ def high_points(points: PreparedPoints, ground: Ground) -> PreparedPoints:
     return PreparedPoints(above, above.astype(np.float64), np.zeros((len(above), 6)), len(above))
 
 
-def on_ground(points: PreparedPoints, ground: Ground, tolerance: float) -> PreparedPoints:
-    """The source points no higher above the ground than `tolerance`, m."""
+def on_ground(points: PreparedPoints, ground: Ground) -> PreparedPoints:
+    """The source points that lie on the ground."""
     is_ground = np.ones(len(points.source), bool)
-    is_ground[ground.above(points.source.astype(np.float32), tolerance)] = False
+    is_ground[ground.above(points.source.astype(np.float32))] = False
     return subset(points, is_ground)
 
 
@@ -122,8 +122,8 @@ def best_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
     if is_lost:
         result = _best_start(attempt, result, non_ground, high)
     coarser = target.coarse_maps(points, T_prior)
-    flat = on_ground(points, ground, target.preprocess.ground_tolerance)
-    width = NEAR_KERNEL_FACTOR * c.kernel_min
+    flat = on_ground(points, ground)
+    width = NEAR_KERNEL_FACTOR * KERNEL_MIN_M
 
     def placed(start: Floats) -> RegistrationResult:
         """Height and tilt by the ground, the rest by non-ground points, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
@@ -132,7 +132,7 @@ def best_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
 
     def upright(pose: Floats) -> Floats:
         directions = upright_directions(pose, up_of(target.preprocess))
-        aligned: RegistrationResult = target.refine(flat, pose, width, c.start_iterations, coarser, directions)
+        aligned: RegistrationResult = target.refine(flat, pose, width, START_ITERATIONS, coarser, directions)
         return aligned.T_world_lidar
 
     def agreeing(at: RegistrationResult) -> Bools:
@@ -149,7 +149,7 @@ def best_by_non_ground(attempt: Attempt, result: RegistrationResult, *, is_lost:
     margin = CLEAR_RATIO if is_at_rest(result.T_world_lidar, last) else MUCH_RATIO
     if is_drawn or not is_much_more(most, agreeing(result), margin):
         return result
-    near = target.refine(points, place, width, c.start_iterations, target.coarse_maps(points, place))
+    near = target.refine(points, place, width, START_ITERATIONS, target.coarse_maps(points, place))
     judged = attempt.judge(near, place)
     if not judged.ok and not result.ok:
         return result

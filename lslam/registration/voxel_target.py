@@ -22,7 +22,7 @@ from lslam.registration.preprocessing.beams import ring_gap
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import residual_named
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import KERNEL_MIN_M, Annealing
 from lslam.registration.source_covariance import source_covariance
 
 MIN_SOURCE_POINTS = 30
@@ -50,10 +50,6 @@ class VoxelTarget(MapAlignment, Target):
         shared = 0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR
         local_map = LocalMap(
             config.voxel_size * residual.voxel_share,
-            coarse_factor=config.coarse_factor,
-            min_points=config.min_points,
-            planarity=config.planarity,
-            count_cap=config.count_cap,
             reach=1.2 * preprocess.range_max,
             shared=shared,
         )
@@ -112,7 +108,7 @@ class VoxelTarget(MapAlignment, Target):
         covariance = np.zeros((1, 6)) if self.kind.needs_covariance else None
         gaps = np.zeros(1) if self.kind.needs_gaps else None
         points = replace(points, covariance=covariance, gaps=gaps)
-        optimise(*self.problem(points, np.eye(4), self.config.kernel_min, 1))
+        optimise(*self.problem(points, np.eye(4), KERNEL_MIN_M, 1))
 
     def enter(self, result: RegistrationResult) -> None:
         """Insert a scan at its pose."""

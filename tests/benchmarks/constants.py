@@ -65,6 +65,7 @@ NOT_OF_IT = {
     "odometry/integrity/alerts.py AXES", "registration/preprocessing/ground.py Z",
     "odometry/inertial/integrate.py PERFECT", "odometry/inertial/gyroscope.py MOUNTING",
     "registration/optimiser.py EVERYWHERE", "odometry/feature_solver.py NONE",
+    "registration/preprocessing/prepare.py DENOISE_NEIGHBOURS", "registration/preprocessing/prepare.py DENOISE_DEVIATIONS",
     "registration/preprocessing/prepare.py NO_TIMES", "core/kernels/gaussians.py USED", "core/kernels/gaussians.py FREED",
     "core/kernels/gaussians.py HAND", "core/kernels/gaussians.py LIVE", "odometry/frontend/scene_scale.py USUAL_RANGE_M",
     "odometry/integrity/directions.py _ROWS", "odometry/integrity/directions.py _COLUMNS",
@@ -75,20 +76,16 @@ NOT_OF_IT = {
 # Keys of sections that every scan passes, those that the scene's size decides aside.
 KEYS = {
     "points": (
-        "preprocess.range_max", "preprocess.ground_slope", "preprocess.ground_tolerance", "preprocess.least_line",
-        "preprocess.source_points_min", "preprocess.source_points_max", "registration.min_points", "registration.planarity",
-        "registration.count_cap", "registration.sigma", "registration.blob_weight", "registration.kernel_max",
-        "registration.kernel_min", "registration.kernel_decay", "registration.max_iterations", "registration.start_scans",
-        "registration.start_reach", "registration.start_iterations", "registration.coarse_factor",
-        "registration.coarse_kernel", "registration.coarse_decay", "registration.recover_m", "registration.recover_deg",
-        "registration.min_overlap", "registration.min_agreement", "registration.max_jump_m", "registration.max_jump_deg",
-        "registration.weak_share",
+        "preprocess.range_max", "preprocess.least_line", "preprocess.source_points_min", "preprocess.source_points_max",
+        "registration.sigma", "registration.blob_weight", "registration.kernel_max", "registration.max_iterations",
+        "registration.start_scans", "registration.start_reach", "registration.min_overlap", "registration.min_agreement",
+        "registration.max_jump_m", "registration.max_jump_deg", "registration.weak_share",
     ),
 }  # fmt: skip
 CONFIG = {"preprocess": "core/config/input.py", "registration": "core/config/odometry.py"}
 COSINES = {"UPRIGHT"}
 # Shares of which 1 is the whole, and ratios of which 1 is none.
-LACK = {"FORGETTING_FACTOR", "LESS", "USUAL types", "ALIKE inertial", "kernel_decay", "coarse_decay"}
+LACK = {"FORGETTING_FACTOR", "LESS", "USUAL types", "ALIKE inertial", "KERNEL_DECAY", "COARSE_DECAY"}
 EXCESS = {"CLEAR_RATIO", "MUCH_RATIO", "MORE_POINTS_RATIO", "LONE_CHECK_RATIO", "PILED_RATIO"}
 FACTORS = {"half": 0.5, "double": 2.0}
 

@@ -21,7 +21,7 @@ ARRAYS = ("moments", "planes", "keys", "table")
 
 
 def new_map() -> LocalMap:
-    return LocalMap(0.8, coarse_factor=3, min_points=6, planarity=0.3, count_cap=200.0, reach=100.0, shared=FLOOR_M2)
+    return LocalMap(0.8, reach=100.0, shared=FLOOR_M2)
 
 
 def scan(seed: int) -> PreparedPoints:

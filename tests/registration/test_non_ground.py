@@ -70,6 +70,6 @@ def test_bare_ground_has_no_share() -> None:
 def test_ground_and_non_ground_points_are_complementary() -> None:
     points = street(np.random.default_rng(1), 0.0)
     seen = PreparedPoints(points, points.astype(np.float64), np.arange(len(points))[:, None] * np.ones(6), len(points))
-    ground = on_ground(seen, ground_under(seen, PreprocessConfig()), PreprocessConfig().ground_tolerance)
+    ground = on_ground(seen, ground_under(seen, PreprocessConfig()))
     np.testing.assert_array_equal(ground.source, points[:4000].astype(np.float64))
     np.testing.assert_array_equal(ground.scatter, seen.scatter[:4000])

@@ -22,6 +22,7 @@ from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
+from lslam.registration.robust import KERNEL_MIN_M
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 Floats = NDArray[np.float64]
@@ -78,14 +79,14 @@ def test_unexpected_motion_after_the_start_is_recovered_coarse_to_fine(seed: int
 def test_where_priors_are_right_the_kernel_begins_where_it_ends() -> None:
     """And a surprise of a decimetre is found all the same, in a step or two more."""
     registration, rng = settled(22)
-    assert registration.history.threshold.width == registration.config.kernel_min
+    assert registration.history.threshold.width == KERNEL_MIN_M
     usual = registration.register(seen_from(room(rng), pose_at((2.2, 0.0, 0.0), 11.0)))
     assert usual.iterations <= 2
     T = pose_at((2.42, 0.0, 0.0), 11.5)
     surprised = registration.register(seen_from(room(rng), T))
     assert surprised.iterations <= 4
     assert is_near(T, surprised.T_world_lidar, 0.01, 0.05)
-    assert registration.history.threshold.width > registration.config.kernel_min
+    assert registration.history.threshold.width > KERNEL_MIN_M
 
 
 def test_a_corridor_keeps_the_prior_along_itself_scan_after_scan() -> None:

@@ -99,7 +99,7 @@ def test_a_sensor_that_is_pitched_sees_the_same_walls() -> None:
 
 
 def test_in_a_room_a_tenth_as_large_things_are_told_apart_as_in_a_street() -> None:
-    walls = PlanWalls(scan() / 10, PreprocessConfig(ground_tolerance=0.05), SIGMA, VOXEL_M / 10)
+    walls = PlanWalls(scan() / 10, PreprocessConfig(), SIGMA, VOXEL_M / 10)
     assert walls.votes(scan(1.0, seed=1) / 10, ahead(-0.1)) == Votes(2, 1)
 
 

@@ -23,7 +23,7 @@ from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import NEAR_KERNEL_FACTOR
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import UsualAgreement
+from lslam.registration.robust import COARSE_KERNEL_M, KERNEL_MIN_M, UsualAgreement
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # Sigmas that the kernel spans, and the chance that the innovation of a scan that the map holds lies beyond its gate.
@@ -81,7 +81,7 @@ class MapFollower(Stateful):
         alignment = self.view.at(self.T[:3, 3])
         result = self._align(alignment, points, self.T)
         status, reason = self._judge(result)
-        if reason and self.search is not None and self._spread() > self.config.registration.coarse_kernel:
+        if reason and self.search is not None and self._spread() > COARSE_KERNEL_M:
             T = self.search(position, self.T, self._spread())
             if T is not None:
                 result = self._align(self.view.at(T[:3, 3]), points, T)
@@ -102,7 +102,7 @@ class MapFollower(Stateful):
         A prior wider than the widest kernel says next to nothing, and is the initial guess only.
         """
         c = self.config.registration
-        width = max(self._spread(), NEAR_KERNEL_FACTOR * c.kernel_min)
+        width = max(self._spread(), NEAR_KERNEL_FACTOR * KERNEL_MIN_M)
         if start is self.T and width <= c.kernel_max:
             information = np.asarray(np.linalg.inv(self.covariance), np.float64)
             return alignment.refine(points, start, width, c.max_iterations, information=information)

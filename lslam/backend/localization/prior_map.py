@@ -99,9 +99,6 @@ def make_prior_map(
     local = (points - middle).astype(np.float32)
     planes = GaussianMap(
         config.voxel_size,
-        min_points=config.min_points,
-        planarity=config.planarity,
-        count_cap=config.count_cap,
         reach=np.inf,
     )
     insert_all(planes, local[:: max(len(local) // LOOKED_AT, 1)])
@@ -147,10 +144,6 @@ class LocalView:
         # Nobody knows which beams saw a point of a finished map.
         target = LocalMap(
             c.voxel_size,
-            coarse_factor=c.coarse_factor,
-            min_points=c.min_points,
-            planarity=c.planarity,
-            count_cap=c.count_cap,
             reach=np.inf,
             breadth=0.0,
         )

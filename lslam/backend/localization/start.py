@@ -24,7 +24,7 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.preprocessing.up import ahead_of
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.solver import solve
 
 # m between two keyframes that are tried, at least.
@@ -140,9 +140,7 @@ class PlaceFinder:
         if rivals and rivals[0] > c.max_ambiguity * support:
             self.reasons.append(f"another place fits {rivals[0] / support:.0%} as well")
             return None
-        found = self._solve(
-            query.source, rough, Annealing(r.kernel_max, r.kernel_min, r.kernel_decay, c.max_iterations)
-        )
+        found = self._solve(query.source, rough, Annealing(r.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, c.max_iterations))
         limits = Acceptance(c.min_overlap, MAP_MIN_INLIERS, needs_covariance=True, needs_all_directions=True)
         rejection = limits.rejection(found)
         if rejection is not None:
@@ -189,13 +187,13 @@ class PlaceFinder:
         """Inlier share of the upright points where the map was observed, after registration from `guess`, and the pose."""
         r = self.config.registration
         few = thin(query.source, FEW)
-        slow = Annealing(CATCH, r.kernel_max / 2, r.coarse_decay, self.config.loops.max_iterations)
+        slow = Annealing(CATCH, r.kernel_max / 2, COARSE_DECAY, self.config.loops.max_iterations)
         coarse = self._solve(few, guess, slow, self.search.whole.coarse)
-        fine = self._solve(few, coarse.T_world_lidar, Annealing(r.kernel_max, r.kernel_min, 0.7, 15))
+        fine = self._solve(few, coarse.T_world_lidar, Annealing(r.kernel_max, KERNEL_MIN_M, 0.7, 15))
         T = fine.T_world_lidar
         cells, inside = self.search.grid.cells_of(se3.apply(T, query.upright.source))
         comparable = int((inside & self.search.is_seen[cells]).sum())
-        width = 2 * r.kernel_min
+        width = 2 * KERNEL_MIN_M
         inliers = self._solve(query.upright, T, Annealing(width, width, 0.5, 1)).inliers
         return (0.0 if 2 * comparable < len(query.upright.source) else inliers / comparable), T
 

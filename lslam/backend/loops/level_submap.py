@@ -13,6 +13,7 @@ from lslam.core.kernels import gaussians
 from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.local_map import COARSE_FACTOR
 from lslam.registration.preprocessing.ground import Z
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.preprocessing.up import NEAR_Z
@@ -96,9 +97,6 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
     """
     fine = GaussianMap(
         min(config.voxel_size, LARGEST),
-        min_points=config.min_points,
-        planarity=config.planarity,
-        count_cap=config.count_cap,
         reach=np.inf,
         capacity=CAPACITY,
     )
@@ -111,7 +109,7 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
     chosen, is_upright = solid[::step], ~is_level[::step]
     return LevelSubmap(
         fine,
-        fine.coarsen(config.coarse_factor),
+        fine.coarsen(COARSE_FACTOR),
         _source(fine, chosen),
         _source(fine, chosen[is_upright]),
         fine.planes[solid[~is_level], :3],

@@ -17,7 +17,7 @@ from lslam.core.types.constraint import LoopStage
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.solver import solve
 
 # Cells, at least and at most; the least image serves where the search is short.
@@ -142,14 +142,14 @@ class Verifier:
         """Inlier share of the upright points after registration from `start`, 0 to 1, and the pose found."""
         r = self.registration
         few = thin(b.source, FEW)
-        slow = Annealing(CATCH, r.kernel_max / 2, r.coarse_decay, self.config.max_iterations)
+        slow = Annealing(CATCH, r.kernel_max / 2, COARSE_DECAY, self.config.max_iterations)
         coarse = self._solve(a, few, start, slow, coarse_only=True)
-        fine = self._solve(a, few, coarse.T_world_lidar, Annealing(r.kernel_max, r.kernel_min, 0.7, 15))
+        fine = self._solve(a, few, coarse.T_world_lidar, Annealing(r.kernel_max, KERNEL_MIN_M, 0.7, 15))
         return self._support(a, b.upright, view, fine.T_world_lidar), fine.T_world_lidar
 
     def _refine(self, a: LevelSubmap, b: LevelSubmap, start: Floats) -> RegistrationResult:
         r = self.registration
-        annealing = Annealing(r.kernel_max, r.kernel_min, r.kernel_decay, self.config.max_iterations)
+        annealing = Annealing(r.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, self.config.max_iterations)
         return self._solve(a, b.source, start, annealing)
 
     def _solve(
@@ -161,7 +161,7 @@ class Verifier:
         """Inlier share among the points in cells that a observed: unlike their number, it does not depend on the shift."""
         cells, inside = LARGE.cells_of(se3.apply(T_a_b, upright.source))
         comparable = int((inside & view[cells]).sum())
-        width = 2 * self.registration.kernel_min
+        width = 2 * KERNEL_MIN_M
         inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
         return 0.0 if comparable < SHARED_SHARE * len(upright.source) else inliers / comparable
 

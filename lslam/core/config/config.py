@@ -39,6 +39,27 @@ REMOVED = {
     "leave the key out",
     "registration.start_overlap": "registration.min_overlap holds from the first scan on",
 }
+# Keys of earlier versions that nobody had a reason to turn: the value that they have in all runs, and what to turn instead, if
+# there is such a key. The register of constants (docs/algorithms.md) has their names in the code, and why they are as they are.
+FIXED: dict[str, tuple[Any, str]] = {
+    "preprocess.ground_slope": (0.2, ""),
+    "preprocess.ground_tolerance": (0.25, ""),
+    "preprocess.denoise_neighbours": (10, ""),
+    "preprocess.denoise_deviations": (2.0, ""),
+    "preprocess.standing_m": (0.02, ""),
+    "preprocess.standing_deg": (0.1, ""),
+    "registration.min_points": (6, "registration.voxel_size"),
+    "registration.planarity": (0.3, "registration.voxel_size"),
+    "registration.count_cap": (200, ""),
+    "registration.kernel_min": (0.15, "registration.kernel_max"),
+    "registration.kernel_decay": (0.5, "registration.max_iterations"),
+    "registration.start_iterations": (40, "registration.start_scans"),
+    "registration.coarse_factor": (3, "registration.voxel_size"),
+    "registration.coarse_kernel": (5.0, "registration.start_reach"),
+    "registration.coarse_decay": (0.85, ""),
+    "registration.recover_m": (0.3, "recovery.coarse_to_fine"),
+    "registration.recover_deg": (3.0, "recovery.coarse_to_fine"),
+}
 
 
 class Config(FrontEndConfig):
@@ -135,7 +156,7 @@ def load_config(
     """
     tree: Tree = {}
     if path is not None:
-        _merge(tree, read_toml(path, "configuration"), str(path))
+        _merge(tree, read_toml(path, "configuration"), str(path), is_file=True)
     _merge(tree, _from_environment(os.environ if environ is None else environ), "environment")
     for setting in settings:
         _merge(tree, _parse_setting(setting), f"--set {setting}")
@@ -169,7 +190,7 @@ def _whole(name: str, above: tuple[str, ...] = ()) -> Tree:
     tree = read_preset(name)
     base = tree.pop(BASE, None)
     under = {} if base is None else _whole(str(base), (*above, name))
-    _merge(under, tree, f"preset {name}")
+    _merge(under, tree, f"preset {name}", is_file=True)
     if "preset" in under.get("odometry", {}):
         raise ConfigError(
             f'preset {name}: what it stands on is said by base = "NAME" at its top, not by odometry.preset'
@@ -228,7 +249,8 @@ def setting_value(text: str) -> Any:
         return text
 
 
-def _merge(tree: Tree, more: Tree, where: str) -> None:
+def _merge(tree: Tree, more: Tree, where: str, *, is_file: bool = False) -> None:
+    """Lay `more` over the tree. A file may still say what is fixed, as the config.toml of an earlier run does."""
     for section, values in more.items():
         if section not in Config.model_fields:
             raise ConfigError(f"{where}: unknown section {section!r}; {nearest(section, Config.model_fields)}")
@@ -238,11 +260,22 @@ def _merge(tree: Tree, more: Tree, where: str) -> None:
         assert isinstance(model, type)
         assert issubclass(model, BaseModel)
         for key, value in values.items():
-            if f"{section}.{key}" in REMOVED:
-                raise ConfigError(f"{where}: there is no {section}.{key} any more: {REMOVED[f'{section}.{key}']}")
+            name = f"{section}.{key}"
+            if is_file and name in FIXED and value == FIXED[name][0]:
+                continue
+            if outcome := _outcome(name):
+                raise ConfigError(f"{where}: there is no {name} any more: {outcome}")
             if key not in model.model_fields:
                 raise ConfigError(f"{where}: unknown key {section}.{key}; {nearest(key, model.model_fields)}")
             tree.setdefault(section, {})[key] = value
+
+
+def _outcome(name: str) -> str:
+    """What became of a key of an earlier version, and what to do; empty for any other."""
+    if name not in FIXED:
+        return REMOVED.get(name, "")
+    value, instead = FIXED[name]
+    return f"it is {value} in all runs; " + (f"turn {instead} instead" if instead else "leave the key out")
 
 
 def explain(error: ValidationError, where: str = "configuration") -> str:

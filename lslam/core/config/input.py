@@ -98,20 +98,12 @@ class PreprocessConfig(Section):
         "by number where the recording has others; needs labels of points",
     )
     remove_ground: bool = Field(False, description="take out the points that lie on the ground")
-    ground_slope: float = Field(0.2, gt=0, lt=1, description="m/m; steepest ground against the plane under the sensor")
-    ground_tolerance: float = Field(0.25, gt=0, description="m; what is lower above the ground counts as ground")
     denoise: bool = Field(
         False, description="take out points far from their neighbours (statistical outlier removal): distant ones first"
-    )
-    denoise_neighbours: int = Field(10, ge=2, description="`denoise`: nearest points asked, the point itself included")
-    denoise_deviations: float = Field(
-        2.0, ge=0, description="`denoise`: standard deviations above the mean distance that are still allowed"
     )
     skip_standing: bool = Field(
         False, description="while the sensor stands, repeat the pose instead of registering and mapping the scan"
     )
-    standing_m: float = Field(0.02, gt=0, description="m; what has moved less since it was registered stands")
-    standing_deg: float = Field(0.1, gt=0, description="deg; likewise for rotation")
     deskew: bool = Field(True, description="take the motion within a scan out of it, where points have times")
     map_leaf: float = Field(0.3, gt=0, description="m; centroids of this grid feed the local map")
     least_line: float = Field(

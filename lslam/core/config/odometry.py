@@ -70,14 +70,11 @@ class RegistrationConfig(Section):
         description="m; voxels of the local map, eight are searched per point; for `point`, which is matched to "
         "their means, 5/8 of it",
     )
-    min_points: int = Field(6, ge=4, description="points a voxel needs before it is matched")
-    planarity: float = Field(0.3, gt=0, lt=1, description="(l1 - l0) / l2 above which a voxel is a plane")
-    count_cap: float = Field(200, gt=10, description="points a voxel remembers; older ones fade")
     sigma: float = Field(0.03, gt=0, description="m; noise of a point, ranging and calibration together")
     blob_weight: float = Field(0.5, ge=0, description="weight of voxels that are no plane; 0 leaves them out")
-    kernel_max: float = Field(1.0, gt=0, description="m; widest Geman-McClure kernel, where annealing starts")
-    kernel_min: float = Field(0.15, gt=0, description="m; width at which annealing ends: five sigma")
-    kernel_decay: float = Field(0.5, gt=0, lt=1, description="factor of the width from step to step")
+    kernel_max: float = Field(
+        1.0, gt=0.15, description="m; widest Geman-McClure kernel, where annealing starts; it ends at 0.15 m"
+    )
     max_iterations: int = Field(
         10,
         ge=1,
@@ -95,12 +92,6 @@ class RegistrationConfig(Section):
         description="m; how far the sensor may have moved between the first two scans, 40 m/s at every third scan of "
         "10 Hz; 0: not searched for",
     )
-    start_iterations: int = Field(40, ge=1, description="steps of each stage while starting or recovering")
-    coarse_factor: int = Field(3, ge=2, description="coarse voxels are this many times larger")
-    coarse_kernel: float = Field(5.0, gt=0, description="m; where coarse annealing starts: the capture range")
-    coarse_decay: float = Field(0.85, gt=0, lt=1, description="factor of the width per coarse step")
-    recover_m: float = Field(0.3, gt=0, description="m; a correction beyond this is checked coarse to fine")
-    recover_deg: float = Field(3.0, gt=0, description="deg; likewise for rotation")
     min_overlap: float = Field(
         0.05, ge=0, le=1, description="share of points that found a voxel below which a scan fails"
     )
@@ -121,11 +112,6 @@ class RegistrationConfig(Section):
         description="share of the information below which a direction counts as unobserved; below a third of it (in LOAM "
         "methods: at once) it keeps the motion prior",
     )
-
-    @model_validator(mode="after")
-    def _check(self) -> RegistrationConfig:
-        self.require_order("kernel_min", "kernel_max")
-        return self
 
 
 class RecoveryConfig(Section):

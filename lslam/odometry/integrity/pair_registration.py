@@ -16,18 +16,25 @@ from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import SAME_M, motion_apart
 from lslam.odometry.integrity.directions import directions, filled_directions
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.local_map import LEAST_BREADTH, WIDE_FACTORS
+from lslam.registration.local_map import COARSE_FACTOR, LEAST_BREADTH, WIDE_FACTORS
 from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import PLANE
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
+from lslam.registration.robust import (
+    COARSE_DECAY,
+    COARSE_KERNEL_M,
+    KERNEL_DECAY,
+    KERNEL_MIN_M,
+    START_ITERATIONS,
+    Annealing,
+)
 from lslam.registration.solver import voxel_terms
 
 SETTINGS = RegistrationConfig(blob_weight=0.0)
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
 # room, and spans several points and several sigma of their noise.
-EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, SETTINGS.coarse_factor * SETTINGS.voxel_size
+EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, COARSE_FACTOR * SETTINGS.voxel_size
 # Half of an edge is how far a plane reaches.
 CAPTURE_EDGES = 0.4
 # Steps that settle a scan which lies within its noise of where it was.
@@ -82,9 +89,6 @@ class PairRegistration:
         self._planes = tuple(
             GaussianMap(
                 LARGEST_M * wider,
-                min_points=SETTINGS.min_points,
-                planarity=SETTINGS.planarity,
-                count_cap=SETTINGS.count_cap,
                 reach=1e4,
                 capacity=1 << 13,
                 breadth=LEAST_BREADTH,
@@ -114,30 +118,26 @@ class PairRegistration:
 
     def near(self, start: Floats) -> MotionHypothesis:
         """The motion that fits near a start (4, 4): planes capture points as far as they reach."""
-        s = SETTINGS
-        widest = max(CAPTURE_EDGES * self._edge, s.kernel_min)
-        return self._lay(start, Annealing(widest, s.kernel_min, s.kernel_decay, s.max_iterations))
+        widest = max(CAPTURE_EDGES * self._edge, KERNEL_MIN_M)
+        return self._lay(start, Annealing(widest, KERNEL_MIN_M, KERNEL_DECAY, SETTINGS.max_iterations))
 
     def far(self, start: Floats) -> MotionHypothesis:
         """The motion that fits best some metres around a start (4, 4)."""
-        s = SETTINGS
-        return self._lay(start, Annealing(s.coarse_kernel, s.kernel_min, s.coarse_decay, s.start_iterations))
+        return self._lay(start, Annealing(COARSE_KERNEL_M, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS))
 
     def at_rest(self) -> MotionHypothesis:
         """The motion that fits if the sensor stands: its points lie within their noise of where they were."""
-        s = SETTINGS
-        return self._lay(np.eye(4), Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, STEPS_AT_REST))
+        return self._lay(np.eye(4), Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, STEPS_AT_REST))
 
     def at(self, motion: Floats) -> MotionHypothesis:
         """How the scan fits at a motion (4, 4)."""
-        s = SETTINGS
-        return self._lay(motion, Annealing(s.kernel_min, s.kernel_min, s.kernel_decay, 1))
+        return self._lay(motion, Annealing(KERNEL_MIN_M, KERNEL_MIN_M, KERNEL_DECAY, 1))
 
     def _lay(self, start: Floats, annealing: Annealing) -> MotionHypothesis:
         motion = optimise(self._terms, start, annealing, Limits(SETTINGS.weak_share), self._matches)
         away2 = self._matches.away2
         cells = directions(se3.apply(motion.T_world_lidar, self._source))
-        on_planes = (away2 >= 0) & (away2 < SETTINGS.kernel_min**2)
+        on_planes = (away2 >= 0) & (away2 < KERNEL_MIN_M**2)
         return MotionHypothesis(motion, on_planes, int(np.isin(cells, self._view).sum()))
 
 

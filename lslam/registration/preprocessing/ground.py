@@ -4,7 +4,7 @@ First the dominant plane: of all planes through three of the lowest points of a 
 near it and fewest below (RANSAC, Fischler and Bolles 1981). It levels the scan, so the tilt of a drone is no slope. The grid
 is level where `up` is vertical, which a sensor that hangs or lies has elsewhere than along its z. Then the
 slope filter of Vosselman (2000): a point is no ground when another one lies so much lower that the ground between them
-would be steeper than `slope`. Mirrors and puddles put points under the ground: what no such slope joins to the plane
+would be steeper than `GROUND_SLOPE`. Mirrors and puddles put points under the ground: what no such slope joins to the plane
 under the sensor is not asked for its opinion.
 """
 
@@ -24,6 +24,10 @@ from lslam.core.types.arrays import Floats, Longs
 GROUND_CELL_M = 0.5
 GROUND_REACH_M = 150.0
 TRIPLES = 200
+# m per m; the steepest ground against the dominant plane: steeper than any street, less steep than a kerb over a cell.
+GROUND_SLOPE = 0.2
+# m above the ground that still counts as ground: ruts and kerbs.
+GROUND_TOLERANCE_M = 0.25
 # Planes steeper than 40 deg against the expected horizontal are walls or roofs.
 UPRIGHT = float(np.cos(np.deg2rad(40.0)))
 Z = np.array([0.0, 0.0, 1.0])
@@ -47,20 +51,19 @@ class Ground:
     half: int
     top: Floats
 
-    def above(self, points: NDArray[np.float32], height: float) -> Longs:
+    def above(self, points: NDArray[np.float32], height: float = GROUND_TOLERANCE_M) -> Longs:
         """Indices of those of the scan's points (N, 3), m, that lie higher above it than `height`, m, increasing."""
         return ground.above(points, self.R, GROUND_CELL_M, self.half, self.top, height)
 
 
-def above_ground(points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z) -> Longs:
+def above_ground(points: NDArray[np.float32], up: Floats = Z) -> Longs:
     """Indices of the points (N, 3), m, LiDAR frame, that do not lie on the ground (`ground_of`), increasing."""
-    return ground_of(points, slope, tolerance, up).above(points, tolerance)
+    return ground_of(points, up).above(points)
 
 
-def ground_of(points: NDArray[np.float32], slope: float, tolerance: float, up: Floats = Z) -> Ground:
+def ground_of(points: NDArray[np.float32], up: Floats = Z) -> Ground:
     """The ground under the points (N, 3), m, LiDAR frame, of a scan.
 
-    slope : steepest ground, m per m, against the dominant plane; tolerance : height that still counts as ground, m
     up : (3,) unit vector, about which the dominant plane's normal is looked for
     Without a plane to be found the slope is that against the horizontal of `up`.
     """
@@ -68,13 +71,14 @@ def ground_of(points: NDArray[np.float32], slope: float, tolerance: float, up: F
         return Ground(np.eye(3), 1, np.full((2, 2), ground.NO_HEIGHT))
     farthest = float(np.sqrt(np.einsum("ij,ij->i", points, points).max()))
     half = int(np.ceil(min(farthest, GROUND_REACH_M) / GROUND_CELL_M)) + 1
-    R, floor = levelling(points, tolerance, half, up)
+    R, floor = levelling(points, GROUND_TOLERANCE_M, half, up)
     index = ground.lowest(points, R, GROUND_CELL_M, half)
     low = points[index[index >= 0]].astype(np.float64) @ R.T
-    is_under = low[:, 2] < floor - tolerance - slope * np.hypot(low[:, 0], low[:, 1])
+    is_under = low[:, 2] < floor - GROUND_TOLERANCE_M - GROUND_SLOPE * np.hypot(low[:, 0], low[:, 1])
     height = np.full(len(index), ground.NO_HEIGHT)
     height[index >= 0] = np.where(is_under, ground.NO_HEIGHT, low[:, 2])
-    return Ground(R, half, ground.envelope(height.reshape(2 * half, 2 * half), slope * GROUND_CELL_M, tolerance))
+    top = ground.envelope(height.reshape(2 * half, 2 * half), GROUND_SLOPE * GROUND_CELL_M, GROUND_TOLERANCE_M)
+    return Ground(R, half, top)
 
 
 def levelling(points: NDArray[np.float32], tolerance: float, half: int, up: Floats = Z) -> tuple[Floats, float]:
@@ -114,4 +118,4 @@ def warm_up() -> None:
     """Compile or load the kernels, with a small floor."""
     floor = np.zeros((400, 3), np.float32)
     floor[:, 0], floor[:, 1] = np.divmod(np.arange(400, dtype=np.float32), 20)
-    above_ground(floor, 0.3, 0.2)
+    above_ground(floor)

@@ -25,6 +25,8 @@ WIDE_CELL_M = 1.0
 SPARSE_CELLS_SHARE = 0.25
 # Largest share of returns to remove: beyond, the scan was downsampled before.
 MOST_REMOVED_SHARE = 0.5
+# Statistical outlier removal: nearest points asked, the point included as Open3D counts, and standard deviations allowed.
+DENOISE_NEIGHBOURS, DENOISE_DEVIATIONS = 10, 2.0
 
 
 def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf: float, least_line: float) -> Longs:
@@ -45,7 +47,9 @@ def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf:
     return np.arange(len(counts)) if is_clear or are_most_gone else is_accompanied
 
 
-def dense_points(points: NDArray[np.float32], neighbours: int, deviations: float) -> Longs:
+def dense_points(
+    points: NDArray[np.float32], neighbours: int = DENOISE_NEIGHBOURS, deviations: float = DENOISE_DEVIATIONS
+) -> Longs:
     """Indices of the points (N, 3), m, that are no outliers, increasing.
 
     As Rusu et al. (2008), with the counting of Open3D: a point's mean distance to its `neighbours` nearest, itself
@@ -177,9 +181,9 @@ def gate_points(points: NDArray[np.float32], config: PreprocessConfig) -> Longs:
     """
     index = voxel.gate(points, *_gate_of(config))
     if config.remove_ground:
-        index = index[above_ground(points[index], config.ground_slope, config.ground_tolerance, up_of(config))]
+        index = index[above_ground(points[index], up_of(config))]
     if config.denoise:
-        index = index[dense_points(points[index], config.denoise_neighbours, config.denoise_deviations)]
+        index = index[dense_points(points[index])]
     return index
 
 

@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from lslam.core.geometry import so3
 from lslam.core.kernels import ground
 from lslam.core.types.arrays import Floats
-from lslam.registration.preprocessing.ground import GROUND_CELL_M, Z, levelling
+from lslam.registration.preprocessing.ground import GROUND_CELL_M, GROUND_TOLERANCE_M, Z, levelling
 
 # Cosine of 45 deg: within it z is close enough to up for everything that looks for the ground.
 NEAR_Z = float(np.cos(np.deg2rad(45.0)))
 # The ground fills more than half of the hemisphere below the sensor: a plane that fills less is a wall, or no whole floor.
 GROUND_SHARE = 0.5
-# m, roughness of the ground; extent, in cells to each side; sectors about the foot of the sensor.
-TOLERANCE, CELLS, SECTORS = 0.25, 80, 12
+# Extent, in cells to each side; sectors about the foot of the sensor.
+CELLS, SECTORS = 80, 12
 # Axes, and the diagonals between three of them: no direction is farther than 37 deg from one.
 DIRECTIONS = [
     np.array(d) / np.linalg.norm(d) for d in product((-1.0, 0.0, 1.0), repeat=3) if sum(map(abs, d)) in (1.0, 3.0)
@@ -83,14 +83,14 @@ def ground_share(points: NDArray[np.float32], up: Floats) -> tuple[float, Floats
 
     up : (3,) unit vector, about which the normal is looked for
     """
-    R, height = levelling(points, TOLERANCE, CELLS, up)
-    if not -height > TOLERANCE or not np.isfinite(height):
+    R, height = levelling(points, GROUND_TOLERANCE_M, CELLS, up)
+    if not -height > GROUND_TOLERANCE_M or not np.isfinite(height):
         return 0.0, up
     index = ground.lowest(points, R, GROUND_CELL_M, CELLS)
     above = points[index[index >= 0]].astype(np.float64) @ R[2] - height
-    under = float((above < -TOLERANCE).sum()) / max(float((np.abs(above) <= TOLERANCE).sum()), 1.0)
+    under = float((above < -GROUND_TOLERANCE_M).sum()) / max(float((np.abs(above) <= GROUND_TOLERANCE_M).sum()), 1.0)
     level = points @ R.T.astype(np.float32)
-    x, y = level[np.abs(level[:, 2] - height) <= TOLERANCE, :2].astype(np.float64).T
+    x, y = level[np.abs(level[:, 2] - height) <= GROUND_TOLERANCE_M, :2].astype(np.float64).T
     reach = np.hypot(x, y)
     sector = np.minimum((np.arctan2(y, x) / (2 * np.pi) + 0.5) * SECTORS, SECTORS - 1).astype(np.int64)
     # What a disc of that radius hides of the half sphere; a sector counts as far as most of its points reach.

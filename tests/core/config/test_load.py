@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from lslam.core.config import Config, load_config, to_toml
+from lslam.core.config.config import FIXED
 from lslam.core.errors import ConfigError, InputError
 
 
@@ -60,7 +61,7 @@ def test_variables_of_others_are_left_alone() -> None:
         ("preprocess.source_points_min=6000", "source_points_min = 6000 must be less"),
         ("preprocess.ego_box=[1,0,0,1,0,1]", "x_min, x_max, y_min, y_max, z_min, z_max"),
         ("preprocess.downsample=grd", "did you mean 'grid'"),
-        ("registration.kernel_min=2", "kernel_min = 2.0 must be less than kernel_max = 1.0"),
+        ("registration.kernel_max=0.1", "registration.kernel_max = 0.1: Input should be greater than 0.15"),
         ("input.threads=-1", "input.threads = -1"),
         ("input.count=0", "input.count = 0"),
         ("input.start=-1", "input.start = -1"),
@@ -88,6 +89,28 @@ def test_wrong_values_name_the_key_and_the_way_out(setting: str, words: str) -> 
 def test_a_key_of_an_earlier_version_is_answered_with_what_became_of_it(setting: str, words: str) -> None:
     with pytest.raises(ConfigError, match=rf"no {setting.partition('=')[0]} any more.*{words}"):
         load_config(settings=[setting])
+
+
+@pytest.mark.parametrize("name", FIXED)
+def test_a_key_that_is_fixed_now_is_answered_with_its_value_and_what_to_turn(name: str, tmp_path: Path) -> None:
+    value, instead = FIXED[name]
+    section, _, key = name.partition(".")
+    assert section in Config.model_fields
+    assert key not in type(getattr(Config(), section)).model_fields
+    words = f"no {name} any more: it is {value} in all runs; " + (f"turn {instead} instead" if instead else "leave the")
+    with pytest.raises(ConfigError) as caught:
+        load(f"{name}={value}")
+    assert words in str(caught.value)
+    if instead:
+        section_of_it, _, key_of_it = instead.partition(".")
+        assert key_of_it in type(getattr(Config(), section_of_it)).model_fields
+    # The file of an earlier run has it at its value.
+    file = tmp_path / "config.toml"
+    file.write_text(f"[{section}]\n{key} = {value}\n")
+    assert load(path=file) == Config()
+    file.write_text(f"[{section}]\n{key} = 0.123\n")
+    with pytest.raises(ConfigError, match=rf"config\.toml: there is no {name} any more"):
+        load(path=file)
 
 
 def test_the_source_of_an_unknown_key_is_named(tmp_path: Path) -> None:

@@ -68,8 +68,8 @@ def test_too_few_points_to_judge_all_stay(n: int) -> None:
 def test_the_option_reaches_every_methods_points_after_the_ground_is_gone() -> None:
     points = cloud(4)
     gate = gate_points(points, PreprocessConfig())
-    config = PreprocessConfig(denoise=True, denoise_neighbours=6, denoise_deviations=1.5)
-    np.testing.assert_array_equal(gate_points(points, config), gate[dense_points(points[gate], 6, 1.5)])
+    config = PreprocessConfig(denoise=True)
+    np.testing.assert_array_equal(gate_points(points, config), gate[dense_points(points[gate])])
     both = config.model_copy(update={"remove_ground": True})
     without = gate_points(points, PreprocessConfig(remove_ground=True))
-    np.testing.assert_array_equal(gate_points(points, both), without[dense_points(points[without], 6, 1.5)])
+    np.testing.assert_array_equal(gate_points(points, both), without[dense_points(points[without])])

@@ -34,7 +34,7 @@ def place(grade: float = 0.0, height: float = 1.8, seed: int = 0) -> tuple[Point
 def scores(points: Points, is_ground: NDArray[np.bool_]) -> tuple[float, float]:
     """Share of the ground that is taken out, and of the rest that stays."""
     stays = np.zeros(len(points), bool)
-    stays[above_ground(points, 0.2, 0.25)] = True
+    stays[above_ground(points)] = True
     return float((~stays[is_ground]).mean()), float(stays[~is_ground].mean())
 
 
@@ -57,7 +57,7 @@ def test_a_hill_within_the_slope_is_ground_and_a_steep_one_is_not() -> None:
     for steepness, is_kept in ((0.15, False), (0.6, True)):
         z = np.maximum(xy[:, 0] - 5, 0) * steepness - 2
         points = np.column_stack([xy, z]).astype(np.float32)
-        kept = points[above_ground(points, 0.2, 0.25)]
+        kept = points[above_ground(points)]
         assert (len(kept) > 3000) == is_kept
         if not is_kept:
             assert len(kept) < 0.01 * len(points)
@@ -105,24 +105,22 @@ def test_the_envelope_is_the_lowest_cone_over_supported_cells() -> None:
 @pytest.mark.parametrize("n", [0, 1, 2, 5])
 def test_scans_of_a_few_points(n: int) -> None:
     points = np.array([[5, 0, -1], [6, 1, -1], [5, 2, -1], [9, 9, 4], [9, 8, -1]], np.float32)[:n]
-    kept = above_ground(points, 0.2, 0.25)
+    kept = above_ground(points)
     assert set(kept.tolist()) <= set(range(n))
     assert (np.diff(kept) > 0).all()
 
 
 def test_without_a_plane_nothing_is_levelled() -> None:
     wall = np.random.default_rng(0).uniform([10, -9, -2], [10.01, 9, 9], (4000, 3)).astype(np.float32)
-    kept = above_ground(wall, 0.2, 0.25)
+    kept = above_ground(wall)
     assert 0.9 < len(kept) / len(wall) < 1.0
 
 
 def test_the_option_reaches_every_methods_points_and_is_off_by_default() -> None:
     points, _ = place()
     config = PreprocessConfig(remove_ground=True)
-    expected = set(above_ground(points, config.ground_slope, config.ground_tolerance).tolist())
+    expected = set(above_ground(points).tolist())
     in_range = set(gate_points(points, PreprocessConfig()).tolist())
     assert set(gate_points(points, config).tolist()) == expected & in_range
     assert len(in_range) > 0.9 * len(points)
     assert prepare_points(points, config).used < 0.7 * prepare_points(points, PreprocessConfig()).used
-    mild = PreprocessConfig(remove_ground=True, ground_tolerance=2.0)
-    assert len(gate_points(points, mild)) < len(gate_points(points, config))

@@ -88,18 +88,18 @@ def test_ground_under_a_turned_sensor_is_that_under_the_upright_one(name: str) -
     R, points = turn(name), scan().points
     config = PreprocessConfig(up=tuple(3.0 * R[2]))
     upright = np.zeros(len(points), bool)
-    upright[above_ground(points, 0.2, 0.25)] = True
+    upright[above_ground(points)] = True
     turned = np.zeros(len(points), bool)
-    turned[above_ground(turned_points(points, R), 0.2, 0.25, up_of(config))] = True
+    turned[above_ground(turned_points(points, R), up_of(config))] = True
     assert 0.3 < upright.mean() < 0.9
     assert (turned == upright).mean() > 0.995
     blind = np.zeros(len(points), bool)
-    blind[above_ground(turned_points(points, R), 0.2, 0.25)] = True
+    blind[above_ground(turned_points(points, R))] = True
     assert (blind == upright).mean() < 0.9
 
 
 def test_without_a_plane_the_horizon_is_that_of_up() -> None:
-    assert np.allclose(ground_of(np.zeros((9, 3), np.float32), 0.2, 0.25, -Z).R[2], -Z)
+    assert np.allclose(ground_of(np.zeros((9, 3), np.float32), -Z).R[2], -Z)
 
 
 def test_lego_loam_finds_the_ground_of_a_sensor_upside_down() -> None:
