@@ -40,6 +40,8 @@ from lslam.registration.start_search import MUCH_RATIO, START_STEP_M, start_offs
 
 # Fewer inliers, ten per degree of freedom, are insignificant.
 MIN_FEATURES = 60
+# m; of an edge across itself: it lies anywhere between two beams, and silhouettes move.
+EDGE_SIGMA_M = 0.15
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,7 @@ class FeatureTarget(Target):
         The prior counts at most as one planar point: a sensor on a straight way need not stay on it.
         """
         c, least = self.config, self.config.sigma**2
-        return FeatureNoise(
-            self.loam.edge_sigma, c.sigma, c.weak_share, least / max(history.threshold.mean_square, least)
-        )
+        return FeatureNoise(EDGE_SIGMA_M, c.sigma, c.weak_share, least / max(history.threshold.mean_square, least))
 
     def align(
         self, attempt: Attempt, T_start: Floats, annealing: Annealing, information: Floats | None = None

@@ -59,6 +59,18 @@ FIXED: dict[str, tuple[Any, str]] = {
     "registration.coarse_decay": (0.85, ""),
     "registration.recover_m": (0.3, "recovery.coarse_to_fine"),
     "registration.recover_deg": (3.0, "recovery.coarse_to_fine"),
+    "loam.max_less_edge_points": (20, "loam.max_edge_points"),
+    "loam.edge_curvature": (1.0, "loam.max_edge_points"),
+    "loam.planar_curvature": (0.5, "loam.max_planar_points"),
+    "loam.edge_noise": (4.0, "loam.max_edge_points"),
+    "loam.edge_sigma": (0.15, ""),
+    "loam.occlusion": (0.3, ""),
+    "loam.parallel_deg": (80.0, ""),
+    "loam.ground_angle_deg": (10.0, ""),
+    "loam.segment_angle_deg": (60.0, ""),
+    "loam.segment_points": (30, ""),
+    "loam.small_segment_points": (5, ""),
+    "loam.small_segment_rings": (3, ""),
 }
 
 

@@ -30,6 +30,16 @@ _MANY_TURNS = 0.1
 _SPINS = 0.5
 # Neighbours farther apart than this many steps have missing returns between them: one lost return is bridged.
 _GAP_STEPS = 2.5
+# Edges per region, the sharp ones included (Zhang and Singh 2014).
+MAX_LESS_EDGE_POINTS = 20
+# Curvature of equation 2.21 over the angle between beams: edges have more, planes less; a right angle has 2.7.
+EDGE_CURVATURE, PLANAR_CURVATURE = 1.0, 0.5
+# An edge's curvature over what the noise of the ranges makes, which is measured in each scan.
+EDGE_NOISE_RATIO = 4.0
+# m; a jump in range from beam to beam that hides what is behind.
+OCCLUSION_M = 0.3
+# Angle of incidence above which a surface is parallel to the beam.
+PARALLEL_DEG = 80.0
 # m; grid of the points that are no feature: they only tell what stands where.
 _NEITHER_GRID = LoamConfig().grid_step
 
@@ -121,14 +131,14 @@ def features_along(
     scan: Scan, walk: RingWalk, config: LoamConfig, allowed: NDArray[np.uint8] | None = None
 ) -> Features:
     """As `extract_features`, of a scan whose rings are walked already."""
-    slope = np.tan(np.radians(config.parallel_deg))
+    slope = np.tan(np.radians(PARALLEL_DEG))
     curved, bend, breaks = curvature.curvatures(
         walk.points,
         walk.ranges,
         walk.steps,
         walk.starts,
         _GAP_STEPS * walk.step,
-        config.occlusion,
+        OCCLUSION_M,
         slope * walk.step,
         slope,
     )
@@ -142,10 +152,10 @@ def features_along(
         both[walk.order],
         walk.starts,
         config.regions,
-        (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
-        config.edge_curvature * walk.step,
-        config.planar_curvature * walk.step,
-        config.edge_noise * noise,
+        (config.max_edge_points, MAX_LESS_EDGE_POINTS, config.max_planar_points),
+        EDGE_CURVATURE * walk.step,
+        PLANAR_CURVATURE * walk.step,
+        EDGE_NOISE_RATIO * noise,
         SIGNIFICANT_SIGMAS * noise,
     )
     return gather_features(scan, walk, labels, config.grid_step)

@@ -15,7 +15,13 @@ from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import curvature, petals
 from lslam.registration.kernels.curvature import WIDEST_STEP
 from lslam.registration.preprocessing.features import (
+    EDGE_CURVATURE,
+    EDGE_NOISE_RATIO,
+    MAX_LESS_EDGE_POINTS,
     MAY_BE_EDGE,
+    OCCLUSION_M,
+    PARALLEL_DEG,
+    PLANAR_CURVATURE,
     Features,
     RingWalk,
     curvature_noise,
@@ -51,7 +57,7 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
     """
     config = config or LoamConfig()
     walk = walk_lines(scan, gate or PreprocessConfig())
-    slope = np.tan(np.radians(config.parallel_deg))
+    slope = np.tan(np.radians(PARALLEL_DEG))
     brightness = _brightness(scan, walk)
     curved, bend, contrast, breaks = petals.smoothness(
         walk.points,
@@ -59,12 +65,12 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         walk.starts,
         _left_out(walk, brightness),
         brightness,
-        config.occlusion,
+        OCCLUSION_M,
         slope * walk.step,
-        np.sin(np.radians(config.parallel_deg)),
+        np.sin(np.radians(PARALLEL_DEG)),
     )
     allowed, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.PETAL_SIDE)
-    limits, usual = (config.max_edge_points, config.max_less_edge_points), _SHORTER * walk.step
+    limits, usual = (config.max_edge_points, MAX_LESS_EDGE_POINTS), _SHORTER * walk.step
     labels = curvature.pick(
         curved,
         bend,
@@ -74,9 +80,9 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         walk.starts,
         1,
         (*limits, config.max_planar_points),
-        config.edge_curvature * usual,
-        config.planar_curvature * usual,
-        config.edge_noise * noise,
+        EDGE_CURVATURE * usual,
+        PLANAR_CURVATURE * usual,
+        EDGE_NOISE_RATIO * noise,
         SIGNIFICANT_SIGMAS * noise,
     )
     if len(brightness):

@@ -26,6 +26,12 @@ from lslam.registration.preprocessing.features import (
 )
 from lslam.registration.preprocessing.ground import GROUND_CELL_M, GROUND_REACH_M, levelling, up_of
 
+# Steepest ground against the dominant plane.
+GROUND_ANGLE_DEG = 10.0
+# Neighbours whose line makes more with the beam belong together.
+SEGMENT_ANGLE_DEG = 60.0
+# Smaller clusters are clutter, unless they have so many points on so many rings, as poles have.
+SEGMENT_POINTS, SMALL_SEGMENT_POINTS, SMALL_SEGMENT_RINGS = 30, 5, 3
 # m; a ring's next neighbour on the ground is at least so far off, so that noise does not tilt the line between them.
 _BASELINE = 0.3
 # m; noise of height, and what a kerb may rise at once.
@@ -66,13 +72,13 @@ def lego_features(
     config = config or LoamConfig()
     gate = gate or PreprocessConfig()
     walk = walk_rings(scan, gate)
-    segments = _segment(scan, walk, config, up_of(gate))
+    segments = _segment(scan, walk, up_of(gate))
     allowed = np.uint8(MAY_BE_EDGE | MAY_BE_FLAT) * (segments.labels > 0)
     allowed += np.uint8(MAY_BE_PLANE | MAY_BE_FLAT) * segments.ground
     return features_along(scan, walk, config, allowed), segments
 
 
-def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: Floats) -> Segments:
+def _segment(scan: Scan, walk: RingWalk, vertical: Floats) -> Segments:
     slopes = range_image.row_slopes(walk.points, walk.starts) * (1.0 if vertical[2] >= 0 else -1.0)
     with_slope = np.flatnonzero(np.isfinite(slopes))
     row = np.zeros(len(slopes), np.int64)
@@ -85,7 +91,7 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: Floats) -
     pixel, nearest = range_image.project(walk.points, walk.ranges, walk.starts, row, len(with_slope), columns)
     up, floor = _floor(walk, upwards[: max(1, len(upwards) // _LOWEST)], vertical)
     ground = range_image.find_ground(
-        walk.points, nearest, columns, up, floor, np.tan(np.radians(config.ground_angle_deg)), _BASELINE, _TOLERANCE
+        walk.points, nearest, columns, up, floor, np.tan(np.radians(GROUND_ANGLE_DEG)), _BASELINE, _TOLERANCE
     )
     labels = range_image.cluster(
         walk.ranges,
@@ -93,8 +99,8 @@ def _segment(scan: Scan, walk: RingWalk, config: LoamConfig, vertical: Floats) -
         ground,
         columns,
         elevation,
-        np.radians(config.segment_angle_deg),
-        (config.segment_points, config.small_segment_points, config.small_segment_rings),
+        np.radians(SEGMENT_ANGLE_DEG),
+        (SEGMENT_POINTS, SMALL_SEGMENT_POINTS, SMALL_SEGMENT_RINGS),
     )
     return Segments(*range_image.give_back(walk.ranges, walk.order, pixel, nearest, ground, labels, _SAME, len(scan)))
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lslam.core.config.odometry import LoamConfig
+from lslam.registration.preprocessing import features
 
 Ring = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -27,7 +28,7 @@ def bend_at(ring: Ring, i: int) -> float:
 
 def reference_labels(rings: list[Ring], step: float, config: LoamConfig) -> list[list[int]]:
     """Labels of each ring's points. `step` is the angle between beams, rad."""
-    slope = math.tan(math.radians(config.parallel_deg))
+    slope = math.tan(math.radians(features.PARALLEL_DEG))
     ranges = [np.linalg.norm(ring, axis=1) for ring in rings]
     flat = np.concatenate(ranges)
     bends = [abs(flat[i] - 2 * flat[i + 1] + flat[i + 2]) for i in range(0, len(flat) - 2, 4)]
@@ -41,7 +42,7 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
     angle = [float(np.linalg.norm(u[i + 1] - u[i])) for i in range(n - 1)]
     gap = [a > 2.5 * step for a in angle]
     jump = [
-        not gap[i] and abs(r[i + 1] - r[i]) > max(config.occlusion, slope * step * min(r[i], r[i + 1]))
+        not gap[i] and abs(r[i + 1] - r[i]) > max(features.OCCLUSION_M, slope * step * min(r[i], r[i + 1]))
         for i in range(n - 1)
     ]
     hidden = set()
@@ -75,18 +76,20 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
         sharp = [
             i
             for i in part
-            if i in c and bend[i] > config.edge_curvature * step and bend[i] * r[i] > config.edge_noise * noise
+            if i in c
+            and bend[i] > features.EDGE_CURVATURE * step
+            and bend[i] * r[i] > features.EDGE_NOISE_RATIO * noise
         ]
         picked = 0
         for i in sorted(sharp, key=lambda i: (-c[i], i)):
-            if i not in taken and picked < config.max_less_edge_points:
+            if i not in taken and picked < features.MAX_LESS_EDGE_POINTS:
                 labels[i] = 2 if picked < config.max_edge_points else 1
                 picked += 1
                 suppress(i)
         smooth = [
             i
             for i in part
-            if i in c and labels[i] == 0 and (c[i] < config.planar_curvature * step or c[i] * r[i] < 2 * noise)
+            if i in c and labels[i] == 0 and (c[i] < features.PLANAR_CURVATURE * step or c[i] * r[i] < 2 * noise)
         ]
         for i in smooth:
             labels[i] = -1

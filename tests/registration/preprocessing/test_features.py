@@ -17,6 +17,7 @@ from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import ConfigError, InputError
 from lslam.core.geometry import so3
 from lslam.core.types.scan import Scan
+from lslam.registration.preprocessing import features
 from lslam.registration.preprocessing.features import extract_features, walk_rings
 from lslam.simulation.scenarios import simulate
 
@@ -60,19 +61,29 @@ def picks_of_reference(scan: Scan, config: LoamConfig) -> NDArray[np.int64]:
 
 
 @pytest.mark.parametrize(
-    "config",
+    ("config", "numbers"),
     [
-        LoamConfig(),
-        LoamConfig(regions=4, max_edge_points=1, max_less_edge_points=3, max_planar_points=9, occlusion=0.5),
-        LoamConfig(regions=1, edge_curvature=0.5, planar_curvature=0.2, edge_noise=2.0, parallel_deg=60),
+        (LoamConfig(), {}),
+        (
+            LoamConfig(regions=4, max_edge_points=1, max_planar_points=9),
+            {"MAX_LESS_EDGE_POINTS": 3, "OCCLUSION_M": 0.5},
+        ),
+        (
+            LoamConfig(regions=1),
+            {"EDGE_CURVATURE": 0.5, "PLANAR_CURVATURE": 0.2, "EDGE_NOISE_RATIO": 2.0, "PARALLEL_DEG": 60.0},
+        ),
     ],
 )
-def test_the_kernels_pick_what_the_plain_reference_picks(config: LoamConfig) -> None:
+def test_the_kernels_pick_what_the_plain_reference_picks(
+    config: LoamConfig, numbers: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in numbers.items():
+        monkeypatch.setattr(features, name, value)
     for scan in (bumpy(0), bumpy(1), simulate("block", seed=2, count=2).scan(1)):
         expected = picks_of_reference(scan, config)
         got = extract_features(scan, config, GATE).labels
         np.testing.assert_array_equal(got, expected)
-        assert {-2, -1, 0, 1, 2} <= set(got.tolist()) or config.max_less_edge_points == 3
+        assert {-2, -1, 0, 1, 2} <= set(got.tolist()) or features.MAX_LESS_EDGE_POINTS == 3
 
 
 def test_scans_without_rings_or_with_lines_that_skip_about_are_refused() -> None:
@@ -83,11 +94,9 @@ def test_scans_without_rings_or_with_lines_that_skip_about_are_refused() -> None
         extract_features(replace(scan, rings=None))
 
 
-def test_limits_that_contradict_each_other_are_refused() -> None:
-    with pytest.raises(ConfigError, match="max_less_edge_points = 1"):
-        load_config(None, ["loam.max_less_edge_points=1"], {})
-    with pytest.raises(ConfigError, match="planar_curvature = 2"):
-        load_config(None, ["loam.planar_curvature=2"], {})
+def test_more_sharp_edges_than_edges_are_refused() -> None:
+    with pytest.raises(ConfigError, match="max_edge_points = 21"):
+        load_config(None, ["loam.max_edge_points=21"], {})
 
 
 STEP = np.radians(0.2)
