@@ -30,8 +30,11 @@ from lslam.io.formats.trajectory_files import read_trajectory
 CAMERA_TO_LIDAR = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
-def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanResult]:
-    """The results with drift over the distance travelled; covariances are rotated with the poses, and not enlarged."""
+def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_100m: float = 0.0) -> list[ScanResult]:
+    """The results with drift over the distance travelled; covariances are rotated with the poses, and not enlarged.
+
+    tilt_deg_per_100m : of roll and pitch, as `drift_deg_per_100m` of heading
+    """
     poses = np.stack([r.T_world_lidar for r in results])
     steps = se3.relative(poses[:-1], poses[1:])
     way = np.linalg.norm(steps[:, :3, 3], axis=1)
@@ -45,7 +48,7 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig) -> list[ScanR
     # The horizon sinks towards the direction.
     across = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
-    degrees = np.column_stack([config.drift_tilt_deg_per_100m * across, config.drift_deg_per_100m * sides])
+    degrees = np.column_stack([tilt_deg_per_100m * across, config.drift_deg_per_100m * sides])
     turns = so3.exp(np.deg2rad(degrees) / 100 * way[:, None])
     shifts = 0.01 * config.drift_percent * way[:, None] * directions
     drifted = [poses[0]]
@@ -126,7 +129,7 @@ def describe(config: DebugConfig) -> str:
         lasting = "in the root mean square after 100 m of a random walk"
     return (
         f"debug.drift: odometry was made to drift by {config.drift_percent:g} % of the way and "
-        f"{config.drift_deg_per_100m:g} deg/100 m, and to tilt by {config.drift_tilt_deg_per_100m:g}, {lasting} "
+        f"{config.drift_deg_per_100m:g} deg/100 m, {lasting} "
         f"(seed {config.drift_seed}); this run is an experiment"
     )
 

@@ -26,7 +26,7 @@ from lslam.core.config.backend import GnssConfig, GraphConfig
 from lslam.core.config.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import geodesy, noise, se3, so3
-from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference, GnssStream
@@ -40,6 +40,10 @@ log = logging.getLogger("lslam")
 
 # m; of a fix that does not state its sigma.
 UNSTATED = 5.0
+# m; least sigma of a fix, and by how much heights are worse than positions.
+MIN_SIGMA_M, VERTICAL_RATIO = 0.02, 1.8
+# With fewer fixes that agree there is no georeference.
+MIN_FIXES = 5
 # rad; one sigma of the z axis against up, of a world that nothing levelled and of one levelled by an IMU.
 UNLEVELLED, LEVELLED = np.deg2rad(10.0), np.deg2rad(1.0)
 # Sigmas (noise and drift) beyond which a fix is no outlier candidate of the graph but left out.
@@ -118,13 +122,13 @@ def place(
     fixes, faults = _on_one_clock(stream, results, arm, level, config)
     if isinstance(fixes, str):
         return Placement(problem=fixes)
-    fixes, faults = with_actual_sigmas(fixes, level, config.gnss.max_sigma, config.graph.probability, faults)
-    alignment, fixes, faults = aligned(fixes, direction, sigma, config.gnss.min_fixes, faults)
+    fixes, faults = with_actual_sigmas(fixes, level, config.gnss.max_sigma, RIGHT_PROBABILITY, faults)
+    alignment, fixes, faults = aligned(fixes, direction, sigma, MIN_FIXES, faults)
     if alignment is None:
         return Placement(
             faults=faults,
             problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and "
-            f"{config.gnss.min_fixes} at the least (gnss.min_fixes): all rejected",
+            f"{MIN_FIXES} at the least: all rejected",
         )
     georeference, shift = _at_first(alignment, fixes, config.gnss)
     log.info(
@@ -194,14 +198,14 @@ def _usable(
     """The fixes taken during the run that have a position and a small enough sigma; or why there are too few."""
     stamps = np.array([r.stamp_ns for r in results], np.int64)
     stated = np.full(len(stream), config.sigma) if config.sigma is not None else stream.sigma
-    stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, UNSTATED), config.min_sigma)
+    stated = np.maximum(np.where(np.isfinite(stated) & (stated > 0), stated, UNSTATED), MIN_SIGMA_M)
     inside = (stream.stamps_ns >= stamps[0]) & (stream.stamps_ns <= stamps[-1])
     good = inside & stream.is_place & (stated <= config.max_sigma)
     count = int(inside.sum())
-    if len(stamps) < 2 or good.sum() < config.min_fixes:
+    if len(stamps) < 2 or good.sum() < MIN_FIXES:
         return (
             f"GNSS: {int(good.sum())} of {len(stream)} fixes were taken during the run, are places and state at most "
-            f"{config.max_sigma:g} m; {config.min_fixes} are needed"
+            f"{config.max_sigma:g} m; {MIN_FIXES} are needed"
         )
     poses = np.stack([r.T_world_lidar for r in results])
     at = poses_at(stamps, poses, stream.stamps_ns[good])
@@ -213,7 +217,7 @@ def _usable(
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
     travelled = np.interp(stream.stamps_ns[good], stamps, way)
     slack = 0.01 * drift.drift_percent * np.abs(travelled - 0.5 * way[-1])
-    sigmas = stated[good, None] * [1.0, 1.0, config.vertical]
+    sigmas = stated[good, None] * [1.0, 1.0, VERTICAL_RATIO]
     antenna = np.einsum("fij,j->fi", at[:, :3, :3], arm) + at[:, :3, 3]
     is_stated = config.sigma is None and bool((np.isfinite(stream.sigma) & (stream.sigma > 0))[good].all())
     return Fixes(stream.stamps_ns[good], positions, sigmas, antenna, slack, origin, count, is_stated)
@@ -303,7 +307,7 @@ def _fix_noise(
         alignment.residuals[good],
         fixes.sigmas[good],
         (fixes.positions - alignment.residuals)[good],
-        config.graph.probability,
+        RIGHT_PROBABILITY,
         drift,
         config.gnss.max_sigma if fixes.is_refuted else None,
     )

@@ -41,6 +41,7 @@ from lslam.backend.outcome import BackEnd, Given, solve, unsolved, without_stead
 from lslam.core.config import Config
 from lslam.core.errors import GraphError
 from lslam.core.geometry import se3
+from lslam.core.geometry.noise import RIGHT_PROBABILITY
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import ControlPoint, LoopCandidate, Turn
@@ -114,10 +115,10 @@ def _with_residuals(
 ) -> BackEnd:
     """The outcome with what is left of the control points; what contradicts them is one of the problems."""
     config, points, results = given.config, given.points, given.results
-    geoid, probability = config.gnss.geoid, config.graph.probability
+    geoid = config.gnss.geoid
     residuals = control_residuals(points, out.results, georeference, geoid)
-    given.problems.extend(against_odometry(points, results, given.store.keyframes, drift, probability, geoid))
-    given.problems.extend(contradicting(residuals, probability))
+    given.problems.extend(against_odometry(points, results, given.store.keyframes, drift, RIGHT_PROBABILITY, geoid))
+    given.problems.extend(contradicting(residuals, RIGHT_PROBABILITY))
     single, facts = redundancy(*as_surveyed_and_seen(points, results, geoid), is_level)
     if single and config.gnss.mode == "off":
         log.warning("%s", single)
@@ -140,7 +141,7 @@ def _compared_with_map(out: BackEnd, graph: PoseGraph, given: Given) -> BackEnd:
             log.debug("the graph without control points: %s", error)
             return out
     held_by = "control points" if given.points else "GNSS"
-    text, facts = thicker_map(thickening(given.store, without, out.keyframes), held_by, config.graph.probability)
+    text, facts = thicker_map(thickening(given.store, without, out.keyframes), held_by, RIGHT_PROBABILITY)
     if text and len(given.points) > 2:
         text += _without_one(graph, without, given)
     given.problems.append(text)
@@ -162,7 +163,7 @@ def _without_one(graph: PoseGraph, without: Floats, given: Given) -> str:
         except (GraphError, np.linalg.LinAlgError) as error:
             log.debug("the graph without a control point: %s", error)
             continue
-        if change is not None and not change.is_clear(config.graph.probability):
+        if change is not None and not change.is_clear(RIGHT_PROBABILITY):
             names.append(points[i].at.said)
     if not names:
         return "; no single one of them is why"

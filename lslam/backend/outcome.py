@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.backend.georeferencing import MIN_FIXES
 from lslam.backend.graph.drift import tilt_factor
 from lslam.backend.graph.factors import well_conditioned
 from lslam.backend.graph.fix_errors import NO_HEIGHT
@@ -103,7 +104,7 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
         return None
     free = [not fix.is_held for fix in graph.fixes]
     accepted_fixes = int(solution.fix_inliers[free].sum())
-    if any(free) and accepted_fixes < config.gnss.min_fixes:
+    if any(free) and accepted_fixes < MIN_FIXES:
         text = f"GNSS: the pose graph accepts {accepted_fixes} of {sum(free)} fixes"
         given.problems.append(
             f"{text}: all rejected" if all(free) else f"{text}, the control points contradict the others"

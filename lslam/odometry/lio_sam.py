@@ -25,21 +25,25 @@ from lslam.odometry.map_method import MapMethod
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.result import RegistrationResult
 
+# The newest keyframes make the local map; a new one where the sensor moved or turned so far (Shan et al. 2020).
+KEYFRAMES, KEYFRAME_M, KEYFRAME_DEG = 25, 1.0, 10.0
+# Scans after which the smoother's graph begins anew, with what it knows as its prior.
+RESET_SCANS = 100
+
 
 def create(config: Config) -> LioSam | LioSamOfPoints:
     """The method on features or on all points, with no recovery beside the smoother but `at_rest`."""
-    own = config.lio_sam
-    if own.features == "loam":
-        keyframes = own.keyframes, own.keyframe_m, float(np.deg2rad(own.keyframe_deg))
+    if config.lio_sam.features == "loam":
+        keyframes = KEYFRAMES, KEYFRAME_M, float(np.deg2rad(KEYFRAME_DEG))
         quiet = config.model_copy(update={"recovery": rest_alone(config.recovery)})
         return LioSam(quiet, LoamVariant(None, with_map=True, keyframes=keyframes))
-    keys: dict[str, Any] = {"keyframes": own.keyframes, "keyframe_m": own.keyframe_m, "keyframe_deg": own.keyframe_deg}
+    keys: dict[str, Any] = {"keyframes": KEYFRAMES, "keyframe_m": KEYFRAME_M, "keyframe_deg": KEYFRAME_DEG}
     return LioSamOfPoints(registration_of(config, recovery=rest_alone(config.recovery), target="keyframe", **keys))
 
 
 def create_motion(opening: InertialStart, config: Config) -> SmootherMotion:
     """The smoother, whose states predict the next one."""
-    smoother = InertialSmoother(smoother_noise(opening.estimate.gyroscope.noise), config.lio_sam.reset_scans)
+    smoother = InertialSmoother(smoother_noise(opening.estimate.gyroscope.noise), RESET_SCANS)
     return SmootherMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, smoother)
 
 

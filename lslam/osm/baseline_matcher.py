@@ -29,7 +29,7 @@ from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm.classes import classify
 from lslam.osm.corrections import place_buildings
 from lslam.osm.matcher import Laid, accepted_part
-from lslam.osm.walls import OsmMap
+from lslam.osm.walls import WALL_RANGE_M, OsmMap
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.residuals import residual_named
@@ -111,7 +111,7 @@ def _match(
         if config.osm.labels:
             labels = submap_labels(store, number, 1) if config.osm.needs_labels else classify(points)
             points = points[table_of(config.osm.labels)[labels]]
-        seen = flatten_scan(points, config.osm.wall_range)
+        seen = flatten_scan(points, WALL_RANGE_M)
     with clock.stage("map match"):
         whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose

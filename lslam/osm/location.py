@@ -20,7 +20,7 @@ from lslam.backend.levelling import floor_planes
 from lslam.core.config import Config
 from lslam.core.config.backend import GraphConfig, OsmConfig
 from lslam.core.geometry import se2, se3, so3
-from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.labels import table_of
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
@@ -225,7 +225,7 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
     if track.sigma[0] > LOST_RATIO * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
         return replace(match, reason="too few walls for a relocalisation")
     squared, rank = track.squared(match.pose, match.information)
-    limit = quantile(graph.probability, rank)
+    limit = quantile(RIGHT_PROBABILITY, rank)
     if squared > limit:
         return replace(
             match, reason=f"{np.sqrt(squared / limit):.1f} times as far from odometry as it may have drifted"

@@ -99,6 +99,8 @@ def merged(replies: Iterable[Any]) -> OsmData:
 log = logging.getLogger("lslam")
 
 USER_AGENT = f"lslam/{__version__} (batch LiDAR SLAM; buildings around a recorded trajectory)"
+CONNECT_TIMEOUT_S = 10.0  # s; longest wait for a connection
+BACKOFF_S = 5.0  # s; wait after the first refusal, doubled after each further one
 LONGEST_REPLY = 48 * 1024 * 1024  # bytes; its text is kept, and read element by element
 LONGEST_WAIT = 120.0  # s; a server that asks for a longer wait is not asked again
 FAR_OUT = 1000.0  # m; a long building reaches that far out of a box
@@ -186,7 +188,7 @@ def _bounds_of(path: Path) -> Bounds | None:
 
 
 def _ask_patiently(bounds: Bounds, config: OsmConfig, folder: Path, sleep: Callable[[float], None]) -> OverpassReply:
-    wait = config.backoff
+    wait = BACKOFF_S
     # All threads and processes of this user together send one request at a time.
     with _one_thread_at_a_time, one_at_a_time(folder / "request.lock", "asks the map server"):
         for attempt in range(1, config.attempts + 1):
@@ -240,7 +242,7 @@ def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> by
             server,
             data={"data": query(bounds, config.timeout)},
             headers={"User-Agent": USER_AGENT, "Accept": "application/json"},
-            timeout=(config.connect_timeout, config.timeout),
+            timeout=(CONNECT_TIMEOUT_S, config.timeout),
             allow_redirects=False,
             stream=True,
         ) as reply:
@@ -248,7 +250,7 @@ def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> by
             return _read(reply, server, config.timeout, is_late)
     except requests.exceptions.Timeout as error:
         is_connecting = isinstance(error, requests.exceptions.ConnectTimeout)
-        raise InputError(_too_late(server, config.connect_timeout if is_connecting else config.timeout)) from None
+        raise InputError(_too_late(server, CONNECT_TIMEOUT_S if is_connecting else config.timeout)) from None
     except requests.exceptions.ConnectionError as error:
         reason = getattr(error.args[0] if error.args else None, "reason", None)
         if type(reason).__name__ in ("NewConnectionError", "NameResolutionError"):

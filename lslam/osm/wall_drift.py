@@ -18,7 +18,7 @@ from lslam.backend.graph.drift import MEMORY_M, SIZES, correct_drift, linear_bas
 from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
 from lslam.core.config.backend import GraphConfig
-from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats, Longs
 
@@ -271,7 +271,7 @@ def _fitted(
         found.reshape(-1, 3),
         np.asarray(at_knots @ new.reshape(-1, 3)),
         spread,
-        EstimatedDrift(-(mean @ found), sigma, gain, quantile(config.probability, FITTED), rms),
+        EstimatedDrift(-(mean @ found), sigma, gain, quantile(RIGHT_PROBABILITY, FITTED), rms),
         is_settled=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
     )
 

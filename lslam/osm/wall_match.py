@@ -22,6 +22,9 @@ from lslam.core.types.constraint import Verdict
 from lslam.osm.kernels import wall_matching
 from lslam.osm.walls import OsmMap, find_walls
 
+MIN_START_COVERAGE = 0.6  # share of the walls seen that must lie on the map where any heading is possible
+MIN_BUILDING_COVERAGE = 0.1  # share of a building's walls that must be seen
+LINE_WEIGHT = 0.25  # information of a match of parallel walls only, against one with corners
 SEARCH_SIGMAS = 3.0  # sigmas of the prior that are searched
 EDGE_REACH_M = 20.0  # m; a virtual edge lies at most so far beyond the ends of its walls
 SHARPEST = np.radians(30.0)  # between two walls that make a corner
@@ -106,7 +109,7 @@ def find_heading(
     """
     config = config or OsmConfig()
     # Without a heading the least coverage is larger, and the distance from the prior does not count.
-    config = config.model_copy(update={"translation_weight": 0.0, "min_coverage": config.min_start_coverage})
+    config = config.model_copy(update={"translation_weight": 0.0, "min_coverage": MIN_START_COVERAGE})
     at = np.append(np.asarray(place, np.float64)[:2], 0.0)
     found = _best(
         _rows(source), _rows(target), at, np.array([radius, radius, np.pi]), np.zeros(3), config, by_coverage=False
@@ -136,7 +139,7 @@ def _best(
     if best.rank < 3:
         inside += laid([(pose, gates) for pose in _beside(best, at, window)])
         best = max(inside, key=lambda m: m.fitness)
-    if best.coverage < (config.min_building_coverage if by_coverage else config.min_coverage):
+    if best.coverage < (MIN_BUILDING_COVERAGE if by_coverage else config.min_coverage):
         return None
     pairs = np.column_stack([best.pairs[:, 0], numbers[best.pairs[:, 1]]])
     return replace(best, pairs=pairs, is_ambiguous=_has_alternative(best, inside, config))
@@ -213,7 +216,7 @@ def _refined(
         - config.translation_weight * min(translation / max(farthest, 1e-9), 1.0)
     )
     kind: Literal["edges", "lines"] = "edges" if rank == 3 else "lines"
-    information = _at_pose(planar, centre, pose) * (1.0 if kind == "edges" else config.line_weight)
+    information = _at_pose(planar, centre, pose) * (1.0 if kind == "edges" else LINE_WEIGHT)
     pairs = np.column_stack([np.flatnonzero(pair >= 0), pair[pair >= 0]])
     return WallMatch(
         pose, information, rank, float(fitness), float(coverage), float(distance), float(rms), pairs, kind, False

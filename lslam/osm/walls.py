@@ -20,6 +20,10 @@ from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.building import Building, Footprint, footprint_polygon, is_canopy
 from lslam.osm.kernels import segments
 
+WALL_RANGE_M = 60.0  # m; walls are looked for so far from the sensor
+WALL_TILT_DEG = 15.0  # largest tilt of a wall's surface
+WALL_GAP_M = 1.0  # m; a wider gap parts two walls on one line
+MIN_CLUSTER = 20  # points a wall has at least
 CELL_M = 2.0  # m; of the grid in which the ground is found
 SLOPE = 0.3  # m per m; steepest street
 ROUGHNESS_M = 0.3  # m; of the ground within a cell
@@ -70,16 +74,16 @@ def find_walls(
     config = config or OsmConfig()
     cloud = np.asarray(points, np.float32).reshape(-1, 3)
     x, y, z = np.abs(cloud.T)
-    near = (x < config.wall_range) & (y < config.wall_range) & (z < HIGHEST)
+    near = (x < WALL_RANGE_M) & (y < WALL_RANGE_M) & (z < HIGHEST)
     cloud = cloud[near]
-    if len(cloud) < config.min_cluster:
+    if len(cloud) < MIN_CLUSTER:
         return Walls(np.zeros((0, 2, 2)), np.zeros(0, np.int64), np.zeros(0))
     high = _high(cloud, config.wall_height)
     flat, every = segments.flat_walls(
         cloud,
         high if is_wall is None else high[is_wall[near][high]],
         NEIGHBOURHOOD,
-        np.sin(np.radians(config.wall_tilt_deg)),
+        np.sin(np.radians(WALL_TILT_DEG)),
         THICKNESS,
         THIN,
     )
@@ -90,8 +94,8 @@ def find_walls(
         tries,
         config.wall_tolerance,
         AGREEMENT,
-        config.wall_gap,
-        float(config.min_cluster),
+        WALL_GAP_M,
+        float(MIN_CLUSTER),
         config.min_length,
         WALL_STEP_M,
     )

@@ -128,12 +128,6 @@ def _check_heeded(config: Config) -> None:
                     "the preset"
                 )
             raise UsageError(
-                f"{name} = {value!r} does nothing with method {method}: drop it, {_own_key(config, key)}or use one that heeds it "
+                f"{name} = {value!r} does nothing with method {method}: drop it, or use one that heeds it "
                 f"({', '.join(methods)})"
             )
-
-
-def _own_key(config: Config, key: str) -> str:
-    """Full name of the method's own key of this name, empty where it has none."""
-    part = config.odometry.method.replace("-", "_")
-    return f"set {part}.{key}, " if hasattr(getattr(config, part, None), key) else ""

@@ -27,7 +27,8 @@ def test_added_drift_has_the_configured_size(seed: int) -> None:
     assert np.rad2deg(so3.angle(turned[-1].T_world_lidar[:3, :3])) == pytest.approx(1.0)
     tilted = with_drift(
         RESULTS,
-        DebugConfig(drift_percent=0, drift_deg_per_100m=0, drift_tilt_deg_per_100m=0.5, drift_seed=seed),
+        DebugConfig(drift_percent=0, drift_deg_per_100m=0, drift_seed=seed),
+        tilt_deg_per_100m=0.5,
     )
     off = so3.log(tilted[-1].T_world_lidar[:3, :3])
     assert np.rad2deg(np.hypot(off[0], off[1])) == pytest.approx(1.0)

@@ -18,6 +18,7 @@ from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
 from lslam.core.config import Config, load_config
 from lslam.core.geometry import geodesy, se3, so3
+from lslam.core.geometry.noise import RIGHT_PROBABILITY
 from lslam.core.geometry.se3 import umeyama
 from lslam.core.types.constraint import Constraint, LoopCandidate
 from lslam.core.types.gnss import GnssStream
@@ -46,12 +47,12 @@ def config(*settings: str) -> Config:
     return load_config(settings=settings, environ={})
 
 
-def drifted(*settings: str) -> list[ScanResult]:
+def drifted(*settings: str, tilt_deg_per_100m: float = 0.0) -> list[ScanResult]:
     results = [
         ScanResult(i, i * 100_000_000, T, covariance=OWN * (1 + i), registration_covariance=OWN)
         for i, T in enumerate(REAL)
     ]
-    return with_drift(results, config(*settings).debug)
+    return with_drift(results, config(*settings).debug, tilt_deg_per_100m)
 
 
 def store_of(results: list[ScanResult], seen: Floats | None = None) -> KeyframeStore:
@@ -116,7 +117,7 @@ def test_a_constant_drift_is_corrected_and_reported() -> None:
     assert np.linalg.norm(shift) == pytest.approx(1.0, abs=0.1)
     assert abs(told["left_deg_per_100m"]["estimate"]) == pytest.approx(0.5, abs=0.05)
     assert told["log_likelihood_gain"] > told["gain_by_chance"]
-    assert told["gain_by_chance"] == pytest.approx(0.5 * chi2.ppf(config().graph.probability, 6), abs=0.06)
+    assert told["gain_by_chance"] == pytest.approx(0.5 * chi2.ppf(RIGHT_PROBABILITY, 6), abs=0.06)
     # The odometry that is written is the one that was solved.
     steps = [c for c in done.constraints if c.b == c.a + 1]
     ends = [se3.relative(done.keyframes[c.a], done.keyframes[c.b]) for c in steps]
@@ -348,8 +349,8 @@ def with_gravity(results: list[ScanResult], seed: int, sigma: float = np.deg2rad
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_gravity_takes_a_tilt_away_without_any_loop(seed: int) -> None:
     """Half a degree per 100 m; the heading, of which gravity knows nothing, is odometry's own."""
-    tilting = ("debug.drift_percent=0", "debug.drift_deg_per_100m=0", "debug.drift_tilt_deg_per_100m=0.5")
-    results = with_gravity(drifted(*tilting, f"debug.drift_seed={seed}"), seed)
+    level = ("debug.drift_percent=0", "debug.drift_deg_per_100m=0", f"debug.drift_seed={seed}")
+    results = with_gravity(drifted(*level, tilt_deg_per_100m=0.5), seed)
     store = store_of(results)
     done = run_back_end(Stub([]), results, store, config(), [])
     blind = run_back_end(Stub([]), results, store, config("graph.gravity=false"), [])
@@ -365,8 +366,8 @@ def test_gravity_takes_a_tilt_away_without_any_loop(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("count", [COUNT, 300])
 def test_gravity_that_is_no_better_than_odometry_moves_nothing(seed: int, count: int) -> None:
-    tilting = ("debug.drift_percent=0", "debug.drift_deg_per_100m=0", "debug.drift_tilt_deg_per_100m=0.03")
-    results = with_gravity(drifted(*tilting, f"debug.drift_seed={seed}"), seed)[:count]
+    level = ("debug.drift_percent=0", "debug.drift_deg_per_100m=0", f"debug.drift_seed={seed}")
+    results = with_gravity(drifted(*level, tilt_deg_per_100m=0.03), seed)[:count]
     store = store_of(results)
     done = run_back_end(Stub([]), results, store, config(), [])
     assert done.results is results

@@ -112,7 +112,7 @@ def test_fixes_that_are_all_bad_are_refused_with_a_reason(name: str) -> None:
     assert placement.problem.startswith("GNSS: ")
 
 
-def test_too_few_that_agree_name_the_setting_that_asks_for_more() -> None:
+def test_too_few_that_agree_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two of six jump: four are the most of them, and not five."""
     sequence = recording(0.1)
     stream = sequence.gnss
@@ -121,8 +121,9 @@ def test_too_few_that_agree_name_the_setting_that_asks_for_more() -> None:
     few = replace(sequence, gnss=replace(stream, stamps_ns=some, lat_lon_alt=places, sigma=stream.sigma[::35]))
     refused = fit(few)
     assert refused.georeference is None
-    assert "half of 6 fixes, and 5 at the least (gnss.min_fixes)" in refused.problem
-    assert fit(few, min_fixes=4).georeference.used == 4
+    assert "half of 6 fixes, and 5 at the least: all" in refused.problem
+    monkeypatch.setattr("lslam.backend.georeferencing.MIN_FIXES", 4)
+    assert fit(few).georeference.used == 4
 
 
 def test_some_bad_fixes_do_not_matter() -> None:

@@ -230,7 +230,7 @@ def test_a_server_that_says_when_in_no_digits(tmp_path: Path) -> None:
     try:
         done = lslam(
             "osm", "fetch", "--around", "49,8.4", "--radius", "100", "--out", tmp_path / "o.osm",
-            "--set", "osm.backoff=0.01", "--server", f"http://127.0.0.1:{server.server_port}",
+            "--set", "osm.attempts=1", "--server", f"http://127.0.0.1:{server.server_port}",
         )  # fmt: skip
     finally:
         server.shutdown()

@@ -24,7 +24,7 @@ TRUE = {
 FOUND = (CLASSES["other-ground"], CLASSES["building"], CLASSES["pole"], CLASSES["vegetation"], CLASSES["car"])
 NAMES = tuple(TRUE)
 SPACING_M, SCANS = 2.0, 5
-REACH_M = 60.0  # as osm.wall_range
+REACH_M = 60.0  # as `WALL_RANGE_M`
 
 
 def submap_of(

@@ -159,7 +159,8 @@ def test_drift_is_significant_by_the_likelihood_ratio(seed: int, monkeypatch: py
     for factor, is_sure in ((0.9, True), (1.1, False)):
         level = float(chi2.cdf(factor * gain, 2))
         assert 0.5 < level < 1.0
-        drift = find_wall_drift(graph, seen, SEEN, MAP, GraphConfig(probability=level))
+        monkeypatch.setattr(wall_drift, "RIGHT_PROBABILITY", level)
+        drift = find_wall_drift(graph, seen, SEEN, MAP, GraphConfig())
         assert drift is not None
         assert drift.is_sure == is_sure
 

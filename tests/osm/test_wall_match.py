@@ -239,7 +239,7 @@ def test_a_wall_without_final_correspondences_is_no_match() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.6, 2.2])
-def test_the_direction_along_parallel_walls_is_free(turn: float) -> None:
+def test_the_direction_along_parallel_walls_is_free(turn: float, monkeypatch: pytest.MonkeyPatch) -> None:
     street = np.array([[[-30, 5], [30, 5]], [[30, -5], [-30, -5]]], np.float64)[:, ::-1]
     pose = (0.0, 0.0, turn)
     part = np.array([[[12, 5.02], [-9, 4.98]], [[-11, -5], [10, -5]]])
@@ -256,7 +256,8 @@ def test_the_direction_along_parallel_walls_is_free(turn: float) -> None:
     fixed = np.append(across, 0.0)
     assert fixed @ match.information @ fixed > 1.0
     assert not match.is_ambiguous, "the same wall further along is no other answer"
-    full = match_walls(part, turned(street, pose), prior, SIGMA, OsmConfig(line_weight=1.0))
+    monkeypatch.setattr("lslam.osm.wall_match.LINE_WEIGHT", 1.0)
+    full = match_walls(part, turned(street, pose), prior, SIGMA)
     assert full is not None
     np.testing.assert_allclose(match.information, 0.25 * full.information, rtol=1e-9, atol=1e-9)
 

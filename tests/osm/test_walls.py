@@ -77,11 +77,12 @@ def test_other_surfaces_give_no_walls() -> None:
     assert len(find_walls(noisy(plain()))) == 0
 
 
-def test_two_houses_in_line_are_two_walls_and_a_narrow_gap_is_none() -> None:
+def test_two_houses_in_line_are_two_walls_and_a_narrow_gap_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = np.concatenate([plain(), upright((-12, 8), (-3, 8), 0, 5), upright((-1, 8), (8, 8), 0, 5)])
     two = find_walls(noisy(cloud))
     assert sorted(np.round(two.lengths).tolist()) == [9.0, 9.0]
-    assert len(find_walls(noisy(cloud), OsmConfig(wall_gap=3.0))) == 1
+    monkeypatch.setattr("lslam.osm.walls.WALL_GAP_M", 3.0)
+    assert len(find_walls(noisy(cloud))) == 1
 
 
 def test_a_round_building_and_a_little_one_break_nothing() -> None:

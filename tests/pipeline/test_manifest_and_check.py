@@ -135,8 +135,8 @@ def test_a_key_that_the_method_would_pass_over_is_refused(method: str, setting: 
 @pytest.mark.parametrize(
     ("method", "settings", "words"),
     [("lio-sam", ("recovery.fallback=all-points",), r"recovery\.fallback = 'all-points' .* method lio-sam.*\(loam-odom, loam"),
-     ("lio-sam", ("lio_sam.features=points", "registration.keyframes=5"), r"lio-sam: drop it, set lio_sam\.keyframes, or"),
-     ("lio-sam", ("registration.keyframe_deg=5",), r"set lio_sam\.keyframe_deg, or"),
+     ("lio-sam", ("lio_sam.features=points", "registration.keyframes=5"), "method lio-sam: drop it, or"),
+     ("lio-sam", ("registration.keyframe_deg=5",), "method lio-sam: drop it, or"),
      ("lio-sam", ("graph.gravity=false",), r"^graph\.gravity = false .* lio_sam\.graph_imu brings it in"),
      ("lio-sam", ("graph.gravity=false", "lio_sam.graph_imu=false"), ""),
      ("ct-icp", ("registration.keyframe_m=1",), "method ct-icp: drop it, or"),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lslam.backend.graph.problem import PoseGraph
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.geometry.noise import quantile, squared_distances
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile, squared_distances
 from lslam.core.stopping import check_stop
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
@@ -66,7 +66,7 @@ def judge_loops(graph: PoseGraph, config: GraphConfig) -> list[str]:
         return reasons
     ends = Ends(graph.loops)
     drift = drift_of(graph, config)
-    limit = quantile(config.probability, 6)
+    limit = quantile(RIGHT_PROBABILITY, 6)
     twists, covariances = _against_odometry(graph, ends, drift)
     errors = squared_distances(twists, covariances)
     near = errors <= limit

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.geometry.noise import chance_of_median, quantile, squared_distances
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, chance_of_median, quantile, squared_distances
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
 
@@ -59,8 +59,8 @@ def drift_factor(graph: PoseGraph, loops: Sequence[Constraint], config: GraphCon
     by_loops = _of_loops(graph, loops, noise, drift) if loops else 0.0
     # Where the noise of fixes was estimated, odometry's drift was beside it: `graph.walk`.
     fixes = graph.fixes if graph.fix_noise is None else ()
-    by_fixes = _of_fixes(graph.poses, fixes, 3, noise, drift, config.probability)
-    by_map = _of_fixes(graph.poses, on_map, 2, noise, drift, config.probability)
+    by_fixes = _of_fixes(graph.poses, fixes, 3, noise, drift, RIGHT_PROBABILITY)
+    by_map = _of_fixes(graph.poses, on_map, 2, noise, drift, RIGHT_PROBABILITY)
     return max(by_loops, by_fixes, by_map, _of_ups(graph, noise, drift, config))
 
 
@@ -162,7 +162,7 @@ def _of_ups(graph: PoseGraph, white: Floats, drift: Floats, config: GraphConfig)
 
     own = together(white) + np.kron(np.diag(variances[1:]) + variances[0], np.eye(2))
     surprise = float(tilt[0] @ np.linalg.solve(own[0], tilt[0]))
-    return _fitting(tilt, own, together(drift)) if surprise > quantile(config.probability, 2 * count) else 0.0
+    return _fitting(tilt, own, together(drift)) if surprise > quantile(RIGHT_PROBABILITY, 2 * count) else 0.0
 
 
 def _measurements(graph: PoseGraph) -> tuple[NDArray[np.intp], Floats, Floats]:

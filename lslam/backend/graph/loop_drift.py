@@ -19,7 +19,7 @@ from lslam.backend.graph.pose_graph import check_graph, with_distances
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
-from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint
@@ -69,7 +69,7 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
         rates = at_knots @ drift.reshape(-1, 6)
         turned = _turned(rates[:, 3:], np.diff(graph.distances))
         straight = correct_drift(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
-    chance = quantile(config.probability, 6)
+    chance = quantile(RIGHT_PROBABILITY, 6)
     if gain <= chance:
         return graph
     share = np.diff(graph.distances) / np.ptp(graph.distances)

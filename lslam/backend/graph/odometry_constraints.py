@@ -21,6 +21,8 @@ from lslam.core.types.trajectory import Keyframe
 # m and rad; least sigmas of a step when a method states no covariance, and those of one into another frame.
 LEAST_M, LEAST_RAD = 1e-3, 1e-4
 FREE_M, FREE_RAD = 1e3, np.pi
+# Sigmas of a perfect fit and of a bad one, and how soon they grow with the fitness score (hdl_graph_slam).
+FITNESS_SIGMA_M, FITNESS_SIGMA_RAD, FITNESS_GAIN = (0.1, 5.0), (0.05, 0.2), 20.0
 # m2 and rad2, of every constraint by `graph.information = "identity"`.
 IDENTITY = np.eye(6)
 
@@ -78,9 +80,9 @@ def fitness_covariance(score: float, config: GraphConfig) -> Floats:
 
     The variance rises from that of the smaller of two sigmas to that of the larger with it.
     """
-    gain, limit = config.fitness_gain, config.fitness_limit
-    share = (1 - np.exp(-gain * min(score, limit))) / (1 - np.exp(-gain * limit))
-    (near_m, far_m), (near_rad, far_rad) = (np.square(s) for s in (config.fitness_sigma_m, config.fitness_sigma_rad))
+    limit = config.fitness_limit
+    share = (1 - np.exp(-FITNESS_GAIN * min(score, limit))) / (1 - np.exp(-FITNESS_GAIN * limit))
+    (near_m, far_m), (near_rad, far_rad) = (np.square(s) for s in (FITNESS_SIGMA_M, FITNESS_SIGMA_RAD))
     return np.diag(np.repeat([near_m + (far_m - near_m) * share, near_rad + (far_rad - near_rad) * share], 3))
 
 

@@ -14,12 +14,14 @@ from lslam.backend.graph.selected_inverse import selected_inverse
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise
-from lslam.core.geometry.noise import quantile
+from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
 from lslam.core.stopping import check_stop, checking
 from lslam.core.types.arrays import Floats
 
 # Keyframes that iSAM2 takes in per update.
 BATCH = 10
+# Of the optimiser, per solution.
+MAX_ITERATIONS = 100
 # The control parameter's growth per round, and rounds at most (Yang et al. take 1.4 and 100, from far worse starts).
 GROWTH, ROUNDS = 2.0, 30
 # A weight beyond is decided, as one of 0 is; other small weights are not: with the control parameter all of them are small.
@@ -37,7 +39,7 @@ def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
     try:
         is_dogleg = config.optimizer == "dogleg"
         params: Any = gtsam.DoglegParams() if is_dogleg else gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(config.max_iterations)
+        params.setMaxIterations(MAX_ITERATIONS)
         params.iterationHook = lambda iteration, before, after: check_stop()
         optimizer: Any = gtsam.DoglegOptimizer if is_dogleg else gtsam.LevenbergMarquardtOptimizer
         solution = optimizer(factors, values, params).optimize()
@@ -58,7 +60,7 @@ def refine(factors: Any, values: Any, config: GraphConfig) -> Any:
     import gtsam
 
     params = gtsam.NonlinearOptimizerParams()
-    for _ in range(config.max_iterations):
+    for _ in range(MAX_ITERATIONS):
         check_stop()
         try:
             linear = factors.linearize(values)
@@ -208,7 +210,7 @@ class GncResult:
 
 def gnc_solve(fixed: Any, candidates: Sequence[OutlierCandidate], values: Any, config: GraphConfig) -> GncResult:
     """Solve, classifying the outlier candidates by the method `config.robust`."""
-    limits = np.array([quantile(config.probability, d.dim) for d in candidates])
+    limits = np.array([quantile(RIGHT_PROBABILITY, d.dim) for d in candidates])
     plain = [d.make(1.0, None) for d in candidates]
     if config.robust == "gnc":
         return _graduated(fixed, candidates, plain, limits, values, config)

@@ -12,7 +12,7 @@ from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.keyframes.submaps import mounted_up, submap
 from lslam.backend.localization.place_search import GUESSES_APART_M, PlaceSearch, Region
 from lslam.backend.localization.prior_map import MAP_MIN_INLIERS
-from lslam.backend.loops.gating import LoopThrottle
+from lslam.backend.loops.gating import GATE_SIGMAS, LoopThrottle
 from lslam.backend.loops.level_submap import LevelSubmap, find_up, level_rotation, make_level_submap
 from lslam.core.config.config import Config
 from lslam.core.geometry import se3, so3
@@ -206,8 +206,8 @@ class PlaceFinder:
     def _drift(self, a: int, b: int) -> tuple[float, float]:
         """m and rad that odometry may be wrong by between two keyframes."""
         c, way = self.config.loops, abs(float(self._distances[b] - self._distances[a]))
-        turn = c.sigmas * np.deg2rad(c.drift_deg) / 100 * way
-        return c.sigmas * 0.01 * c.drift_percent * way + 0.5 * turn * way, float(turn)
+        turn = GATE_SIGMAS * np.deg2rad(c.drift_deg) / 100 * way
+        return GATE_SIGMAS * 0.01 * c.drift_percent * way + 0.5 * turn * way, float(turn)
 
     def _same(self, one: Vote, other: Vote) -> bool:
         """Whether two votes put the drive at the same place, as far as odometry can tell.

@@ -15,6 +15,7 @@ import numpy as np
 from lslam.backend.loops import create_descriptor
 from lslam.backend.loops.descriptor import PlaceMatch
 from lslam.backend.loops.gating import (
+    GATE_SIGMAS,
     LoopThrottle,
     OdometryUncertainty,
     RelativeUncertainty,
@@ -37,6 +38,8 @@ from lslam.registration.preprocessing.ground import Z
 
 # m; two passes of a street lie so far apart at most.
 NEAR_M = 8.0
+# m; so far apart the scans of a known pair may have been taken: what a person calls one place.
+KNOWN_WITHIN_M = 10.0
 # m and rad, least gate of odometry: what two registrations of the same place differ by.
 LEAST_REACH, LEAST_TURN = 1.0, np.deg2rad(2.0)
 # rad between the headings that are searched; beyond the widest gate they lie about the descriptor's own.
@@ -143,7 +146,7 @@ class Detector:
         spread = WIDEST_TURN if turn <= WIDEST_TURN else np.pi
         yaws = np.arange(-spread, spread, TURN_STEP)
         expected = self.keyframes[a].T_world_lidar[:3, :3] @ pair.place
-        within = self.config.known_within if pair.within is None else pair.within
+        within = KNOWN_WITHIN_M if pair.within is None else pair.within
         check = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
         closed = self._constraint(a, b, check)
         return LoopCandidate(
@@ -205,7 +208,7 @@ class Detector:
         """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
         among = self._allowed(b, self.memory.before(b))
         if self.config.radius is None:
-            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR_M, self.config.sigmas)
+            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR_M, GATE_SIGMAS)
         return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
 
     def _allowed(self, b: int, among: Longs) -> Longs:
@@ -307,11 +310,11 @@ class Detector:
         """m, gate on the position."""
         if self.config.radius is not None:
             return self.config.radius
-        return max(self.config.sigmas * float(uncertainty.reach[0]), LEAST_REACH)
+        return max(GATE_SIGMAS * float(uncertainty.reach[0]), LEAST_REACH)
 
     def _turn(self, uncertainty: RelativeUncertainty) -> float:
         """rad, gate on the heading."""
-        return max(self.config.sigmas * float(uncertainty.turn[0]), float(LEAST_TURN))
+        return max(GATE_SIGMAS * float(uncertainty.turn[0]), float(LEAST_TURN))
 
     def _yaws(self, match: PlaceMatch, turn: float) -> Floats:
         """rad, headings of the newer submap in the older to search."""
@@ -327,11 +330,11 @@ class Detector:
         if turn > self._turn(uncertainty):
             return f"odometry would be wrong by {np.rad2deg(turn):.1f} deg"
         if self.config.radius is not None:
-            sigmas = self.config.sigmas * float(np.linalg.norm(shift)) / self.config.radius
+            sigmas = GATE_SIGMAS * float(np.linalg.norm(shift)) / self.config.radius
         else:
-            least = (LEAST_REACH / self.config.sigmas) ** 2 * np.eye(3)
+            least = (LEAST_REACH / GATE_SIGMAS) ** 2 * np.eye(3)
             sigmas = float(np.sqrt(shift @ np.linalg.solve(uncertainty.position[0] + least, shift)))
-        if sigmas > self.config.sigmas:
+        if sigmas > GATE_SIGMAS:
             return f"odometry would be wrong by {np.linalg.norm(shift):.1f} m"
         return ""
 

@@ -17,6 +17,9 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.trajectory import Keyframe
 
+# Odometry is trusted to be wrong by at most so many standard deviations.
+GATE_SIGMAS = 3.0
+
 
 @dataclass(frozen=True)
 class RelativeUncertainty:

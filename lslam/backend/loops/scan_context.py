@@ -18,6 +18,8 @@ LIFT = 2.0
 GROUND_SHARE = 0.05
 # So many keyframes, nearest by their ring keys, are compared in full.
 COMPARED = 25
+# Rings, sectors and radius, m, of the polar image (Kim and Kim 2018).
+RINGS, SECTORS, REACH_M = 20, 60, 80.0
 
 
 def describe(points: NDArray[np.float32], rings: int, sectors: int, reach: float) -> Images:
@@ -59,13 +61,13 @@ def _unit_columns(images: Images) -> tuple[Images, Bools]:
 
 def create(config: LoopsConfig) -> PlaceIndex:
     """The descriptor, empty."""
-    return PlaceIndex(config.rings, config.sectors, config.reach)
+    return PlaceIndex()
 
 
 class PlaceIndex:
     """The places seen so far, by keyframe number."""
 
-    def __init__(self, rings: int = 20, sectors: int = 60, reach: float = 80.0) -> None:
+    def __init__(self, rings: int = RINGS, sectors: int = SECTORS, reach: float = REACH_M) -> None:
         self.rings, self.sectors, self.reach = rings, sectors, reach
         self.yaw_error = np.pi / sectors
         self._rows: dict[int, int] = {}

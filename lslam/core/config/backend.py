@@ -32,15 +32,11 @@ class LoopsConfig(Section):
     file: str = Field(
         "", description="CSV of pairs that are known to be loop closures, or forbidden to be any; empty: none"
     )
-    known_within: float = Field(10.0, gt=0, description="m; so far apart the scans of a known pair may have been taken")
     radius: float | None = Field(
         None,
         gt=0,
         description="m; keyframes within this distance by odometry are candidates; absent: within 8 m and what odometry "
         "may be wrong by",
-    )
-    sigmas: float = Field(
-        3.0, gt=0, description="odometry is trusted to be wrong by at most so many standard deviations"
     )
     drift_percent: float = Field(
         0.5,
@@ -74,9 +70,6 @@ class LoopsConfig(Section):
         description="there, keyframes in a row within 8 m are one place where 1 minus the distance of their descriptors is so "
         "much; absent: 4 m of way are one",
     )
-    rings: int = Field(20, ge=4, le=400, description="Scan Context: rings of the polar image (Kim and Kim 2018)")
-    sectors: int = Field(60, ge=8, le=360, description="Scan Context: sectors of the polar image")
-    reach: float = Field(80.0, gt=0, description="m; Scan Context: radius of the polar image")
     max_descriptor_distance: float = Field(
         0.4, gt=0, le=1, description="distance of the descriptors, 0 alike to 1, above which two places are different"
     )
@@ -111,12 +104,6 @@ class GraphConfig(Section):
         "gnc", description="how wrong loops and fixes are told: graduated non-convexity, an M-estimator, not at all"
     )
     is_pairwise: bool = Field(True, description="drop loops that contradict the loops around them before optimising")
-    probability: float = Field(
-        0.999,
-        gt=0.5,
-        lt=1,
-        description="a loop or fix within this quantile of its own chi-square distribution is right",
-    )
     drift_percent: float = Field(
         1.0, gt=0, description="%; one sigma of what odometry may be wrong by over a distance, when loops are judged"
     )
@@ -126,7 +113,6 @@ class GraphConfig(Section):
         description="set odometry straight where loops tell that it runs away at one rate, before they are closed, or walls of "
         "buildings that it drifts",
     )
-    max_iterations: int = Field(100, ge=1, description="of the optimiser, per solution")
     refine: bool = Field(
         False, description="then correct all scans at once, so that what they saw of a plane lies on one (--refine)"
     )
@@ -148,9 +134,6 @@ class GraphConfig(Section):
         description="covariances of constraints: of the registrations, from how far the points of one keyframe lie from the "
         "nearest ones of the other (hdl_graph_slam), or 1 m2 and 1 rad2 whatever was found (Girolimetto)",
     )
-    fitness_sigma_m: tuple[float, float] = Field((0.1, 5.0), description="m; sigma of a perfect fit and of a bad one")
-    fitness_sigma_rad: tuple[float, float] = Field((0.05, 0.2), description="rad; likewise of rotation")
-    fitness_gain: float = Field(20.0, gt=0, description="how soon sigma grows with the fitness score")
     fitness_limit: float = Field(0.5, gt=0, description="m2; a fitness score as bad as can be")
 
 
@@ -173,10 +156,7 @@ class GnssConfig(Section):
         "", description="grid (GTX, GeoTIFF) of the geoid that heights of outputs and control points count from"
     )
     sigma: float | None = Field(None, gt=0, description="m; one sigma of a fix; default: what the recording states")
-    min_sigma: float = Field(0.02, gt=0, description="m; least sigma of a fix")
-    vertical: float = Field(1.8, ge=1, description="heights are worse than positions by this factor")
     max_sigma: float = Field(20.0, gt=0, description="m; fixes that state more are left out")
-    min_fixes: int = Field(5, ge=3, description="with fewer fixes that agree there is no georeference")
 
 
 class OsmConfig(Section):
@@ -236,9 +216,7 @@ class OsmConfig(Section):
         description="address of an Overpass server",
     )
     timeout: float = Field(180.0, gt=0, le=900, description="s; longest wait for one reply")
-    connect_timeout: float = Field(10.0, gt=0, description="s; longest wait for a connection")
     attempts: int = Field(4, ge=1, le=10, description="how often one request is tried while the server is busy")
-    backoff: float = Field(5.0, gt=0, description="s; wait after the first refusal, doubled after each further one")
     cache: Literal["use", "refresh", "only"] = Field(
         "use", description="use: what was fetched before is not asked for again; refresh: ask again; only: no network"
     )
@@ -248,11 +226,7 @@ class OsmConfig(Section):
     wall_height: float = Field(
         1.6, ge=0, description="m; above the ground: what is lower is clutter: cars, fences, hedges, people"
     )
-    wall_range: float = Field(60.0, gt=0, le=150, description="m; walls are looked for so far from the sensor")
-    wall_tilt_deg: float = Field(15.0, gt=0, lt=45, description="deg; largest tilt of a wall's surface")
     wall_tolerance: float = Field(0.15, gt=0, description="m; points so far from a line are of its wall")
-    wall_gap: float = Field(1.0, gt=0, description="m; a wider gap parts two walls on one line")
-    min_cluster: int = Field(20, ge=3, description="points a wall has at least")
     min_length: float = Field(2.0, gt=0, description="m; shorter walls are left out")
     wall_sigma: float = Field(0.3, gt=0, description="m; one sigma of a wall of the map, drawn by hand from the air")
     max_distance: float = Field(2.0, gt=0, description="m; mean distance of walls that counts as no match (eq. 3.1)")
@@ -265,12 +239,7 @@ class OsmConfig(Section):
     building_max_distance: float | None = Field(
         None, gt=0, description="m; likewise in place of max_distance; absent: the same"
     )
-    line_weight: float = Field(
-        0.25, gt=0, le=1, description="information of a match of parallel walls only, against one with corners"
-    )
     min_coverage: float = Field(0.4, ge=0, le=1, description="share of the walls seen that must lie on the map")
-    min_start_coverage: float = Field(0.6, ge=0, le=1, description="the same where any heading is possible")
-    min_building_coverage: float = Field(0.1, ge=0, le=1, description="share of a building's walls that must be seen")
     rival_margin: float = Field(
         15.0, ge=0, description="another pose with so little less fitness makes a match a guess"
     )
@@ -321,7 +290,6 @@ class DebugConfig(Section):
     )
     drift_percent: float = Field(1.0, ge=0, description="%; of the way travelled, in one direction of the world")
     drift_deg_per_100m: float = Field(0.5, ge=0, description="deg/100 m; of heading, over the way travelled")
-    drift_tilt_deg_per_100m: float = Field(0.0, ge=0, description="deg/100 m; of roll and pitch, likewise")
     drift_seed: int = Field(0, ge=0, description="draws that direction and the side the heading turns to")
     drift_memory: float | None = Field(
         None, gt=0, description="m; way over which both are forgotten and drawn anew; absent: they never change"

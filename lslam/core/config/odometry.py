@@ -151,7 +151,6 @@ class LoamConfig(Section):
     """Features of LOAM and LeGO-LOAM. Numbers are the papers' own unless the description says more."""
 
     regions: int = Field(6, ge=1, description="parts of a ring with equally many points, each with its own features")
-    max_edge_points: int = Field(2, ge=1, le=20, description="sharp edges per region, of 20 edges at most")
     max_planar_points: int = Field(4, ge=1, description="planar points per region")
     grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
     feature_map_voxel: float = Field(
@@ -174,12 +173,6 @@ class LioSamConfig(Section):
     features: Literal["loam", "points"] = Field(
         "loam",
         description="what is registered: edges and planar points along the rings, as in the paper, or all points",
-    )
-    keyframes: int = Field(25, ge=1, description="newest keyframes that make the local map")
-    keyframe_m: float = Field(1.0, gt=0, description="m; moved so far since the last of them, or")
-    keyframe_deg: float = Field(10.0, gt=0, description="deg; turned by so much, for a new one")
-    reset_scans: int = Field(
-        100, ge=2, description="scans after which the smoother's graph begins anew, with what it knows as its prior"
     )
     graph_imu: bool = Field(
         True,
@@ -254,9 +247,6 @@ class ImuConfig(Section):
     start_s: float = Field(
         5.0, ge=0.5, le=60, description="s; the start, which is registered once without the IMU, to check and align it"
     )
-    gap_s: float = Field(
-        0.1, gt=0, description="s; time without samples beyond which a scan falls back to constant velocity"
-    )
 
 
 class WheelsConfig(Section):
@@ -272,9 +262,6 @@ class WheelsConfig(Section):
     )
     wheelbase_m: float | None = Field(
         None, gt=0, description="m; between the axles, where the file has a steering angle"
-    )
-    gap_s: float = Field(
-        0.2, gt=0, description="s; time without readings beyond which a scan falls back to constant velocity"
     )
 
 

@@ -63,6 +63,10 @@ def squared_distances(error: NDArray[Any], covariance: NDArray[Any]) -> Floats:
     return np.asarray(np.einsum("ij,ij->i", error, np.linalg.solve(covariance, error[..., None])[..., 0]))
 
 
+# A loop or a fix within this quantile of its own chi-square distribution is right.
+RIGHT_PROBABILITY = 0.999
+
+
 def quantile(probability: float, dim: int) -> float:
     """The value that a chi-square variable of `dim` degrees of freedom stays below with `probability`.
 

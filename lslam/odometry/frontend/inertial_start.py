@@ -29,7 +29,7 @@ from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial import fusion
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import Gyroscope
-from lslam.odometry.inertial.imu_cleaning import LEAST_RATE_HZ, ImuRefusedError, is_slow, rate_of
+from lslam.odometry.inertial.imu_cleaning import IMU_GAP_S, LEAST_RATE_HZ, ImuRefusedError, is_slow, rate_of
 from lslam.odometry.inertial.initialise import FirstPoses, InertialStart, start
 
 log = logging.getLogger("lslam")
@@ -200,7 +200,7 @@ def first_imu_ns(imu: ImuStream | None, stamps_ns: Longs, config: Config) -> int
     shifted = imu.stamps_ns + round(1e9 * (config.imu.time_offset_s or 0.0))
     during = shifted[(shifted >= first_ns) & (shifted <= stamps_ns[-1])]
     silent_s = 1e-9 * (int(during.min()) - first_ns) if len(during) else 0.0
-    return first_ns if silent_s <= config.imu.gap_s else int(during.min())
+    return first_ns if silent_s <= IMU_GAP_S else int(during.min())
 
 
 def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def begin_wheels(sequence: Sequence, config: WheelsConfig) -> Wheels:
     stream = getattr(sequence, "wheels", None)  # of a simulated drive, which has no files
     if stream is None:
         stream = read_wheels(sequence, config.source, config.frame, config.wheelbase_m, part.notes, part.problems)
-    part.motion = WheelMotion(stream, config.gap_s)
+    part.motion = WheelMotion(stream)
     what = "speed and yaw rate" if stream.yaw_rate is not None else "speed"
     part.notes.append(f"wheels from {config.source}: {what}, {len(stream)} readings")
     for note in part.notes:

@@ -18,7 +18,7 @@ from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
-from lslam.odometry.inertial.imu_cleaning import covers, gaps
+from lslam.odometry.inertial.imu_cleaning import IMU_GAP_S, covers, gaps
 from lslam.odometry.inertial.imu_estimate import WORSE_RATIO, ImuEstimate
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import Increments
@@ -68,7 +68,7 @@ class InertialMotion(Stateful):
         self.is_inertial = False
         # Whether the newest pose has no registration.
         self._was_bridged = False
-        self._gaps = gaps(imu, config.gap_s)
+        self._gaps = gaps(imu, IMU_GAP_S)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
         # From `weigh` at an instant, ns, for `correct`: the gyroscope, and the variance of the registered position, m2.

@@ -19,6 +19,8 @@ PLAUSIBLE_G = (0.8, 1.2)
 CALM_S = 1.0
 # A stream slower than this cannot tell how the sensor moves within a sweep of 0.1 s.
 LEAST_RATE_HZ = 50.0
+# s; time without samples of the IMU, or readings of wheels, beyond which a scan falls back to constant velocity.
+IMU_GAP_S, WHEEL_GAP_S = 0.1, 0.2
 # Clocks differ by some ppm, and drivers round their periods: nearer to that rate than a twentieth is that rate.
 RATE_SLACK_SHARE = 0.05
 MOST_BAD_SHARE = 0.1

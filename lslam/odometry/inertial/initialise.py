@@ -14,7 +14,7 @@ from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan_result import FASTEST_M_S, STILL_M
 from lslam.odometry.inertial.agreement import LEAST_OFFSET_S, check_agreement
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_cleaning import ImuRefusedError, clean, covers, gaps
+from lslam.odometry.inertial.imu_cleaning import IMU_GAP_S, ImuRefusedError, clean, covers, gaps
 from lslam.odometry.inertial.imu_estimate import BIAS, DOWN, WORSE_RATIO, ImuEstimate
 
 # Prior sigmas: any vehicle's speed; consumer devices' biases; a bias by the mean turn.
@@ -95,7 +95,7 @@ def start(
     shift = 0 if offset_s is None else round(1e9 * offset_s)
     cleaned = clean(replace(imu, stamps_ns=imu.stamps_ns + shift), int(first.stamps_ns[0]), last_ns)
     notes = list(cleaned.notes)
-    part = told_poses(first, cleaned.imu, config.gap_s)[0]
+    part = told_poses(first, cleaned.imu)[0]
     agreement = check_agreement(
         cleaned.imu, T_lidar_imu, part.instants_ns, part.middles, None if offset_s is None else 0.0, least_offset_s
     )
@@ -106,7 +106,7 @@ def start(
     config = _without_wrong_bias(config, agreement.gyro_bias, problems)
     moved = round(1e9 * agreement.offset_s)
     usable = replace(cleaned.imu, stamps_ns=cleaned.imu.stamps_ns + moved)
-    part, opening = told_poses(first, usable, config.gap_s)
+    part, opening = told_poses(first, usable)
     _refuse_sign(usable, T_lidar_imu, part, agreement.gyro_bias)
     guess, is_static = _first_guess(usable, T_lidar_imu, part.stamps_ns, part.poses, config, agreement.gyro_bias)
     options = config.estimate_extrinsics, config.estimate_offset
@@ -126,12 +126,12 @@ def start(
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
 
-def told_poses(first: FirstPoses, imu: ImuStream, gap_s: float) -> tuple[FirstPoses, FirstPoses]:
+def told_poses(first: FirstPoses, imu: ImuStream) -> tuple[FirstPoses, FirstPoses]:
     """The longest time among the first scans that the stream tells of, and how far it does from the very first on.
 
     Raises ImuRefusedError when it is silent between all of them.
     """
-    silent = gaps(imu, gap_s)
+    silent = gaps(imu, IMU_GAP_S)
     ends = [k + 1 for k, (a, b) in enumerate(pairwise(first.stamps_ns)) if not covers(silent, int(a), int(b))]
     stretches = list(pairwise([0, *ends, len(first.stamps_ns)]))
     longest = max(stretches, key=lambda stretch: stretch[1] - stretch[0])

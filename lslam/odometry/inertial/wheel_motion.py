@@ -18,7 +18,7 @@ from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, ConstantVelocity, middle_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS
-from lslam.odometry.inertial.imu_cleaning import covers, gaps
+from lslam.odometry.inertial.imu_cleaning import WHEEL_GAP_S, covers, gaps
 from lslam.odometry.inertial.imu_estimate import WORSE_RATIO
 from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelStep, by_axis, learnt, split
 from lslam.odometry.kernels import kalman
@@ -68,8 +68,6 @@ class WheelMotion(ConstantVelocity):
     Both predictions are averaged by the noise of each, which is learnt while driving: wheels of another robot have no weight. A
     registered motion is weighed against the wheels by the covariances of both. Tyres hold no more than gravity: a speed of the
     wheels that changes faster is slip, and constant velocity goes on. The motion within a sweep is that of constant velocity.
-
-    gap_s : time between readings beyond which there are none
     """
 
     STATE: ClassVar[tuple[str, ...]] = (
@@ -85,13 +83,13 @@ class WheelMotion(ConstantVelocity):
     )
     CLEARED: ClassVar[tuple[str, ...]] = (*ConstantVelocity.CLEARED, "_reckoned", "_learnt")
 
-    def __init__(self, wheels: WheelStream, gap_s: float, pose: Floats | None = None) -> None:
+    def __init__(self, wheels: WheelStream, pose: Floats | None = None) -> None:
         super().__init__(pose)
-        self.wheels, self.gap_s = wheels, gap_s
+        self.wheels = wheels
         self.calibration = WheelCalibration.of(wheels)
         self.refusal = ""
         self.slip_scans = self.gap_scans = 0
-        self._gaps = gaps(wheels, gap_s)
+        self._gaps = gaps(wheels, WHEEL_GAP_S)
         # Of constant velocity: variances along and across, (m/s2)2, and of the turn, (rad/s2)2, and the steps behind them.
         self._acceleration, self._counts = np.square(USUAL_ACCELERATION[[0, 0, 3]]), np.ones(3)
         # When wheels last changed their speed by no more than tyres hold, ns.
@@ -105,7 +103,7 @@ class WheelMotion(ConstantVelocity):
 
     def fresh(self, pose: Floats) -> WheelMotion:
         """One that has learnt as much, and expects the first scan at `pose` (4, 4)."""
-        other = WheelMotion(self.wheels, self.gap_s, pose)
+        other = WheelMotion(self.wheels, pose)
         empty = other.state()
         other.restore({**self.state(), **{name: empty[name] for name in ConstantVelocity.STATE}})
         return other

@@ -183,7 +183,7 @@ def _examine_time(sequence: Sequence, imu: ImuStream, steps: Floats, median: flo
     gaps = int((steps > _GAP_S + 0.5 * median).sum())
     if gaps:
         what = f"IMU: {plural(gaps, 'gap')}, the longest {steps.max():.3f} s"
-        findings.append(Finding("imu-gaps", what, "scans within them are predicted by constant velocity (imu.gap_s)"))
+        findings.append(Finding("imu-gaps", what, "scans within them are predicted by constant velocity"))
     apart = no_shared_time("IMU")
     first, last = sequence.stamps_ns[0], sequence.stamps_ns[-1]
     if apart not in sequence.problems and (imu.stamps_ns[0] > last or imu.stamps_ns[-1] < first):

@@ -52,7 +52,7 @@ def examine_turns(sequence: Sequence, findings: list[Finding]) -> Facts | None:
     seconds = float(np.clip(_SCANS / sequence.rate_hz, 0.5, 60))
     config = Config.model_validate({"imu": {"start_s": seconds}})
     try:
-        first, _ = told_poses(first_poses(sequence, config, None), cleaned.imu, config.imu.gap_s)
+        first, _ = told_poses(first_poses(sequence, config, None), cleaned.imu)
     except ImuRefusedError:
         return None  # gaps everywhere, which are found by now
     if len(first.instants_ns) < _FEWEST:
@@ -74,7 +74,7 @@ def _swept_by_imu(
         if not begun.offset_s:
             return first
         motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
-        again = told_poses(first_poses(sequence, config, motion), imu, config.imu.gap_s)[0]
+        again = told_poses(first_poses(sequence, config, motion), imu)[0]
     except ImuRefusedError:
         return first
     return again if len(again.instants_ns) >= _FEWEST else first

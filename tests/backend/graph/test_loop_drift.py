@@ -20,6 +20,7 @@ from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.core.config.backend import DebugConfig, GraphConfig
 from lslam.core.errors import GraphError
 from lslam.core.geometry import se3, so3
+from lslam.core.geometry.noise import RIGHT_PROBABILITY
 from lslam.core.types.constraint import Constraint
 from lslam.core.types.scan_result import ScanResult
 
@@ -101,7 +102,7 @@ def test_the_estimated_drift_is_within_its_sigma(percent: float, degrees: float)
         np.testing.assert_allclose(estimated_drift.rates[:3], real[:3], atol=5e-4)
         np.testing.assert_allclose(estimated_drift.rates[3:], real[3:], atol=5e-6)
         squared.append(((estimated_drift.rates - real) / estimated_drift.sigma) ** 2)
-        assert estimated_drift.chance == pytest.approx(chi2.ppf(CONFIG.probability, 6))
+        assert estimated_drift.chance == pytest.approx(chi2.ppf(RIGHT_PROBABILITY, 6))
     assert 0.1 < np.mean(squared) < 3.0
 
 

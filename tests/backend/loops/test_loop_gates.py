@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 
 from lslam.backend.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector
 from lslam.backend.loops.gating import RelativeUncertainty, SharedResults
-from lslam.backend.loops.scan_context import PlaceMatch
+from lslam.backend.loops.scan_context import SECTORS, PlaceMatch
 from lslam.backend.loops.verify import Verification, Verifier, _is_elsewhere
-from lslam.core.config import load_config
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.errors import ConfigError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.scan_result import StageClock
@@ -80,7 +78,7 @@ def test_a_radius_is_the_limit_in_every_direction() -> None:
 def test_headings_tried_are_odometrys_or_else_the_descriptors() -> None:
     match = PlaceMatch(0, 0.1, yaw=2.0)
     near, wide = detector()._yaws(match, np.deg2rad(5.0)), detector()._yaws(match, 1.01 * WIDEST_TURN)
-    for yaws, centre, spread in ((near, 0.0, np.deg2rad(5.0)), (wide, 2.0, np.pi / LoopsConfig().sectors)):
+    for yaws, centre, spread in ((near, 0.0, np.deg2rad(5.0)), (wide, 2.0, np.pi / SECTORS)):
         assert yaws.mean() == pytest.approx(centre)
         assert np.diff(yaws) == pytest.approx(TURN_STEP)
         assert spread <= yaws.max() - centre < spread + 2 * TURN_STEP
@@ -229,9 +227,3 @@ def test_a_failed_registration_back_is_reported() -> None:
 )
 def test_poses_differ_from_a_metre_or_five_degrees(x: float, yaw_deg: float, expected: bool) -> None:
     assert _is_elsewhere(pose(0, 0), pose(x, 0, yaw_deg)) == expected
-
-
-@pytest.mark.parametrize("key", ["sectors", "rings"])
-def test_an_image_that_no_machine_holds_is_refused(key: str) -> None:
-    with pytest.raises(ConfigError, match=rf"loops\.{key} = 5000: .*less than or equal to"):
-        load_config(settings=[f"loops.{key}=5000"], environ={})

@@ -54,8 +54,6 @@ def test_variables_of_others_are_left_alone() -> None:
         ("map.voxel=nan", "map.voxel = nan"),
         ("map.voxel=inf", "finite"),
         ("map.voxel=1e-9", "0.01"),
-        ("loops.rings=401", "loops.rings = 401"),
-        ("loops.sectors=361", "loops.sectors = 361"),
         ("map.range_max=1", "map: range_min = 2.0 must be less than range_max = 1.0"),
         ("preprocess.range_min=100", "range_min = 100.0 must be less"),
         ("preprocess.source_points_min=6000", "source_points_min = 6000 must be less"),

@@ -164,7 +164,7 @@ def test_gaps_fall_back_to_constant_velocity_and_are_counted() -> None:
 
 
 def test_scans_at_the_edge_of_a_gap_are_predicted_by_the_imu() -> None:
-    """The sweep before lacks its last samples, the step to the scan after its first ones: each less than half of `gap_s`."""
+    """The sweep before lacks its last samples, the step to the scan after its first ones: each less than half of `IMU_GAP_S`."""
     drive = walk()
     motion = motion_over_a_gap(drive, 5_985_000_000, 6_275_000_000)
     own, own_sweep = errors(motion, drive)
@@ -216,12 +216,14 @@ def test_one_scan_in_twenty_is_compared_with_constant_velocity_unless_in_a_gap()
 
 
 @pytest.mark.parametrize("seconds", [0.101, 0.03])
-def test_a_sweep_is_refined_by_the_imu_when_samples_cover_it(seconds: float) -> None:
+def test_a_sweep_is_refined_by_the_imu_when_samples_cover_it(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """What comes after a sweep is not asked for. Of half a sweep constant velocity is as good a judge."""
     drive = walk()
     stamps, poses = truth_of(drive)
     imu, end_ns = stream_of(drive), int(stamps[30]) + round(1e9 * seconds)
-    whole, ending = motion_of(drive, gap_s=0.05), motion_of(drive, imu_until(imu, end_ns), gap_s=0.05)
+    for module in ("fusion", "initialise"):
+        monkeypatch.setattr(f"lslam.odometry.inertial.{module}.IMU_GAP_S", 0.05)
+    whole, ending = motion_of(drive), motion_of(drive, imu_until(imu, end_ns))
     refined = []
     for motion in (whole, ending):
         for stamp, pose in zip(stamps[:30], poses[:30], strict=True):

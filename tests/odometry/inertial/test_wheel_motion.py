@@ -121,7 +121,7 @@ def test_noise_is_learnt_by_the_median_of_what_surfaces_tell() -> None:
 
 def test_scale_offsets_and_latency_are_found() -> None:
     stamps, poses = truth(40.0)
-    motion = WheelMotion(readings(40.0, late_s=0.05, scale=1.04), 0.2)
+    motion = WheelMotion(readings(40.0, late_s=0.05, scale=1.04))
     drive(motion, stamps, poses)
     scale, sigma = motion.calibration.scale
     assert scale == pytest.approx(1 / 1.04, abs=max(3 * sigma, 0.002))
@@ -133,7 +133,7 @@ def test_scale_offsets_and_latency_are_found() -> None:
 
 def test_they_predict_changes_of_speed_that_constant_velocity_does_not() -> None:
     stamps, poses = truth(40.0)
-    own, _ = drive(WheelMotion(readings(40.0, scale=1.04), 0.2), stamps[::3], poses[::3])
+    own, _ = drive(WheelMotion(readings(40.0, scale=1.04)), stamps[::3], poses[::3])
     steady, _ = drive(ConstantVelocity(), stamps[::3], poses[::3])
     assert np.median(own[20:]) < 0.4 * np.median(steady[20:])
 
@@ -141,7 +141,7 @@ def test_they_predict_changes_of_speed_that_constant_velocity_does_not() -> None
 def test_they_carry_through_where_the_way_is_open() -> None:
     stamps, poses = truth(40.0)
     through = slice(150, 400)
-    _, own = drive(WheelMotion(readings(40.0, scale=1.04), 0.2), stamps, poses, through)
+    _, own = drive(WheelMotion(readings(40.0, scale=1.04)), stamps, poses, through)
     _, steady = drive(ConstantVelocity(), stamps, poses, through)
     way = np.linalg.norm(np.diff(poses[through, :3, 3], axis=0), axis=1).sum()
     off, lost = (np.linalg.norm(found[-1, :3, 3] - poses[-1, :3, 3]) for found in (own, steady))
@@ -151,7 +151,7 @@ def test_they_carry_through_where_the_way_is_open() -> None:
 
 def test_what_is_open_teaches_no_scale() -> None:
     stamps, poses = truth(30.0)
-    motion = WheelMotion(readings(30.0, scale=1.04), 0.2)
+    motion = WheelMotion(readings(30.0, scale=1.04))
     drive(motion, stamps, poses, slice(0, 300))
     scale, sigma = motion.calibration.scale
     assert scale == pytest.approx(1.0, abs=0.003)
@@ -164,7 +164,7 @@ def test_slip_is_not_followed() -> None:
     spins = (wheels.stamps_ns > 10_000_000_000) & (wheels.stamps_ns <= 10_400_000_000)
     slipping = replace(wheels, speed=wheels.speed + 6.0 * spins)
     through = slice(95, 115)
-    (_, found), (_, clean) = (drive(WheelMotion(w, 0.2), stamps, poses, through) for w in (slipping, wheels))
+    (_, found), (_, clean) = (drive(WheelMotion(w), stamps, poses, through) for w in (slipping, wheels))
     moved = np.linalg.norm(found[114, :3, 3] - clean[114, :3, 3])
     assert moved < 0.1 * 6.0 * 0.4
 
@@ -174,7 +174,7 @@ def test_wheels_of_another_robot_get_no_weight() -> None:
     wheels = readings(30.0)
     assert wheels.yaw_rate is not None
     other = replace(wheels, speed=wheels.speed[::-1] / 0.3048, yaw_rate=-3 * wheels.yaw_rate)
-    motion, alone = WheelMotion(other, 0.2), ConstantVelocity()
+    motion, alone = WheelMotion(other), ConstantVelocity()
     (errors, found), (steady, without) = (drive(one, stamps, poses) for one in (motion, alone))
     assert "are they this robot's" in motion.refusal
     np.testing.assert_allclose(np.median(errors[40:]), np.median(steady[40:]), rtol=0.2)
@@ -186,7 +186,7 @@ def test_wheels_of_another_robot_get_no_weight() -> None:
 
 def test_a_registration_that_both_deny_is_bridged_and_one_that_insists_is_not() -> None:
     stamps, poses = truth(10.0)
-    motion = WheelMotion(readings(10.0), 0.2)
+    motion = WheelMotion(readings(10.0))
     drive(motion, stamps[:80], poses[:80])
     accepted = []
     for k in (80, 81):
@@ -205,7 +205,7 @@ def test_a_registration_that_both_deny_is_bridged_and_one_that_insists_is_not() 
 
 def test_where_nothing_places_them_direction_and_arm_are_found() -> None:
     stamps, poses = truth(40.0)
-    motion = WheelMotion(replace(readings(40.0), T_lidar_base=None), 0.2)
+    motion = WheelMotion(replace(readings(40.0), T_lidar_base=None))
     errors, _ = drive(motion, stamps, poses)
     np.testing.assert_allclose(motion.calibration.direction, T_LIDAR_BASE[:3, 0], atol=0.03)
     assert np.median(errors[100:]) < 0.02
@@ -227,7 +227,7 @@ def test_a_pause_is_constant_velocitys() -> None:
 
 def test_without_a_yaw_rate_the_turn_is_that_of_constant_velocity() -> None:
     stamps, poses = truth(30.0)
-    motion = WheelMotion(replace(readings(30.0, scale=1.04), yaw_rate=None), 0.2)
+    motion = WheelMotion(replace(readings(30.0, scale=1.04), yaw_rate=None))
     drive(motion, stamps[:250], poses[:250])
     prior, steady = motion.sweep(int(stamps[250]), Span()).pose, motion.predict(int(stamps[250]))
     turned = so3.log(prior[:3, :3].T @ steady[:3, :3])
@@ -238,9 +238,9 @@ def test_without_a_yaw_rate_the_turn_is_that_of_constant_velocity() -> None:
 def test_restored_it_goes_on_as_if_nothing_had_been() -> None:
     stamps, poses = truth(20.0)
     wheels = readings(20.0)
-    whole = WheelMotion(wheels, 0.2)
+    whole = WheelMotion(wheels)
     drive(whole, stamps[:100], poses[:100])
-    other = WheelMotion(wheels, 0.2)
+    other = WheelMotion(wheels)
     other.restore(whole.state())
     _, a = drive(whole, stamps[100:], poses[100:], seed=5)
     _, b = drive(other, stamps[100:], poses[100:], seed=5)
@@ -249,7 +249,7 @@ def test_restored_it_goes_on_as_if_nothing_had_been() -> None:
 
 def test_a_new_map_begins_with_what_was_learnt() -> None:
     stamps, poses = truth(20.0)
-    motion = WheelMotion(readings(20.0, scale=1.04), 0.2)
+    motion = WheelMotion(readings(20.0, scale=1.04))
     drive(motion, stamps, poses)
     fresh = motion.fresh(poses[7])
     assert fresh.calibration is motion.calibration
