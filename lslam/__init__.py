@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from lslam.core.version import __version__
+from lslam.core import __version__
 
 if TYPE_CHECKING:
     from lslam.core.config.config import load_config

@@ -264,6 +264,14 @@ MARKS = {
     "LESS_PLANE",
     "PLANE",
     "NO_LINE",
+    "INFORMATION",
+    "SQUARED",
+    "INLIERS",
+    "MATCHED",
+    "LEVER",
+    "ROBUST",
+    "POPULATION",
+    "COUNT",
 }
 SECTIONS = ("preprocess", "registration", "recovery", "keyframes", "loops", "graph")
 HELD = ("registration", "backend/loops", "backend/graph", "odometry", "odometry/integrity")

@@ -145,5 +145,5 @@ def test_an_unknown_name_is_refused_before_a_run() -> None:
 
 def test_help_looks_for_no_other_package() -> None:
     code = "import sys; from lslam.cli.main import main\nsys.argv = ['lslam', '--help']\ntry: main()\nexcept SystemExit: pass\n"
-    code += "assert 'lslam.core.plugins' not in sys.modules and 'importlib.metadata' not in sys.modules"
+    code += "assert 'lslam.core.extras' not in sys.modules and 'importlib.metadata' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)

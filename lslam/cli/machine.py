@@ -11,8 +11,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from lslam.core import __version__
 from lslam.core.extras import install_command
-from lslam.core.version import __version__
 
 # Of Linux: the control group of this process, and the limits of all.
 CGROUP, CGROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")

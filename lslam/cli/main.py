@@ -12,10 +12,10 @@ from typing import Any, NoReturn
 
 import click
 
+from lslam.core import __version__
 from lslam.core.errors import LslamError, cause, nearest, sentence
 from lslam.core.machine import pin_blas
 from lslam.core.stopping import heeded, is_interrupt, is_too_late
-from lslam.core.version import __version__
 
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
 COMMANDS = {

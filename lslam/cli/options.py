@@ -246,7 +246,7 @@ def coordinates(function: F) -> F:
 
 def crs_settings(crs: str | None, geoid: str | None) -> dict[str, str | None]:
     """Configuration keys of these flags. Raises UsageError for an invalid code."""
-    from lslam.core.geometry.crs_names import parse_crs
+    from lslam.core.geometry.geodesy import parse_crs
 
     epsg, height_epsg = (None, None) if crs is None else parse_crs(f"EPSG:{crs}" if crs[:1].isdecimal() else crs)
     path = None if geoid is None else grid_file(geoid)
@@ -265,7 +265,7 @@ def grid_file(geoid: str) -> str:
 
 def output_crs(given: dict[str, Any]) -> OutputCrs | None:
     """Coordinates that --crs and --geoid ask for; None without them. Raises UsageError for what is no code."""
-    from lslam.core.geometry.crs_names import parse_crs
+    from lslam.core.geometry.geodesy import parse_crs
     from lslam.core.types.gnss import OutputCrs
 
     epsg, height_epsg = (None, None) if given["crs"] is None else parse_crs(given["crs"])

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from lslam.core.version import __version__
+from lslam.core import __version__
 from lslam.io.formats.atomic import atomic_write
 
 INTERVAL_S = 0.005

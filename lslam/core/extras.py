@@ -1,17 +1,24 @@
-"""How the libraries that only some people need are installed and imported: one clear sentence instead of a traceback."""
+"""What only some people install: libraries, which are missing with one clear sentence, and other packages' plug-ins.
+
+Tables of names are extended by entry points of other packages; nothing is looked up before a name of ours fails.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
 import shlex
-from collections.abc import Iterator
-from importlib.metadata import PackageNotFoundError, distribution
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from lslam.core.errors import InputError
+from lslam.core.errors import InputError, UsageError, nearest
 from lslam.core.untrusted import parse_json
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 # Of a checkout; where lslam is installed, the folder of packages.
 _SOURCES = Path(__file__).resolve().parents[2]
@@ -33,6 +40,8 @@ def install_command(extra: str) -> str:
 
 def _requirement(extra: str) -> str:
     """By what pip was told (PEP 610): a path that is there, an address; else the folder of sources, or the name."""
+    from importlib.metadata import PackageNotFoundError, distribution  # late, as for plug-ins
+
     named = f"lslam[{extra}]"
     try:
         source = parse_json(distribution("lslam").read_text("direct_url.json") or "{}")
@@ -77,3 +86,53 @@ def importing_open3d() -> Iterator[None]:
     way_out = f"{install_hint('open3d')}; on a bare Linux also: apt install libgl1 libegl1 libx11-6 libgomp1"
     with importing("Open3D", way_out):
         yield
+
+
+# name -> (module with `create`, one line for people)
+Table = Mapping[str, tuple[str, str]]
+
+
+def registered(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
+    """What other packages register under `group`, by name; they cannot take the name of anything of our `own`.
+
+    Of two packages with one name the first in the alphabet has it, whatever was installed last.
+    """
+    from importlib.metadata import entry_points  # imported late: as much work as the whole command line
+
+    entries = sorted(
+        entry_points(group=group), key=lambda entry: "" if entry.dist is None else entry.dist.name, reverse=True
+    )
+    return {entry.name: entry for entry in entries if entry.name not in own}
+
+
+def known(group: str, own: Table) -> dict[str, str]:
+    """Names and one-line summaries, those of other packages included; nothing is imported."""
+    foreign = {name: f"from {entry.value}" for name, entry in registered(group, own).items()}
+    return {name: summary for name, (_, summary) in own.items()} | foreign
+
+
+def require(group: str, own: Table, name: str, what: str) -> None:
+    """Raise UsageError with the nearest name when there is no `what` of this name; nothing is imported."""
+    if name not in own and name not in (names := known(group, own)):
+        raise UsageError(f"no {what} {name!r}; {nearest(name, names)}")
+
+
+def factory(group: str, own: Table, name: str, what: str) -> Callable[..., Any]:
+    """What makes the `what` of this name. Raises as `require` and `load`."""
+    if name in own:
+        made: Callable[..., Any] = import_module(own[name][0]).create
+        return made
+    require(group, own, name, what)
+    return load(registered(group, own)[name], what)  # type: ignore[no-any-return]
+
+
+def load(entry: EntryPoint, what: str) -> Any:
+    """What the entry point names. Raises InputError naming the package when it is broken."""
+    try:
+        return entry.load()
+    except Exception as error:
+        package = "another package" if entry.dist is None else f"the package {entry.dist.name}"
+        raise InputError(
+            f"{what} {entry.name!r} of {package} cannot be loaded from {entry.value}: {type(error).__name__}: {error}; "
+            "mend or uninstall it"
+        ) from None

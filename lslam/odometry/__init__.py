@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
 from lslam.core.errors import UsageError
-from lslam.core.plugins import factory, known, require
+from lslam.core.extras import factory, known, require
 
 if TYPE_CHECKING:
     from lslam.core.config.config import Config

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior

@@ -21,12 +21,12 @@ from typing import IO, Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.config.backend import OsmConfig
 from lslam.core.errors import InputError, OutputError, UsageError
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.machine import one_at_a_time
 from lslam.core.untrusted import JsonItems, parse_json, whole_number
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.osm_data import OsmData
 from lslam.io.formats.osm_files import ELEMENTS, GaveUpError, add_elements, check_reply

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lslam.core import __version__
 from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, input_errors
 from lslam.core.types.sequence import Sequence, select
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.core.version import __version__
 from lslam.io.remote import as_path
 from lslam.osm.source import AUTO
 from lslam.pipeline.manifest import machine_facts

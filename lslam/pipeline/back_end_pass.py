@@ -19,6 +19,7 @@ from lslam.backend.loops.find_loops import find_loops, verify_known
 from lslam.backend.manual import KeyframePairs, keyframe_pairs, write_control
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
+from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import se2, se3
@@ -28,7 +29,6 @@ from lslam.core.types.gnss import Georeference
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import KeyframeClocks, ScanResult
 from lslam.core.types.sequence import Sequence
-from lslam.core.version import __version__
 from lslam.io.formats.g2o import write_g2o
 from lslam.io.formats.state_files import Records
 from lslam.io.formats.trajectory_files import write_tum

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.errors import OutputExistsError, UsageError, output_errors
 from lslam.core.geometry import se3
 from lslam.core.geometry.geodesy import frame_change
@@ -16,7 +17,6 @@ from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.sequence import Sequence
-from lslam.core.version import __version__
 from lslam.io.formats.geojson import write_areas
 from lslam.io.formats.ply_files import write_ply
 from lslam.maps.changes import ChangedCells, MapChange, changed_cells

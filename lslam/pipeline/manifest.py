@@ -16,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.stopping import is_interrupt
@@ -24,7 +25,6 @@ from lslam.core.types.scan import Span
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.warned import Warnings
-from lslam.core.version import __version__
 from lslam.maps.colour import ColourCounts
 from lslam.reports.facts import describe
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.config.outputs import MapConfig
 from lslam.core.errors import output_errors
 from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.trajectory import Trajectory
 from lslam.core.untrusted import MISFIT, parse_json
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.geojson import write_line
 from lslam.io.formats.ply_files import write_ply, write_ply_mesh

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core import __version__
 from lslam.core.errors import (
     InputError,
     InterruptedRunError,
@@ -23,7 +24,6 @@ from lslam.core.errors import (
 from lslam.core.types.cloud import ArrayCloud, Cloud
 from lslam.core.types.gnss import Georeference, OutputCrs
 from lslam.core.types.sequence import Sequence
-from lslam.core.version import __version__
 from lslam.io.formats.copc_files import SUFFIX as COPC
 from lslam.io.formats.point_files import read_cloud, write_cloud
 from lslam.maps.georeference import ProjectedCloud, Projection

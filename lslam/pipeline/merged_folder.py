@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lslam.backend.graph.factors import well_conditioned
+from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError, UsageError
 from lslam.core.geometry import se3
@@ -20,7 +21,6 @@ from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence as Recording
 from lslam.core.types.trajectory import Trajectory
-from lslam.core.version import __version__
 from lslam.evaluation.evaluate import evaluate
 from lslam.io.formats.g2o import write_g2o
 from lslam.io.formats.trajectory_files import write_tum

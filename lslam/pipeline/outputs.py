@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.config import Config, to_toml
 from lslam.core.config.outputs import MapConfig
 from lslam.core.geometry import se3
@@ -23,7 +24,6 @@ from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
-from lslam.core.version import __version__
 from lslam.evaluation.evaluate import Evaluation
 from lslam.evaluation.timing import AFTER, SAVED
 from lslam.io.formats.atomic import write_text

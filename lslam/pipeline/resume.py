@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.config.config import load_config
 from lslam.core.errors import (
@@ -23,11 +24,10 @@ from lslam.core.errors import (
     cause,
 )
 from lslam.core.printable import printable_tree, shown
+from lslam.core.types.imu import WheelStream
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
-from lslam.core.types.wheels import WheelStream
 from lslam.core.untrusted import MISFIT, parse_json, parse_toml
-from lslam.core.version import __version__
 from lslam.io.readers import open_sequence
 from lslam.io.remote import RemotePath
 from lslam.osm.source import extract_digest

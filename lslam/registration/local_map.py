@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
-from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
+from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
 from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
 from lslam.registration.gaussian_map import GaussianMap

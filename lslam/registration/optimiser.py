@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimmed
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from lslam.core.kernels.significance import OUTLIER_SIGMAS, SIGNIFICANT_SIGMAS
+from lslam.core.kernels.linearisation import OUTLIER_SIGMAS, SIGNIFICANT_SIGMAS
 from lslam.core.types.state import Stateful
 
 # Of what was lately, what stays from scan to scan: a memory of five.

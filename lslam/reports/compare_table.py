@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lslam.core import __version__
 from lslam.core.printable import counted, fixed, metres
 from lslam.core.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.reports.evaluations import strict
 from lslam.reports.text import Grid, aligned, comma_separated, latex, markdown

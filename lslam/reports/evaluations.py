@@ -12,9 +12,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from lslam.core import __version__
 from lslam.core.printable import significant
 from lslam.core.types.run_record import Crispness, RunRecord
-from lslam.core.version import __version__
 from lslam.evaluation.evaluate import METRICS, shown_metrics
 from lslam.evaluation.metric import Evaluation, MetricRow
 from lslam.evaluation.timing import StageTime, Timing

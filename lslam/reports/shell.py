@@ -10,7 +10,7 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from lslam.core.version import __version__
+from lslam.core import __version__
 
 if TYPE_CHECKING:
     from jinja2 import Environment, Template

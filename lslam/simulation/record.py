@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.errors import OutputError, OutputExistsError, cause
 from lslam.core.types.scan import Scan
 from lslam.core.untrusted import parse_json
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.kitti_layout import (
     PER_POINT,

@@ -15,11 +15,10 @@ from lslam.core.errors import UsageError
 from lslam.core.geometry import portable, se3, so3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
-from lslam.core.types.imu import ImuStream
+from lslam.core.types.imu import ImuStream, WheelStream
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration, Scans
 from lslam.core.types.trajectory import Trajectory
-from lslam.core.types.wheels import WheelStream
 from lslam.simulation.built_scenario import build_scenario, check_path, populate
 from lslam.simulation.city import City
 from lslam.simulation.imu import ImuModel, imu_named

@@ -8,7 +8,7 @@ import numpy as np
 
 from lslam.core.geometry import portable, se3
 from lslam.core.types.arrays import Floats
-from lslam.core.types.wheels import WheelStream
+from lslam.core.types.imu import WheelStream
 from lslam.simulation.kinematics import Motion
 
 # Middle of the rear axle below the LiDAR on KITTI's car: it hardly moves sideways.

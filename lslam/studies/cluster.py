@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from lslam.core import __version__
 from lslam.core.errors import InputError, OutputError, RunFailedError, UsageError, cause
 from lslam.core.extras import install_command
 from lslam.core.untrusted import whole_number
-from lslam.core.version import __version__
 from lslam.io.remote import RemotePath, as_path
 from lslam.studies.grid import Job
 from lslam.studies.jobs import clear_attempt, ensure_state, simulate_scenes

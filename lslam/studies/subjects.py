@@ -11,11 +11,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.config.input import AS_CONFIGURED, InputConfig, ScanRange
 from lslam.core.errors import InputError, OutputExistsError, UsageError, nearest
 from lslam.core.printable import file_safe
-from lslam.core.version import __version__
 from lslam.io.readers import open_sequence
 from lslam.io.readers.lookup import find_folder
 from lslam.simulation.scenario_files import scenario_named

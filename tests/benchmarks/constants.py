@@ -38,7 +38,7 @@ PATH: dict[str, tuple[str, ...]] = {
         "odometry/uncertainty.py", "odometry/frontend/windows.py", "odometry/inertial/course.py", "odometry/icp.py",
         "registration/preprocessing/prepare.py", "registration/preprocessing/deskew.py", "registration/preprocessing/ground.py",
         "core/kernels/gauss_newton.py", "core/kernels/gaussians.py", "core/kernels/residuals.py", "core/kernels/ground.py",
-        "core/kernels/significance.py", "core/kernels/voxel.py",
+        "core/kernels/linearisation.py", "core/kernels/voxel.py",
     ),
     "features": (
         "odometry/feature_*.py", "odometry/loam.py", "registration/preprocessing/features.py",
@@ -56,7 +56,7 @@ PATH: dict[str, tuple[str, ...]] = {
 NOT_OF_IT = {
     "registration/source_covariance.py", "registration/voxel_target.py SPARSE_SHARE",
     "registration/start_search.py NO_PLANES", "core/kernels/voxel.py OFFSET", "core/kernels/voxel.py MASK",
-    "core/kernels/gaussians.py FREE", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
+    "core/kernels/gaussians.py FREE", "core/kernels/linearisation.py COUNT", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
     "core/kernels/ground.py NO_HEIGHT", "odometry/kernels/lines.py NO_LINE", "registration/kernels/curvature.py EDGE",
     "registration/kernels/curvature.py LESS_EDGE", "registration/kernels/curvature.py NEITHER",
     "registration/kernels/curvature.py LESS_PLANE", "registration/kernels/curvature.py PLANE",

@@ -17,7 +17,7 @@ import tables
 from traced import Traced, run_on, traced
 
 from lslam.core.geometry import se3
-from lslam.core.types.wheels import WheelStream
+from lslam.core.types.imu import WheelStream
 from lslam.simulation.scenarios import simulate
 from lslam.simulation.wheels import WheelModel
 

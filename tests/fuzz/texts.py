@@ -11,12 +11,12 @@ from fuzz.cases import Files, Parser
 from osm_builders import ExtractMaker
 
 from lslam.backend.manual import read_control_points, read_named_pairs
+from lslam.core import __version__
 from lslam.core.config import load_config
 from lslam.core.config.config import to_toml
 from lslam.core.config.study import read_batch, read_study
 from lslam.core.errors import LslamError
 from lslam.core.types.study import StudyRow
-from lslam.core.version import __version__
 from lslam.evaluation.timing import read_timing
 from lslam.io.formats.calibration_files import read_cam0_lidar, read_mcd_extrinsics, read_transform
 from lslam.io.formats.geojson import read_line

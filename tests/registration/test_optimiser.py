@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import UsageError
 from lslam.core.geometry import se3, so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linearisation import Floats, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import Voxels, add_row, nearest, octant_slots

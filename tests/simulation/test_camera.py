@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from lslam.core.geometry import se3
-from lslam.core.kernels.projection import project_all
 from lslam.core.types.camera import Lens, cameras_of
 from lslam.io.readers import open_sequence
+from lslam.maps.kernels.views import project_all
 from lslam.simulation.camera import COLOURS, CameraModel, SimulatedCamera
 from lslam.simulation.record import record
 from lslam.simulation.scenarios import SimulatedDrive, simulate

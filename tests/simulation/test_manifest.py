@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lslam.core import __version__
 from lslam.core.errors import OutputError
-from lslam.core.version import __version__
 from lslam.simulation import record as recording
 from lslam.simulation.record import MANIFEST, record
 from lslam.simulation.scenario_files import Scenario

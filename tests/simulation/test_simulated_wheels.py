@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lslam.core.types.wheels import WheelStream
+from lslam.core.types.imu import WheelStream
 from lslam.io.readers import open_sequence
 from lslam.io.readers.wheels import read_wheels
 from lslam.simulation.record import record

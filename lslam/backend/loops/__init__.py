@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from lslam.core.plugins import factory, require
+from lslam.core.extras import factory, require
 
 if TYPE_CHECKING:
     from lslam.backend.loops.descriptor import PlaceDescriptor

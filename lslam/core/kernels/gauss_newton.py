@@ -6,10 +6,9 @@ import math
 
 import numpy as np
 
-from lslam.core.kernels.facts import INFORMATION, LEVER, MATCHED, POPULATION
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import eigen, extent, rotate_left
-from lslam.core.kernels.linearisation import Floats, Pose, Sums
+from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Floats, Pose, Sums
 from lslam.core.kernels.residuals import solve_on_surfaces
 
 Limits = tuple[float, float, float]

@@ -32,3 +32,15 @@ Search = tuple[Longs, Ints, Ints, Floats, Flags, Floats]
 Pose = tuple[Floats, Floats]
 Width = tuple[float, float, float]
 Sums = tuple[Floats, Floats, Floats, Floats]
+
+# Indices of `facts`, an array of `COUNT` sums over the points beside the normal equations: information of the correspondences,
+# 1/m2; squared residuals times robust weights, m2; points within the kernel's width; points with a correspondence; information
+# times squared lever arm; robust weights; relative weights of the points, 0 for residuals without them, see
+# `gauss_newton.scale_by_population`.
+INFORMATION, SQUARED, INLIERS, MATCHED, LEVER, ROBUST, POPULATION = range(7)
+COUNT = 7
+
+# A value stands out of its noise: one in twenty does by chance.
+SIGNIFICANT_SIGMAS = 2.0
+# A value is none of its noise: one in four hundred is by chance.
+OUTLIER_SIGMAS = 3.0

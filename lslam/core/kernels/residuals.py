@@ -6,12 +6,26 @@ import math
 
 import numpy as np
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, EMPTY, find
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
 from lslam.core.kernels.linalg import add_gradient, add_matrix, eigen
-from lslam.core.kernels.linearisation import Floats, Ints, Longs, Pose, Search, Settings, Sums, Width
-from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
+from lslam.core.kernels.linearisation import (
+    INFORMATION,
+    INLIERS,
+    LEVER,
+    MATCHED,
+    ROBUST,
+    SIGNIFICANT_SIGMAS,
+    SQUARED,
+    Floats,
+    Ints,
+    Longs,
+    Pose,
+    Search,
+    Settings,
+    Sums,
+    Width,
+)
 from lslam.core.kernels.voxel import hash_key, index_of, pack
 
 # Rows of planes, keys and table, see `gaussians`.

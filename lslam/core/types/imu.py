@@ -1,4 +1,4 @@
-"""Inertial values: measurements, the direction of gravity, errors of an IMU, and what links scans by it."""
+"""Readings of an IMU and of wheels, the direction of gravity, errors of an IMU, and what links scans by it."""
 
 from __future__ import annotations
 
@@ -232,3 +232,20 @@ class InertialChain:
         """That of the first `count` keyframes; None without a link."""
         links = [link for link in self.links if max(link.a, link.b) < count]
         return replace(self, links=links) if links else None
+
+
+@dataclass(frozen=True)
+class WheelStream:
+    """Speeds of a vehicle by its wheels.
+
+    stamps_ns : (M,) int64, increasing; speed : (M,) m/s, forwards; yaw_rate : (M,) rad/s, None where it was not measured
+    T_lidar_base : (4, 4) the frame of which they are the speeds, x forward and z up; None where nothing says where it sits
+    """
+
+    stamps_ns: Longs
+    speed: Floats
+    yaw_rate: Floats | None = None
+    T_lidar_base: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core import __version__
 from lslam.core.errors import InputError, OutputError, cause
 from lslam.core.extras import importing
 from lslam.core.labels import asprs_table
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import BLOCK, TIME_NS, ArrayCloud, Cloud, CloudBlock, Columns, in_memory
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.copc_files import INFO, INFO_BYTES, USER_ID, copc_bytes, is_copc
 from lslam.io.formats.gps_time import gps_time_s, unix_time_ns

@@ -13,8 +13,7 @@ from lslam.core.errors import InputError
 from lslam.core.printable import shown
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
-from lslam.core.types.imu import ImuStream
-from lslam.core.types.wheels import WheelStream
+from lslam.core.types.imu import ImuStream, WheelStream
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.text_tables import read_table
 from lslam.io.formats.time_columns import find_clock, unread_columns

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.core.errors import InputError, LslamError, UsageError, cause
-from lslam.core.plugins import load, registered
+from lslam.core.extras import load, registered
 from lslam.io.formats.bag_listing import holds_recording
 from lslam.io.readers.lookup import find_folder
 from lslam.io.remote import RemotePath

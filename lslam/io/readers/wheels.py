@@ -9,8 +9,8 @@ import numpy as np
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.imu import WheelStream
 from lslam.core.types.sequence import Sequence
-from lslam.core.types.wheels import WheelStream
 from lslam.io.formats.bag_files import Bag
 from lslam.io.formats.bag_streams import read_twists
 from lslam.io.formats.stamped_csv import read_wheels_csv

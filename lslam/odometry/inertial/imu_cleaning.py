@@ -8,8 +8,7 @@ from enum import StrEnum
 import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.imu import GRAVITY, ImuStream
-from lslam.core.types.wheels import WheelStream
+from lslam.core.types.imu import GRAVITY, ImuStream, WheelStream
 from lslam.odometry.inertial.saturation import with_hidden
 from lslam.odometry.kernels.strapdown import overlaps
 

@@ -10,11 +10,10 @@ import numpy as np
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats
-from lslam.core.types.imu import GRAVITY
+from lslam.core.types.imu import GRAVITY, WheelStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.state import State
-from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, ConstantVelocity, middle_of
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from lslam.core.geometry import se3
-from lslam.core.kernels.significance import OUTLIER_SIGMAS
+from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan_result import OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
 from lslam.odometry.integrity.directions import EMPTIED_SHARE

@@ -12,10 +12,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.gaussians import find
 from lslam.core.kernels.jit import inline, kernel
-from lslam.core.kernels.linearisation import Pose, Sums, Width
+from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Sums, Width
 from lslam.core.kernels.residuals import add_facts, add_row, add_surface, place
 from lslam.core.kernels.voxel import index_of, pack
 from lslam.odometry.kernels.feature_grid import Matches, counterparts

@@ -13,10 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import plane_of
-from lslam.core.kernels.linearisation import Pose, Sums, Width
+from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Sums, Width
 from lslam.core.kernels.residuals import TILT_FACTOR, add_facts, add_row, octant_slots, place
 from lslam.core.kernels.voxel import MASK, OFFSET
 

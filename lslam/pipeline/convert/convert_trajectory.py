@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.errors import InputError, OutputExistsError, UsageError
 from lslam.core.extras import importing, install_hint
 from lslam.core.geometry import se3
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.sequence import Calibration
 from lslam.core.types.trajectory import Trajectory
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.sequence_toml import FRAMES
 from lslam.io.formats.text_tables import utc_of

@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core import __version__
 from lslam.core.errors import InputError, OutputExistsError, UsageError
 from lslam.core.extras import install_command
 from lslam.core.printable import counted
 from lslam.core.untrusted import MISFIT
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.geotiff import write_geotiff
 from lslam.io.formats.las_files import write_las

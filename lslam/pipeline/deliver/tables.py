@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.errors import input_errors
 from lslam.core.geometry import so3
 from lslam.core.types.arrays import Floats
 from lslam.core.untrusted import MISFIT
-from lslam.core.version import __version__
 from lslam.io.formats.atomic import write_text
 from lslam.io.formats.text_tables import utc_of
 from lslam.pipeline.convert.to_gpkg import GeoLayer, building_layers, pose_layers

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from lslam.core import __version__
 from lslam.core.printable import counted, fixed
-from lslam.core.version import __version__
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import Projection
 from lslam.pipeline.deliver.survey import FINISHED, Survey

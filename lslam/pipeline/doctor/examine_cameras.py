@@ -197,7 +197,7 @@ def _scores(
     """Mean strength of the image's edges at the edges of depth (T, 2R+1, 2R+1), by time, rows and columns of the shift."""
     from scipy.ndimage import gaussian_gradient_magnitude
 
-    from lslam.core.kernels.projection import project_all, shifted_means
+    from lslam.maps.kernels.views import project_all, shifted_means
 
     strength = gaussian_gradient_magnitude(image.mean(axis=2), 1.0)
     # A bright edge is no better an edge than a dim one.

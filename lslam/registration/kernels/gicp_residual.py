@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INLIERS, MATCHED
 from lslam.core.kernels.jit import inline, kernel
 from lslam.core.kernels.linalg import invert_symmetric, rotate_symmetric
-from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.linearisation import INLIERS, MATCHED, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import (
     Voxels,
     add_facts,

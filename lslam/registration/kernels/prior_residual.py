@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import MATCHED, POPULATION
 from lslam.core.kernels.jit import kernel
-from lslam.core.kernels.linearisation import Pose, Sums, Width
+from lslam.core.kernels.linearisation import MATCHED, POPULATION, Pose, Sums, Width
 
 Floats = NDArray[np.float64]
 

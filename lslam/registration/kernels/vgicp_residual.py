@@ -5,11 +5,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.kernels.facts import INFORMATION, INLIERS, LEVER, MATCHED, POPULATION, ROBUST, SQUARED
 from lslam.core.kernels.gaussians import BLOB, EMPTY
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linalg import add_gradient, add_matrix, rotate_symmetric
-from lslam.core.kernels.linearisation import Pose, Search, Settings, Sums, Width
+from lslam.core.kernels.linearisation import (
+    INFORMATION,
+    INLIERS,
+    LEVER,
+    MATCHED,
+    POPULATION,
+    ROBUST,
+    SQUARED,
+    Pose,
+    Search,
+    Settings,
+    Sums,
+    Width,
+)
 from lslam.core.kernels.residuals import nearest, octant_slots, place, thin_information
 from lslam.registration.kernels.discs import EXTENT_M2
 from lslam.registration.kernels.gicp_residual import certainty_of_pair

@@ -13,7 +13,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import so3
-from lslam.core.kernels.significance import SIGNIFICANT_SIGMAS
+from lslam.core.kernels.linearisation import SIGNIFICANT_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.registration.kernels import curvature

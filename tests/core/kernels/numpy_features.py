@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from numpy_features import Match, gradient, match_edge, match_plane, match_point, nearest, normal_equations
 
 from lslam.core.geometry import se3, so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.voxel import OFFSET
 from lslam.odometry.feature_map import no_counterparts

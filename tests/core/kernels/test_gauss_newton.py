@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
 from lslam.core.kernels import gauss_newton
+from lslam.core.kernels import linearisation as at
 
 Floats = NDArray[np.float64]
 # Of what makes a direction weak: with less of it, it is not followed either.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from numpy_features import Match, gradient, normal_equations
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.odometry.feature_map import MIN_LINE_POINTS
 from lslam.odometry.kernels import lines
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap

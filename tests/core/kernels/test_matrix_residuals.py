@@ -12,7 +12,7 @@ from numpy_residuals import EXTENT2, GemanMcClure, Magnusson, Pair, disc_pairs, 
 from numpy_voxels import VoxelMap
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.kernels.discs import source_discs
 from lslam.registration.optimiser import Correspondences

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.registration.kernels.prior_residual import linearise
 
 Floats = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from numpy_voxels import Match, VoxelMap, matches
 
 from lslam.core.geometry import so3
-from lslam.core.kernels import facts as at
+from lslam.core.kernels import linearisation as at
 from lslam.core.kernels import residuals
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Correspondences

@@ -11,7 +11,7 @@ from bag_builders import START_NS, Fill, bag, clouds, together, transforms
 
 from lslam.core.errors import InputError, LslamError, UsageError
 from lslam.core.geometry import se3, so3
-from lslam.core.types.wheels import WheelStream
+from lslam.core.types.imu import WheelStream
 from lslam.io.formats.stamped_csv import read_wheels_csv, write_wheels_csv
 from lslam.io.readers import open_sequence
 from lslam.io.readers.wheels import read_wheels

@@ -9,8 +9,8 @@ import pytest
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.imu import WheelStream
 from lslam.core.types.scan import Span
-from lslam.core.types.wheels import WheelStream
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.inertial.wheel_calibration import OFFSET_S, YAW_OFFSET, YAW_SCALE, WheelCalibration, learnt
 from lslam.odometry.inertial.wheel_motion import WheelMotion

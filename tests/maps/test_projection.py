@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lslam.core.kernels.projection import project_all
 from lslam.core.types.camera import Lens
+from lslam.maps.kernels.views import project_all
 
 SIZE, INTRINSICS = (640, 480), (400.0, 410.0, 319.5, 239.5)
 LENSES = {
