@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field, model_validator
 
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Floats
 from lslam.simulation import furniture

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 from lslam.core.geometry import portable, se3, so3
 from lslam.core.types.arrays import Floats
 from lslam.simulation.curve import interpolating_spline

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 from lslam.core.geometry import portable
 from lslam.core.types.arrays import Bools, Floats
 from lslam.simulation.lidar_models import LidarModel

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from lslam.core.config.config import setting_value, shipped
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.core.geometry import portable
 from lslam.core.printable import toml_text

@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 
 from lslam.core.config import load_config
 from lslam.core.config.config import explain, shipped
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, nearest
 from lslam.core.geometry import geodesy, se2
 from lslam.core.printable import file_safe, significant

@@ -56,7 +56,8 @@ PATH: dict[str, tuple[str, ...]] = {
 NOT_OF_IT = {
     "registration/source_covariance.py", "registration/voxel_target.py SPARSE_SHARE",
     "registration/start_search.py NO_PLANES", "core/kernels/voxel.py OFFSET", "core/kernels/voxel.py MASK",
-    "core/kernels/gaussians.py FREE", "core/kernels/linearisation.py COUNT", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
+    "core/kernels/gaussians.py FREE", "core/kernels/gaussians.py EMPTY", "core/kernels/gaussians.py BLOB",
+    "core/kernels/linearisation.py COUNT",
     "core/kernels/ground.py NO_HEIGHT", "odometry/kernels/lines.py NO_LINE", "registration/kernels/curvature.py EDGE",
     "registration/kernels/curvature.py LESS_EDGE", "registration/kernels/curvature.py NEITHER",
     "registration/kernels/curvature.py LESS_PLANE", "registration/kernels/curvature.py PLANE",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 from lslam.core.labels import parse_classes
 
 

@@ -32,77 +32,6 @@ from lslam.core.untrusted import is_file, parse_toml
 SUMMARY, BASE = "summary", "base"
 Tree = dict[str, Any]
 
-# Keys of earlier versions, and what became of them.
-REMOVED = {
-    "odometry.max_failures": "a lost run begins a new segment and goes on to its last scan; leave the key out",
-    "registration.min_inliers": "a scan is compared with what agreed in this recording before (registration.min_agreement); "
-    "leave the key out",
-    "registration.start_overlap": "registration.min_overlap holds from the first scan on",
-}
-# Keys of earlier versions that nobody had a reason to turn: the value that they have in all runs, and what to turn instead, if
-# there is such a key. The register of constants (docs/algorithms.md) has their names in the code, and why they are as they are.
-FIXED: dict[str, tuple[Any, str]] = {
-    "preprocess.ground_slope": (0.2, ""),
-    "preprocess.ground_tolerance": (0.25, ""),
-    "preprocess.denoise_neighbours": (10, ""),
-    "preprocess.denoise_deviations": (2.0, ""),
-    "preprocess.standing_m": (0.02, ""),
-    "preprocess.standing_deg": (0.1, ""),
-    "registration.min_points": (6, "registration.voxel_size"),
-    "registration.planarity": (0.3, "registration.voxel_size"),
-    "registration.count_cap": (200, ""),
-    "registration.kernel_min": (0.15, "registration.kernel_max"),
-    "registration.kernel_decay": (0.5, "registration.max_iterations"),
-    "registration.start_iterations": (40, "registration.start_scans"),
-    "registration.coarse_factor": (3, "registration.voxel_size"),
-    "registration.coarse_kernel": (5.0, "registration.start_reach"),
-    "registration.coarse_decay": (0.85, ""),
-    "registration.recover_m": (0.3, "recovery.coarse_to_fine"),
-    "registration.recover_deg": (3.0, "recovery.coarse_to_fine"),
-    "loam.max_edge_points": (2, "loam.regions"),
-    "loam.max_less_edge_points": (20, "loam.regions"),
-    "loam.edge_curvature": (1.0, "loam.regions"),
-    "loam.planar_curvature": (0.5, "loam.max_planar_points"),
-    "loam.edge_noise": (4.0, "loam.regions"),
-    "loam.edge_sigma": (0.15, ""),
-    "loam.occlusion": (0.3, ""),
-    "loam.parallel_deg": (80.0, ""),
-    "loam.ground_angle_deg": (10.0, ""),
-    "loam.segment_angle_deg": (60.0, ""),
-    "loam.segment_points": (30, ""),
-    "loam.small_segment_points": (5, ""),
-    "loam.small_segment_rings": (3, ""),
-    "lio_sam.keyframes": (25, ""),
-    "lio_sam.keyframe_m": (1.0, ""),
-    "lio_sam.keyframe_deg": (10.0, ""),
-    "lio_sam.reset_scans": (100, ""),
-    "imu.gap_s": (0.1, ""),
-    "wheels.gap_s": (0.2, ""),
-    "loops.known_within": (10.0, ""),
-    "loops.sigmas": (3.0, "loops.drift_percent"),
-    "loops.rings": (20, "loops.descriptor"),
-    "loops.sectors": (60, "loops.descriptor"),
-    "loops.reach": (80.0, "loops.descriptor"),
-    "graph.probability": (0.999, "graph.robust"),
-    "graph.max_iterations": (100, ""),
-    "graph.fitness_sigma_m": ([0.1, 5.0], "graph.fitness_limit"),
-    "graph.fitness_sigma_rad": ([0.05, 0.2], "graph.fitness_limit"),
-    "graph.fitness_gain": (20.0, "graph.fitness_limit"),
-    "gnss.min_sigma": (0.02, "gnss.sigma"),
-    "gnss.vertical": (1.8, "gnss.sigma"),
-    "gnss.min_fixes": (5, ""),
-    "osm.connect_timeout": (10.0, "osm.timeout"),
-    "osm.backoff": (5.0, "osm.attempts"),
-    "osm.wall_range": (60.0, ""),
-    "osm.wall_tilt_deg": (15.0, ""),
-    "osm.wall_gap": (1.0, ""),
-    "osm.min_cluster": (20, "osm.min_length"),
-    "osm.line_weight": (0.25, ""),
-    "osm.min_start_coverage": (0.6, ""),
-    "osm.min_building_coverage": (0.1, "osm.min_coverage"),
-    "debug.drift_tilt_deg_per_100m": (0.0, ""),
-}
-
 
 class Config(FrontEndConfig):
     """All sections; the defaults are one configuration for every sensor."""
@@ -302,22 +231,26 @@ def _merge(tree: Tree, more: Tree, where: str, *, is_file: bool = False) -> None
         assert isinstance(model, type)
         assert issubclass(model, BaseModel)
         for key, value in values.items():
-            name = f"{section}.{key}"
-            if is_file and name in FIXED and value == FIXED[name][0]:
+            if key in model.model_fields:
+                tree.setdefault(section, {})[key] = value
                 continue
-            if outcome := _outcome(name):
-                raise ConfigError(f"{where}: there is no {name} any more: {outcome}")
-            if key not in model.model_fields:
+            former = former_keys().get(section, {}).get(key)
+            if former is None:
                 raise ConfigError(f"{where}: unknown key {section}.{key}; {nearest(key, model.model_fields)}")
-            tree.setdefault(section, {})[key] = value
+            if not is_file or value != former.get("value"):
+                raise ConfigError(f"{where}: there is no {section}.{key} any more: {_outcome(**former)}")
 
 
-def _outcome(name: str) -> str:
-    """What became of a key of an earlier version, and what to do; empty for any other."""
-    if name not in FIXED:
-        return REMOVED.get(name, "")
-    value, instead = FIXED[name]
-    return f"it is {value} in all runs; " + (f"turn {instead} instead" if instead else "leave the key out")
+@cache
+def former_keys() -> dict[str, dict[str, dict[str, Any]]]:
+    """Keys of earlier versions by section: the value that they have in all runs now, or what became of them."""
+    return parse_toml(resources.files("lslam.core.config").joinpath("former_keys.toml").read_text(encoding="utf-8"))
+
+
+def _outcome(outcome: str = "", value: Any = None, instead: str = "") -> str:
+    """What became of a key of an earlier version, and what to do."""
+    way_out = f"turn {instead} instead" if instead else "leave the key out"
+    return outcome or f"it is {value} in all runs; {way_out}"
 
 
 def explain(error: ValidationError, where: str = "configuration") -> str:

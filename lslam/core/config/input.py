@@ -1,15 +1,33 @@
-"""Sections `input` and `preprocess`: which scans are read, and what is done to one by itself."""
+"""What every section of the configuration shares; sections `input` and `preprocess`, of the scans that are read."""
 
 from __future__ import annotations
 
 import re
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator, model_validator
 
-from lslam.core.config.section import Section
 from lslam.core.labels import parse_classes
 from lslam.core.machine import available_cores
+
+
+class Section(BaseModel):
+    """A frozen section: unknown keys are errors, values are checked, and nothing changes after the start of a run."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+    def changed(self, since: Section | None = None) -> list[str]:
+        """Keys whose values differ from those of `since`, None: from the defaults, in the order of the section."""
+        fields = type(self).model_fields
+        before = {key: field.get_default() if since is None else getattr(since, key) for key, field in fields.items()}
+        return [key for key in fields if getattr(self, key) != before[key]]
+
+    def require_order(self, low: str, high: str) -> None:
+        """Raise ValueError unless the value of key `low` lies below that of `high`."""
+        a, b = getattr(self, low), getattr(self, high)
+        if not a < b:
+            raise ValueError(f"{low} = {a} must be less than {high} = {b}")
+
 
 RINGS = re.compile(r"(auto|field|order)|(rows|elevation)(?::([1-9]\d{0,2}))?")
 

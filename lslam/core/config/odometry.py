@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from lslam.core.config.input import InputConfig, PreprocessConfig
-from lslam.core.config.section import Section
+from lslam.core.config.input import InputConfig, PreprocessConfig, Section
 
 # Methods whose estimate is of points and IMU together.
 TIGHTLY_COUPLED = ("fast-lio", "fast-lio2", "lio-sam", "lio-mapping", "lips")

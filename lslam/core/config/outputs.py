@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from lslam.core.config.section import Section
+from lslam.core.config.input import Section
 
 ATTRIBUTES = ("time", "scan", "ring", "range", "observations", "class")
 FINEST_M = 0.01

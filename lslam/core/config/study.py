@@ -11,8 +11,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from lslam.core.config.config import explain, read_toml
-from lslam.core.config.input import ScanRange
-from lslam.core.config.section import Section
+from lslam.core.config.input import ScanRange, Section
 from lslam.core.errors import ConfigError, nearest
 
 Kind = Literal[
