@@ -283,7 +283,7 @@ def _size(rest: Floats) -> float:
 def warm_up() -> None:
     """Compile or load what the first scans would otherwise wait for."""
     wheels = WheelStream(np.arange(20, dtype=np.int64) * 20_000_000, np.ones(20), np.zeros(20))
-    motion = WheelMotion(wheels, 1.0)
+    motion = WheelMotion(wheels)
     for k in range(3):
         prior = motion.sweep(100_000_000 * k, Span())
         result = RegistrationResult(prior.pose, covariance=1e-4 * np.eye(6))
