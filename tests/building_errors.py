@@ -62,7 +62,7 @@ def _error(
     stands = carried(middle + correction.displacement[:2]) + shift
     away = stands - on_map - real[:2]
     values, axes = np.linalg.eigh(correction.covariance[:2, :2])
-    turn = float(se2.wrapped(correction.displacement[2] - real[2]))
+    turn = float(se2.wrap(correction.displacement[2] - real[2]))
     return BuildingError(
         correction.building.osm_id, correction.status, int((np.sqrt(values) < HELD).sum()),
         float(np.linalg.norm(real[:2])), float(np.linalg.norm(away)), float(abs(away @ axes[:, 0])), turn,

@@ -15,7 +15,7 @@ import pytest
 from numba.core import event
 
 from lslam.core.kernels.jit import kernel
-from lslam.core.stopping import Interrupt, heeded
+from lslam.core.stopping import Interrupt, handle_signals
 
 
 class Hit:
@@ -41,7 +41,7 @@ def test_an_interrupt_that_python_would_ignore_comes_again(
         lost.append(time.monotonic())
         time.sleep(20)
 
-    with heeded(), pytest.raises(KeyboardInterrupt):
+    with handle_signals(), pytest.raises(KeyboardInterrupt):
         be_hit()
     assert lost, "the interrupt was raised in the finaliser: this test proves nothing"
     assert time.monotonic() - lost[0] < 5
@@ -56,7 +56,7 @@ def test_other_errors_of_finalisers_are_reported_as_ever() -> None:
     seen = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.unraisablehook", lambda lost: seen.append(lost.exc_type))
-        with heeded():
+        with handle_signals():
             Broken()
     assert seen == [ValueError]
 
@@ -82,7 +82,7 @@ def test_what_is_raised_while_a_kernel_runs_is_an_interrupt_and_nothing_else() -
     for k in range(60):
         try:
             # Set outside, it could come outside on a machine that is busy, and end pytest.
-            with heeded():
+            with handle_signals():
                 signal.setitimer(signal.ITIMER_REAL, 0.002 + k * 1e-5)
                 work()
         except BaseException as error:
@@ -117,7 +117,7 @@ def test_compiling_is_left_between_two_passes_and_the_kernel_compiles_afterwards
     def doubled(x: float) -> float:
         return 2 * x
 
-    with heeded(), pytest.raises(Interrupt) as raised, event.install_listener("numba:run_pass", Struck()):
+    with handle_signals(), pytest.raises(Interrupt) as raised, event.install_listener("numba:run_pass", Struck()):
         doubled(1.0)
     assert len(passes) == 10
     assert raised.traceback[-2].frame.f_globals["__name__"] == "numba.core.compiler_machinery"
@@ -134,6 +134,6 @@ def test_what_comes_in_llvm_is_raised_when_it_is_left() -> None:
         seen.append(module.strike(lambda: signal.raise_signal(signal.SIGINT)))
         seen.append("too late")
 
-    with heeded(), pytest.raises(Interrupt):
+    with handle_signals(), pytest.raises(Interrupt):
         work()
     assert seen == ["whole"]

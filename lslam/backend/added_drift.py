@@ -138,7 +138,7 @@ def _moved(results: Sequence[ScanResult], poses: Floats) -> list[ScanResult]:
     turns = so3.normalise(poses[:, :3, :3] @ np.stack([r.T_world_lidar[:3, :3].T for r in results]))
 
     def turned(covariance: Floats | None, R: Floats) -> Floats | None:
-        return None if covariance is None else noise.rotated(covariance, R)
+        return None if covariance is None else noise.rotate(covariance, R)
 
     return [
         replace(

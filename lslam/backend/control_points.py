@@ -20,7 +20,7 @@ from lslam.core.errors import GraphError, UsageError
 from lslam.core.geometry import geodesy, noise, se3, so3
 from lslam.core.geometry.noise import quantile
 from lslam.core.geometry.se3 import poses_at
-from lslam.core.printable import counted
+from lslam.core.printable import count_of
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
 from lslam.core.types.gnss import Georeference
@@ -64,7 +64,7 @@ def with_control(
         if T is None:
             return replace(
                 placement,
-                problem=f"control points: from {counted(len(points), 'place')} nobody can say which way the run goes; it "
+                problem=f"control points: from {count_of(len(points), 'place')} nobody can say which way the run goes; it "
                 "takes two that lie apart",
             )
         tilt = LEVELLED if up is not None else UNLEVELLED
@@ -236,7 +236,7 @@ def where_held(
         log.debug("known pairs and control points alone: %s", error)  # said where all of it is solved
         return keyframes
     return [
-        replace(k, T_world_lidar=T, covariance=None if k.covariance is None else noise.rotated(k.covariance, R))
+        replace(k, T_world_lidar=T, covariance=None if k.covariance is None else noise.rotate(k.covariance, R))
         for k, T in zip(keyframes, poses, strict=True)
     ]
 

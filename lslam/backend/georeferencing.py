@@ -150,7 +150,7 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
     """The graph in east, north, up, anchored by its fixes instead of its first pose."""
     assert placement.georeference is not None
     T = placement.georeference.T_enu_world
-    spread = None if graph.spread is None else noise.rotated(graph.spread, T[:3, :3])
+    spread = None if graph.spread is None else noise.rotate(graph.spread, T[:3, :3])
     up = np.array([0.0, 0.0, 1.0])
     return replace(
         graph,
@@ -298,7 +298,7 @@ def _fix_noise(
     good = alignment.inliers
     if not (fixes.is_stated or fixes.is_refuted):
         return None, 0.0
-    constant, unit = (noise.rotated(chain, alignment.T_enu_world[:3, :3]) for chain in chains(graph, config.graph))
+    constant, unit = (noise.rotate(chain, alignment.T_enu_world[:3, :3]) for chain in chains(graph, config.graph))
     metre = drift_covariance(1.0, config.graph)
     places = se3.apply(alignment.T_enu_world, graph.poses[:, :3, 3])
     drift = DriftOfFixes(constant + graph.walk * unit, unit, places, metre, _owners(fixes, keyframes)[good])

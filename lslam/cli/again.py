@@ -27,7 +27,7 @@ def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> Non
     out = given["out"] or folder.absolute().with_name(f"{folder.absolute().name}-again")
     if isinstance(out, RemotePath):
         raise UsageError(f"--out {out}: --again compares folders of this machine, name one")
-    from lslam.core.types.warned import hearing
+    from lslam.core.types.warned import collect_warnings
     from lslam.io.readers import open_sequence
     from lslam.pipeline.again import (
         compare_results,
@@ -72,7 +72,7 @@ def run_again(folder: Path, recording: str | None, given: dict[str, Any]) -> Non
         if given["strict"] and not found.is_same:
             raise GateError(f"--strict: {out} differs from {folder}: {said}")
 
-    with hearing(), helped():
+    with collect_warnings(), helped():
         tell([*recipe.notes, *other_programs(recipe)])
         with progress("opening"):
             opened = open_sequence(

@@ -15,7 +15,7 @@ import click
 from lslam.core import __version__
 from lslam.core.errors import LslamError, cause, nearest, sentence
 from lslam.core.machine import pin_blas
-from lslam.core.stopping import heeded, is_interrupt, is_too_late
+from lslam.core.stopping import handle_signals, is_interrupt, is_too_late
 
 # name -> one line for --help; the module lslam.cli.<name> has the click command `command`.
 COMMANDS = {
@@ -125,7 +125,7 @@ def main() -> NoReturn:
 
         begin_events()  # before the options are read, of which one may be wrong
     # SIGTERM ends lslam as Ctrl-C does, with exit code 130 and without partly written files.
-    with heeded(), _exit_codes():
+    with handle_signals(), _exit_codes():
         code = cli(standalone_mode=False)
         is_too_late()
     sys.exit(code if isinstance(code, int) else 0)

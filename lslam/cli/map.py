@@ -13,7 +13,7 @@ import click
 from lslam.cli import options
 from lslam.cli.console import progress, setup_logging, show
 from lslam.core.errors import UsageError
-from lslam.core.stopping import heeded
+from lslam.core.stopping import handle_signals
 
 if TYPE_CHECKING:
     from lslam.core.types.gnss import OutputCrs
@@ -64,7 +64,7 @@ def compare_drives(target: Path, given: dict[str, Any]) -> None:
     scans = open_scans(new, given["sequence"], **options.reading_of(given))
     earlier = open_scans(old, given["against_sequence"], flag="--against-sequence")
     steps = len(old.trajectory) + len(new.trajectory)
-    with output_folder(folder, given["overwrite"]), heeded() as stop, progress("changes", steps) as advance:
+    with output_folder(folder, given["overwrite"]), handle_signals() as stop, progress("changes", steps) as advance:
         stop.is_gentle = True
         found = compare_runs((new, scans), (old, earlier), T, spool=folder, on_step=advance, should_stop=stop)
         write_changes(folder, found, new, old)
@@ -254,7 +254,7 @@ def _rebuild(target: Path, given: dict[str, Any]) -> None:
         return
     check_output(out or target / f"map.{run.config.map.format}", given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
-    with heeded() as stop, progress("map", len(run.trajectory)) as advance:
+    with handle_signals() as stop, progress("map", len(run.trajectory)) as advance:
         stop.is_gentle = True
         built = rebuild(run, sequence, out, overwrite=given["overwrite"], crs=crs, on_step=advance, should_stop=stop)
     rows = [("map", f"{built.path}: {built.points} points of {built.scans} scans")]
@@ -276,7 +276,7 @@ def _rebuild_tiles(run: EarlierRun, folder: Path, crs: OutputCrs | None, given: 
         raise UsageError("--tiles divides the points alone: leave out --mesh and --occupancy")
     check_tiles(folder, given["tiles"], given["overwrite"])
     sequence = open_scans(run, given["sequence"], **options.reading_of(given))
-    with heeded() as stop, progress("map", len(run.trajectory)) as advance:
+    with handle_signals() as stop, progress("map", len(run.trajectory)) as advance:
         stop.is_gentle = True
         index = rebuild_in_tiles(run, sequence, folder, given["tiles"], crs=crs, on_step=advance, should_stop=stop)
     tiles = len(index["tiles"])

@@ -14,7 +14,7 @@ import click
 
 from lslam.cli import options
 from lslam.cli.console import setup_logging, show
-from lslam.core.stopping import heeded
+from lslam.core.stopping import handle_signals
 
 
 @click.command(
@@ -65,7 +65,7 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
     config = load_config(given["config_file"], settings)
     from lslam.cli.one_run import watch_of
 
-    with heeded() as stop, ExitStack() as stack:
+    with handle_signals() as stop, ExitStack() as stack:
         watch = watch_of(stack, stop, lambda outcome: None)
         stop.is_gentle = True
         manifest = merge_into(
@@ -81,21 +81,21 @@ def command(runs: tuple[Path, ...], **given: Any) -> None:
 
 
 def _summary(out: Path, manifest: dict[str, Any]) -> str:
-    from lslam.core.printable import counted, metres
+    from lslam.core.printable import count_of, metres
 
-    lines = [f"merged, {counted(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]
+    lines = [f"merged, {count_of(len(manifest['sessions']), 'session')}", f"  {'status':<12} {manifest['status']}"]
     lines += [f"  {'':<12} {problem}" for problem in manifest["problems"]]
     for one in manifest["sessions"]:
         found = (
-            f"found by {one['votes']} of {counted(one['tried'], 'keyframe')} tried"
+            f"found by {one['votes']} of {count_of(one['tried'], 'keyframe')} tried"
             if one["tried"]
             else "gives the world"
         )
-        said = f"{counted(one['scans'], 'scan')}, {found}, {counted(one['loops_between'], 'loop')} with others"
+        said = f"{count_of(one['scans'], 'scan')}, {found}, {count_of(one['loops_between'], 'loop')} with others"
         if one["ate"] is not None:
             said += f"; ATE se3 {metres(one['ate'][0])} m alone, {metres(one['ate'][1])} m merged"
         lines.append(f"  {one['name']:<12} {said}")
     graph = manifest["graph"]
-    lines.append(f"  {'graph':<12} {graph['keyframes']} keyframes, {counted(graph['loops'], 'loop')} in all")
+    lines.append(f"  {'graph':<12} {graph['keyframes']} keyframes, {count_of(graph['loops'], 'loop')} in all")
     lines += [f"  {name:<12} {out / name}" for name in ("sessions", "report.html") if (out / name).exists()]
     return "\n".join(lines) + "\n"

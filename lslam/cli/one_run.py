@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from lslam.cli.console import Stages, log, show
 from lslam.core.errors import RunFinishedError
-from lslam.core.stopping import Stop, heeded
+from lslam.core.stopping import Stop, handle_signals
 from lslam.core.untrusted import parse_json
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def arguments_of(
     from lslam.cli.profiling import profiled
 
     try:
-        with heeded() as stop, profiled(given.get("profile")), ExitStack() as stack:
+        with handle_signals() as stop, profiled(given.get("profile")), ExitStack() as stack:
             watch = watch_of(stack, stop, finish or (lambda outcome: print_result(outcome, out, given["as_json"])))
             command = shlex.join(["lslam", *sys.argv[1:]])
             yield {

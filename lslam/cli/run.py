@@ -100,10 +100,10 @@ def command(sequence: str | None, **given: Any) -> None:
         return
     if sequence is None:
         raise click.UsageError("Missing argument 'SEQUENCE'.")
-    from lslam.core.types.warned import hearing
+    from lslam.core.types.warned import collect_warnings
     from lslam.pipeline.precompile import helped, start_helper
 
-    with hearing(), helped():
+    with collect_warnings(), helped():
         _check_folder(given)
         ahead = None if given["dry_run"] else partial(start_helper, if_cold=True)
         with progress("opening"), rarely_collecting():

@@ -255,10 +255,10 @@ def record_drive(
     is_filmed: bool = False,
 ) -> Written:
     """Record the drive in `out` with a progress bar, until a signal comes; arguments as of the command."""
-    from lslam.core.stopping import heeded
+    from lslam.core.stopping import handle_signals
     from lslam.simulation.record import record
 
-    with heeded() as stop, console.progress("simulating", len(drive) * (1 + is_filmed)) as advance:
+    with handle_signals() as stop, console.progress("simulating", len(drive) * (1 + is_filmed)) as advance:
 
         def on_scan(index: int) -> None:
             advance()

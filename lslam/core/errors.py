@@ -128,7 +128,7 @@ def output_errors(place: object) -> Iterator[None]:
         raise OutputError(f"{place} cannot be written: {cause(error)}") from None
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, candidates: Iterable[str]) -> str:
     """Sentence fragment suggesting the known names nearest to `name`, or listing the known ones.
 
     >>> nearest("kis-icp", ["icp", "kiss-icp"])
@@ -138,7 +138,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     >>> nearest("zzz", ["icp", "kiss-icp"])
     'known: icp, kiss-icp'
     """
-    names = {known_name.lower(): known_name for known_name in known}
+    names = {known_name.lower(): known_name for known_name in candidates}
     close = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.5)
     if not close:
         return "known: " + ", ".join(names.values())
@@ -147,6 +147,6 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f"did you mean {', '.join(others)} or {last}?" if others else f"did you mean {last}?"
 
 
-def _likeness(name: str, known: str) -> float:
+def _likeness(name: str, names: str) -> float:
     """0 to 1, as `get_close_matches` counts it."""
-    return difflib.SequenceMatcher(None, known, name.lower()).ratio()
+    return difflib.SequenceMatcher(None, names, name.lower()).ratio()

@@ -92,7 +92,7 @@ def importing_open3d() -> Iterator[None]:
 Table = Mapping[str, tuple[str, str]]
 
 
-def registered(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
+def find_plugins(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
     """What other packages register under `group`, by name; they cannot take the name of anything of our `own`.
 
     Of two packages with one name the first in the alphabet has it, whatever was installed last.
@@ -105,15 +105,15 @@ def registered(group: str, own: Mapping[str, object]) -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entries if entry.name not in own}
 
 
-def known(group: str, own: Table) -> dict[str, str]:
+def summarise(group: str, own: Table) -> dict[str, str]:
     """Names and one-line summaries, those of other packages included; nothing is imported."""
-    foreign = {name: f"from {entry.value}" for name, entry in registered(group, own).items()}
+    foreign = {name: f"from {entry.value}" for name, entry in find_plugins(group, own).items()}
     return {name: summary for name, (_, summary) in own.items()} | foreign
 
 
 def require(group: str, own: Table, name: str, what: str) -> None:
     """Raise UsageError with the nearest name when there is no `what` of this name; nothing is imported."""
-    if name not in own and name not in (names := known(group, own)):
+    if name not in own and name not in (names := summarise(group, own)):
         raise UsageError(f"no {what} {name!r}; {nearest(name, names)}")
 
 
@@ -123,7 +123,7 @@ def factory(group: str, own: Table, name: str, what: str) -> Callable[..., Any]:
         made: Callable[..., Any] = import_module(own[name][0]).create
         return made
     require(group, own, name, what)
-    return load(registered(group, own)[name], what)  # type: ignore[no-any-return]
+    return load(find_plugins(group, own)[name], what)  # type: ignore[no-any-return]
 
 
 def load(entry: EntryPoint, what: str) -> Any:

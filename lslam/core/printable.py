@@ -64,7 +64,7 @@ def metres(value: float) -> str:
     return f"{value:.3f}" if abs(value) >= 0.01 or value == 0 else f"{value:.4f}"
 
 
-def fixed(value: float, decimals: int) -> str:
+def with_decimals(value: float, decimals: int) -> str:
     """A number with fixed decimals, `n/a` when it is not finite."""
     return f"{value:.{decimals}f}" if math.isfinite(value) else "n/a"
 
@@ -91,12 +91,12 @@ def lasting(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
-def counted(number: int, noun: str) -> str:
+def count_of(number: int, noun: str) -> str:
     """A number with its noun, in the plural unless it is one."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def shown(names: Sequence[object]) -> str:
+def first_of(names: Sequence[object]) -> str:
     """The first of many, with commas between them.
 
     >>> shown([1, 2]), shown(range(20))

@@ -64,17 +64,19 @@ class Stop:
             self._come_again()
             return
         left = dropwhile(lambda named: _package(named[0]) not in _FOREIGN, names)
-        caller = next((f for name, f in left if _can_be_left(name)), None)
+        caller = next((f for name, f in left if _can_raise_in(name)), None)
         if caller is None:
             raise Interrupt
         _raise_after(caller)
 
-    def on_lost(self, lost: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableHookArgs], object]) -> None:
+    def on_lost(
+        self, hook_arguments: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableHookArgs], object]
+    ) -> None:
         """Python loses what is raised in a finaliser or a callback of LLVM, where compiling spends its time: raise it again."""
-        if issubclass(lost.exc_type, KeyboardInterrupt):
+        if issubclass(hook_arguments.exc_type, KeyboardInterrupt):
             self._come_again()
         else:
-            report(lost)
+            report(hook_arguments)
 
     def _come_again(self) -> None:
         self._comes_again = True
@@ -92,7 +94,7 @@ def current() -> Stop:
 
 
 @contextmanager
-def heeded(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> Iterator[Stop]:
+def handle_signals(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> Iterator[Stop]:
     """Heed signals for the length of the block; in a block within one, and in other threads than the first, nothing changes."""
     global _current
     if _current is not None or current_thread() is not main_thread():
@@ -120,12 +122,12 @@ _asked: ContextVar[tuple[Callable[[], bool], str]] = ContextVar("asked", default
 
 
 @contextmanager
-def asking(should_stop: Callable[[], bool], said: str) -> Iterator[None]:
+def asking(should_stop: Callable[[], bool], message: str) -> Iterator[None]:
     """In the block, in this thread, `check_stop` asks `should_stop`: so loops far below need not be handed it.
 
-    said : the sentence when it says so
+    message : the sentence when it says so
     """
-    token = _asked.set((should_stop, said))
+    token = _asked.set((should_stop, message))
     try:
         yield
     finally:
@@ -170,7 +172,7 @@ def _package(name: str) -> str:
     return name.partition(".")[0]
 
 
-def _can_be_left(name: str) -> bool:
+def _can_raise_in(name: str) -> bool:
     """Whether raising in this module harms nothing below it."""
     package = _package(name)
     return name == _BETWEEN_PASSES or (package not in _FOREIGN and package not in sys.stdlib_module_names)

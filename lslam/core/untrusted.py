@@ -163,11 +163,11 @@ class _Window:
             if not self._more():
                 return ""
 
-    def take(self, wanted: str) -> str:
-        """The next character, which has to be one of those `wanted`."""
+    def take(self, characters: str) -> str:
+        """The next character, which has to be one of those `characters`."""
         found = self.peek()
-        if not found or found not in wanted:
-            raise self.error(f"Expecting {' or '.join(repr(one) for one in wanted)}")
+        if not found or found not in characters:
+            raise self.error(f"Expecting {' or '.join(repr(one) for one in characters)}")
         self._at += 1
         return found
 

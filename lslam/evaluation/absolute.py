@@ -9,7 +9,7 @@ import numpy as np
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.errors import UsageError, nearest
 from lslam.core.geometry import se3, so3
-from lslam.core.printable import fixed, metres, significant
+from lslam.core.printable import metres, significant, with_decimals
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation import ALIGNMENTS
@@ -129,7 +129,7 @@ class AbsoluteTrajectoryError(TrajectoryMetric[dict[str, AbsoluteError]]):
                     metres(error.horizontal.rmse) if error.horizontal else "",
                     metres(error.vertical.rmse) if error.vertical else "",
                     f"{error.rotation_deg.rmse:.3f}" if error.rotation_deg else "",
-                    fixed(error.percent_of_length, 2),
+                    with_decimals(error.percent_of_length, 2),
                 )
             )
         header = (
@@ -202,7 +202,7 @@ def _sentence(error: AbsoluteError, e: Evaluation) -> str:
     rotation = f", {error.rotation_deg.rmse:.3f} deg" if error.rotation_deg else ""
     return (
         f"{metres(error.translation.rmse)} m rmse{rotation}, max {metres(error.translation.max)} m, "
-        f"{fixed(error.percent_of_length, 2)} % of length ({ALIGNMENTS.get(error.alignment, error.alignment)}; "
+        f"{with_decimals(error.percent_of_length, 2)} % of length ({ALIGNMENTS.get(error.alignment, error.alignment)}; "
         f"{e.matched} of {e.possible} poses)"
     )
 

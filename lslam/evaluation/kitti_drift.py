@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.config.outputs import EvalConfig
-from lslam.core.printable import counted, significant
+from lslam.core.printable import count_of, significant
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.metric import NO_ROTATIONS, Document, Evaluation, MatchedPoses, MetricRow, TrajectoryMetric
@@ -105,7 +105,7 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
         drift = self.of(e)
         text = (
             f"{drift.translation_percent:.3f} %, {drift.rotation_deg_per_100m:.4f} deg/100 m "
-            f"({counted(drift.segments, 'segment')} of 100 to 800 m)"
+            f"({count_of(drift.segments, 'segment')} of 100 to 800 m)"
         )
         return [(self.name, text if drift.available else drift.note or "n/a")]
 
@@ -118,7 +118,7 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
 
     def recipes(self, e: Evaluation) -> list[str]:
         drift = self.of(e)
-        return [f"drift: {drift.recipe}; {counted(drift.segments, 'segment') if drift.available else drift.note}"]
+        return [f"drift: {drift.recipe}; {count_of(drift.segments, 'segment') if drift.available else drift.note}"]
 
     def tables(self, e: Evaluation) -> list[Table]:
         drift = self.of(e)
@@ -132,5 +132,5 @@ class KittiOdometry(TrajectoryMetric[KittiDrift]):
 
     def cards(self, e: Evaluation) -> list[tuple[str, str, str]]:
         drift = self.of(e)
-        name = f"{self.name}, {counted(drift.segments, 'segment')}"
+        name = f"{self.name}, {count_of(drift.segments, 'segment')}"
         return [(f"{drift.translation_percent:.2f}", "%", name)] if drift.available else []

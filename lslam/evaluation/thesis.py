@@ -14,7 +14,7 @@ import numpy as np
 
 from lslam.core.config.outputs import EvalConfig
 from lslam.core.geometry import so3
-from lslam.core.printable import fixed, metres, significant
+from lslam.core.printable import metres, significant, with_decimals
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Metric, Table
 from lslam.evaluation.absolute import align
@@ -200,7 +200,7 @@ class Girolimetto(TrajectoryMetric[AxisErrors]):
             "yaw, deg",
             "angular, deg",
         )
-        angles = (fixed(v, 3) for v in (*s.rpy_rmse_deg, s.angular_rmse_deg))
+        angles = (with_decimals(v, 3) for v in (*s.rpy_rmse_deg, s.angular_rmse_deg))
         row = ("rmse", metres(s.thesis_rmse), *(metres(v) for v in s.xyz_rmse), *angles)
         return [Table("Girolimetto (thesis1): errors per axis", header, (row,), f"{s.recipe}.")]
 
@@ -249,10 +249,10 @@ class DelTufo(TrajectoryMetric[Planar]):
         s = self.of(e)
         rows = (
             ("ATE, m", metres(s.ate_mean), metres(s.ate_std)),
-            ("RPE translation, m", fixed(s.rpe_translation_mean, 5), fixed(s.rpe_translation_std, 5)),
+            ("RPE translation, m", with_decimals(s.rpe_translation_mean, 5), with_decimals(s.rpe_translation_std, 5)),
             ("RPE rotation, rad", f"{s.rpe_rotation_mean:.3e}", f"{s.rpe_rotation_std:.3e}"),
         )
-        recipe = f"{s.recipe}; matched poses are {fixed(s.spacing, 2)} m apart."
+        recipe = f"{s.recipe}; matched poses are {with_decimals(s.spacing, 2)} m apart."
         return [Table("Del Tufo (thesis2): planar errors", ("", "mean", "std"), rows, recipe)]
 
 

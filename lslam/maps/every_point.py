@@ -15,7 +15,7 @@ from lslam.core.geometry import se3
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.cloud import BLOCK, CloudBlock
-from lslam.core.types.scan import is_measured
+from lslam.core.types.scan import has_return
 from lslam.core.types.state import State
 from lslam.maps.observations import TAGS, Observations, column_types, columns_of, tags_of
 from lslam.maps.sorted_runs import rows_folder
@@ -107,7 +107,7 @@ class PointCollector:
         with np.errstate(invalid="ignore", over="ignore"):
             # As the kernel of voxels does, so that both keep the same points.
             away2 = np.square(points, dtype=np.float64).sum(axis=1)
-            kept = is_measured(points) & (away2 >= self._near**2) & (away2 <= self._far**2)
+            kept = has_return(points) & (away2 >= self._near**2) & (away2 <= self._far**2)
             world = se3.apply(T_world_lidar, points[kept].astype(np.float64))
         inside = np.isfinite(world).all(axis=1)
         if self._crop is not None:

@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
 from lslam.core.errors import UsageError
-from lslam.core.extras import factory, known, require
+from lslam.core.extras import factory, require, summarise
 
 if TYPE_CHECKING:
     from lslam.core.config.config import Config
@@ -107,7 +107,7 @@ def listed_methods() -> list[ListedMethod]:
 
 def known_methods() -> dict[str, str]:
     """Names and one-line summaries, those of other packages included."""
-    return known(GROUP, METHODS)
+    return summarise(GROUP, METHODS)
 
 
 def require_method(name: str) -> None:

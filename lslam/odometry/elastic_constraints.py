@@ -140,7 +140,7 @@ class LastSweep(Stateful):
         Where scans between are missing the prior says where it begins.
         """
         begin_ns, end_ns = _ends_ns(stamp_ns, prior)
-        Q = noise.rotated(self._change_over(prior.span_s), prior.pose[:3, :3])
+        Q = noise.rotate(self._change_over(prior.span_s), prior.pose[:3, :3])
         # The first sweep has the velocity at its end.
         M = Q if self._skewed is None else self._skewed
         expected, P = ElasticSweep.of(prior), self._covariance

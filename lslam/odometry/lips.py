@@ -131,7 +131,7 @@ class Lips(Traits, Stateful):
         which = np.flatnonzero(matches >= 0)
         state = slice(SHARED, SHARED + 6)
         step = pose[:3, 3] - window.values.poses[-1, :3, 3]
-        on_planes = noise.transported(window.covariance_on_planes(), step)
+        on_planes = noise.transport(window.covariance_on_planes(), step)
         n = planes.counts[which]
         rmse = float(np.sqrt(n @ planes.rms[which] ** 2 / max(n.sum(), 1.0)))
         return RegistrationResult(
@@ -142,7 +142,7 @@ class Lips(Traits, Stateful):
             rmse=rmse,
             degenerate=self._degenerate(window, matches),
             inertial=window.values.newest(P[:27, :27]),
-            detail=noise.transported(P[state, state], step),
+            detail=noise.transport(P[state, state], step),
         )
 
     def _degenerate(self, window: PlaneWindow, matches: Longs) -> Floats:

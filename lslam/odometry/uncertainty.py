@@ -67,7 +67,7 @@ class DeskewUncertainty(Stateful):
         alike = np.repeat([np.trace(self._mean[:3, :3]) / 3, np.trace(self._mean[3:, 3:]) / 3], 3)
         # The prior that the covariance is isotropic weighs as many scans as it has directions.
         share = self.scans / (self.scans + len(self._mean))
-        return noise.rotated(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
+        return noise.rotate(share * self._mean + (1.0 - share) * np.diag(alike), pose[:3, :3])
 
     def _learn(self, change: Floats, step_s: float) -> None:
         """From the change (6,) of the motion over `step_s` seconds since the last scan."""
@@ -142,7 +142,7 @@ class PoseUncertainty(Stateful):
             self._position = self._start = position.copy()
         step = position - self._position
         self._position = position.copy()
-        self._map = noise.transported(self._map, step)
+        self._map = noise.transport(self._map, step)
         if result.is_stationary:
             self._scans += 1
             self.map_age += 1
@@ -156,7 +156,7 @@ class PoseUncertainty(Stateful):
             self.map_age = 1 + (1 - share) * self.map_age
         if self._start is None:
             return np.asarray(self._map + own)
-        at_start = noise.transported(self._start_factor * sweep, position - self._start)
+        at_start = noise.transport(self._start_factor * sweep, position - self._start)
         if self._sweep.scans >= FIRST_SWEEP_SCANS:
             self._map, self._start = self._map + at_start, None
             return np.asarray(self._map + own)

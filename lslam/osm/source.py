@@ -144,9 +144,7 @@ class OsmServer:
 
 def first_pose(config: OsmConfig) -> Floats:
     """Planar pose (3,) of the first scan in the map frame, by origin and heading; yaw 0 when the heading is unknown."""
-    return np.array(
-        [0.0, 0.0, 0.0 if config.heading_deg is None else se2.wrapped(np.radians(90.0 - config.heading_deg))]
-    )
+    return np.array([0.0, 0.0, 0.0 if config.heading_deg is None else se2.wrap(np.radians(90.0 - config.heading_deg))])
 
 
 def _places(gnss: GnssStream, origin: Floats) -> tuple[Longs, Floats]:

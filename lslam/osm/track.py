@@ -63,7 +63,7 @@ class OsmTrack:
         error, H, R = self._innovation(pose, information)
         gain = np.linalg.solve(H @ self.covariance @ H.T + R, H @ self.covariance).T
         moved = self.pose + gain @ error
-        self.pose = np.array([moved[0], moved[1], se2.wrapped(moved[2])])
+        self.pose = np.array([moved[0], moved[1], se2.wrap(moved[2])])
         kept: Floats = np.eye(3) - gain @ H
         self.covariance = kept @ self.covariance @ kept.T + gain @ R @ gain.T
 
@@ -86,7 +86,7 @@ class OsmTrack:
         for _ in range(ROUNDS):
             there = se2.compose(pivot + moved, about)
             away = real - there
-            away[:, 2] = se2.wrapped(away[:, 2])
+            away[:, 2] = se2.wrap(away[:, 2])
             squared = np.einsum("mi,mij,mj->m", away, weights, away)
             robust = (FREEDOM + 1.0) / (FREEDOM + squared)
             effect = np.tile(np.eye(3), (len(there), 1, 1))
@@ -111,7 +111,7 @@ class OsmTrack:
         """Innovation (R,) of a match, its Jacobian (R, 3) and the covariance (R, R), along the observed directions."""
         H, own = _seen(information)
         away = np.asarray(pose, np.float64) - self.pose
-        away[2] = se2.wrapped(away[2])
+        away[2] = se2.wrap(away[2])
         return H @ away, H, own + H @ np.diag(self._map) @ H.T
 
 

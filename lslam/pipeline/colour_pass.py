@@ -17,7 +17,7 @@ from lslam.core.geometry.continuous_motion import ContinuousMotion
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Camera, cameras_of
-from lslam.core.types.cloud import Cloud, thinned
+from lslam.core.types.cloud import Cloud, thin_out
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.maps.colour import ColourCounts, ColouredCloud, MapColourer
@@ -64,7 +64,7 @@ def build_finished_map(
         problems.append(f"{error}; it is written without")
         log.warning("%s", problems[-1])
         return built
-    sample = thinned(coloured, SAMPLE, SHOWN)
+    sample = thin_out(coloured, SAMPLE, SHOWN)
     return replace(built, merged=coloured, sample=sample, colour=counts, done=(*built.done, f"coloured: {counts}"))
 
 

@@ -207,7 +207,7 @@ def _at_first_scan(
     keyframe = store.keyframes[start.vote.keyframe]
     T = start.vote.T_level_odometry @ results[0].T_world_lidar
     at = start.vote.T_level_odometry @ keyframe.T_world_lidar
-    carried = noise.transported(start.vote.covariance, T[:3, 3] - at[:3, 3])
+    carried = noise.transport(start.vote.covariance, T[:3, 3] - at[:3, 3])
     c, way = config.loops, keyframe.distance
     systematic = np.diag(
         np.repeat(
@@ -222,7 +222,7 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
     T = prior_map.T_map_level
     results = record.results[: len(fixes)]
     into_map = [
-        replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotated(f.covariance, T[:3, :3]))
+        replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotate(f.covariance, T[:3, :3]))
         for f in doubted(fixes)
     ]
     held = [k for k, fix in enumerate(into_map) if fix.is_held]

@@ -18,7 +18,7 @@ from lslam.core.errors import InputError, InterruptedRunError
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory, thinned
+from lslam.core.types.cloud import ArrayCloud, Cloud, in_memory, thin_out
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
@@ -199,7 +199,7 @@ class MapMaker:
             done = (*done, f"denoised: {before - len(merged)} of {before} points were far from their neighbours")
         view = top_view(merged, pixel_size(self._section.voxel))
         occupancy = None if self._occupancy is None else self._occupancy.result()
-        return BuiltMap(merged, view, thinned(merged, SAMPLE, SHOWN), done, occupancy)
+        return BuiltMap(merged, view, thin_out(merged, SAMPLE, SHOWN), done, occupancy)
 
     def state(self) -> State:
         """State for `restore`; voxels and cells are written to `keep`."""

@@ -203,7 +203,7 @@ def _warm_up(job: PreparedRun, stationary: StationaryDetector | None, monitor: I
     config, is_over = job.config, job.checkpoints is not None and job.checkpoints.is_over
     alike = type(job.odometry), bool(config.osm.extract), repr(config.model_dump(exclude=_WITHOUT_KERNELS))
     count = COUNTS.get(config.odometry.method)
-    with job.manifest.timed("compile_s"), rarely_collecting(), jit.counted(log, count):
+    with job.manifest.timed("compile_s"), rarely_collecting(), jit.count_kernels(log, count):
         if alike not in _warmed and not is_over:
             load_kernels(config, [one for one in (job.odometry, stationary, monitor) if one is not None])
             _warmed.add(alike)

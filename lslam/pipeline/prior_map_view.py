@@ -12,7 +12,7 @@ from lslam.backend.localization.prior_map import PriorMap
 from lslam.core.geometry import se3
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Bools, Floats
-from lslam.core.types.cloud import ArrayCloud, thinned
+from lslam.core.types.cloud import ArrayCloud, thin_out
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.maps.changes import MapChange, differences, points_in
@@ -45,8 +45,8 @@ def view_prior_map(job: PreparedRun, record: RunRecord, prior_map: PriorMap) -> 
     kinds = {kind: [change for change in changes if change.kind == kind] for kind in ("appeared", "vanished")}
     is_gone = points_in(near, kinds["vanished"], found)
     new = np.concatenate([np.zeros((0, 3)), *(_filled(change) for change in kinds["appeared"])])
-    differing = [thinned(ArrayCloud(part), MOST_DIFFERING).points for part in (near[is_gone], new)]
-    same = thinned(ArrayCloud(near[~is_gone]), SAMPLE - sum(map(len, differing))).points
+    differing = [thin_out(ArrayCloud(part), MOST_DIFFERING).points for part in (near[is_gone], new)]
+    same = thin_out(ArrayCloud(near[~is_gone]), SAMPLE - sum(map(len, differing))).points
     parts = [same, *differing]
     change = np.repeat([0, -1, 1], [len(part) for part in parts])
     record.map_sample = ArrayCloud(np.concatenate(parts), columns={"change": change.astype(np.int8)})

@@ -23,7 +23,7 @@ from lslam.core.errors import (
     UsageError,
     cause,
 )
-from lslam.core.printable import printable_tree, shown
+from lslam.core.printable import first_of, printable_tree
 from lslam.core.types.imu import WheelStream
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
@@ -215,7 +215,7 @@ def _difference(
     changed = [key for key in differing if key not in FREE and not is_open(config, key)]
     unknown = set(_flat(printable_tree(Config().model_dump(mode="json")))) - set(before)
     if changed and set(changed) <= unknown:
-        return f"it was begun by an earlier lslam, which had no {shown(changed)}"
+        return f"it was begun by an earlier lslam, which had no {first_of(changed)}"
     if changed:
         said = [f"{key} was {before.get(key)!r} and is {now.get(key)!r}" for key in changed[:3]]
         return f"the configuration differs: {', '.join(said)}{', ...' if len(changed) > 3 else ''}"

@@ -15,7 +15,7 @@ from lslam.core.errors import InputError
 from lslam.core.kernels import jit
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Trajectory
-from lslam.core.types.warned import hearing
+from lslam.core.types.warned import collect_warnings
 from lslam.io.remote import as_path
 from lslam.pipeline.job import announce, prepare
 from lslam.pipeline.odometry_pass import estimate_poses
@@ -63,7 +63,7 @@ def run(
     """
     watch = watch or Watch()
     config = config or Config()
-    with hearing() as heard, helped(), jit.announced(log, partial(start_helper, config)):
+    with collect_warnings() as heard, helped(), jit.announce_compiling(log, partial(start_helper, config)):
         watch.on_start("preparing", 0)
         job = prepare(sequence, config, ground_truth, command, watch)
         if earlier is not None and not np.array_equal(job.sequence.stamps_ns, earlier.trajectory.stamps_ns):

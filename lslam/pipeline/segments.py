@@ -208,7 +208,7 @@ def _move(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanRe
 
     def chained(own: Floats | None) -> Floats | None:
         step = moved.T_world_lidar[:3, 3] - origin
-        return None if own is None else np.asarray(own + noise.transported(base, step))
+        return None if own is None else np.asarray(own + noise.transport(base, step))
 
     return replace(moved, covariance=chained(moved.covariance), points_covariance=chained(moved.points_covariance))
 

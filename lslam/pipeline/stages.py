@@ -71,9 +71,9 @@ def finalise_poses(job: PreparedRun, record: RunRecord) -> BackEnd:
 
 def _load(job: PreparedRun, *parts: str) -> None:
     """After a cold start, compile or load the kernels of these parts. At others each is loaded when it is called."""
-    if not jit.has_compiled():
+    if not jit.did_compile():
         return
-    with job.manifest.timed("compile_s"), rarely_collecting(), jit.counted(log, None):
+    with job.manifest.timed("compile_s"), rarely_collecting(), jit.count_kernels(log, None):
         load_parts(job.config, parts)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lslam.core.geometry import se3
-from lslam.core.printable import counted, metres
+from lslam.core.printable import count_of, metres
 from lslam.core.types.arrays import Floats
 from lslam.core.types.comparison import Table
 from lslam.core.types.run_record import LoopView, RunRecord
@@ -57,7 +57,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         rows.append(
             (
                 "control",
-                f"{counted(control['count'], 'point')}, {metres(control['rms_horizontal_m'])} m rms horizontally and "
+                f"{count_of(control['count'], 'point')}, {metres(control['rms_horizontal_m'])} m rms horizontally and "
                 f"{metres(control['rms_vertical_m'])} m vertically, the worst {control['worst_sigmas']:.1f} sigmas off",
             )
         )
@@ -77,8 +77,8 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         moves = [float(np.linalg.norm(c.displacement[:2])) for c in found.buildings if c.status == "seen"]
         gone = sum(c.status == "absent" for c in found.buildings)
         said = f"{len(moves)} seen" + (f", moved by {np.median(moves):.2f} m (median)" if moves else "")
-        new = f"{counted(len(found.new_walls), 'wall')} without a building"
-        rows.append(("buildings", f"{said}; {gone} absent; {new}; {counted(len(found.left), 'overlap')} left"))
+        new = f"{count_of(len(found.new_walls), 'wall')} without a building"
+        rows.append(("buildings", f"{said}; {gone} absent; {new}; {count_of(len(found.left), 'overlap')} left"))
     return rows
 
 
@@ -118,7 +118,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
     for loop in closed:
         ends = record.keyframe_scans[[loop.a, loop.b]]
         tracks.append(Track("loop", after[ends], "s3"))
-    legend += [("s3", f"{counted(len(closed), 'loop')} closed")] if closed else []
+    legend += [("s3", f"{count_of(len(closed), 'loop')} closed")] if closed else []
     ellipses, largest = _ellipses(record)
     beside = " beside the map's own shift" if _common(record).any() else ""
     if largest > pixel:

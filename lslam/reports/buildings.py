@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lslam.core.geometry import se2
-from lslam.core.printable import counted
+from lslam.core.printable import count_of
 from lslam.core.types.arrays import Floats
 from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, KeyframeMatch, OsmMatches
 from lslam.core.types.comparison import Table
@@ -105,9 +105,9 @@ def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
     counts = Counter(c.status for c in found.buildings)
     east, north = -found.shift
     recipe = (
-        f"Real minus map, about the middle of each building; {counted(len(found.buildings), 'building')}: {counts['seen']} seen, "
-        f"{counts['unseen']} not, {counts['absent']} absent; the map as a whole lies {east:+.2f} m east and {north:+.2f} m "
-        f"north of the run; {counted(len(found.left), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
+        f"Real minus map, about the middle of each building; {count_of(len(found.buildings), 'building')}: {counts['seen']} "
+        f"seen, {counts['unseen']} not, {counts['absent']} absent; the map as a whole lies {east:+.2f} m east and {north:+.2f} m "
+        f"north of the run; {count_of(len(found.left), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
     )
     header = ("building", "status", "east, m", "north, m", "turn, deg", "confidence", "matches", "given up")
     tables = [Table("Displacement of buildings", header, rows, recipe)]
@@ -153,7 +153,7 @@ def _holds(matches: OsmMatches, poses: Floats) -> Figure:
     legend = [("gt", "way"), *((style, label) for style, label, keys in kinds if len(keys))]
     legend += [("bad", "match not used")] if refused else []
     chart = plane_chart(tracks, "matches along the way", points=poses[refused, :2], width=720, tallest=560, by="own")
-    caption = f"{len(used)} of {counted(len(at), 'keyframe')} held by the map."
+    caption = f"{len(used)} of {count_of(len(at), 'keyframe')} held by the map."
     return Figure("Where the map held the trajectory, from above", chart, tuple(legend), caption, wide=True)
 
 

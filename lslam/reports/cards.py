@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lslam.core.geometry import se3
-from lslam.core.printable import counted, metres
+from lslam.core.printable import count_of, metres
 from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.reports.facts import RunFacts
@@ -51,14 +51,14 @@ def _error_card(record: RunRecord, evaluation: Evaluation | None) -> list[Card]:
         return scores[:1]
     control = record.manifest.get("graph", {}).get("control_points")
     if control is not None:
-        name = f"rms at {counted(control['count'], 'control point')}, horizontally"
+        name = f"rms at {count_of(control['count'], 'control point')}, horizontally"
         return [Card(metres(control["rms_horizontal_m"]), "m", name)]
     moves = [fix.innovation[0] for fix in record.map_fixes if fix.is_held]
     if moves:
         return [Card(metres(float(np.median(moves))), "m", "correction by the map a scan, median")]
     residuals = loop_residuals(record)
     if len(residuals):
-        return [Card(metres(float(np.median(residuals))), "m", f"left at {counted(len(residuals), 'loop')}, median")]
+        return [Card(metres(float(np.median(residuals))), "m", f"left at {count_of(len(residuals), 'loop')}, median")]
     return []
 
 

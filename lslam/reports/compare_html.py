@@ -13,7 +13,7 @@ import numpy as np
 
 from lslam.core.errors import LslamError
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import ArrayCloud, thinned
+from lslam.core.types.cloud import ArrayCloud, thin_out
 from lslam.core.types.comparison import Comparison, Drawing, DrawnRun, RunScore
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.point_files import read_cloud
@@ -134,7 +134,7 @@ def method_map(drawing: Drawing, methods: Sequence[str], clouds: Sequence[Floats
     return {
         "map_figure": figure,
         "map_extent": view.extent,
-        "cloud_data": cloud_data(thinned(ArrayCloud(points), MAP_POINTS)),
+        "cloud_data": cloud_data(thin_out(ArrayCloud(points), MAP_POINTS)),
         "sessions": {"sessions": ways_data(ways), "ties": "", "tied": 0},
     }
 

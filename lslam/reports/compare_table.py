@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lslam.core import __version__
-from lslam.core.printable import counted, fixed, metres
+from lslam.core.printable import count_of, metres, with_decimals
 from lslam.core.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
 from lslam.io.formats.atomic import write_text
 from lslam.reports.evaluations import strict
@@ -160,7 +160,7 @@ def _cell(metric: Metric, row: SummaryRow) -> str:
     if value is None:
         return "-"
     if metric.group == "error":
-        text = _with_spread(metres(value.mean) if metric.unit == "m" else fixed(value.mean, 3), value)
+        text = _with_spread(metres(value.mean) if metric.unit == "m" else with_decimals(value.mean, 3), value)
     else:
         text = f"{value.mean:.1f}"
     return text if metric.group != "time" or row.is_timed_alone else f"~{text}"
@@ -168,7 +168,7 @@ def _cell(metric: Metric, row: SummaryRow) -> str:
 
 def _with_spread(mean: str, value: Spread) -> str:
     """Text of the mean with the standard deviation over seeds, with equal decimals."""
-    return mean if value.n < 2 else f"{mean} ± {fixed(value.std, len(mean.partition('.')[2]))}"
+    return mean if value.n < 2 else f"{mean} ± {with_decimals(value.std, len(mean.partition('.')[2]))}"
 
 
 def _health(row: SummaryRow) -> str:
@@ -197,7 +197,7 @@ def _pairs(comparison: Comparison) -> CompareTable:
     rows = []
     for pair in comparison.paired:
         p = pair.note if math.isnan(pair.p) else f"{pair.p:.3g}"
-        ratio = fixed(pair.ratio, 3) if pair.n else "-"
+        ratio = with_decimals(pair.ratio, 3) if pair.n else "-"
         score = f"{pair.wins}/{pair.ties}/{pair.losses}"
         rows.append((pair.method, pair.reference, str(pair.n), ratio, score, p))
     return CompareTable("pairs", header, tuple(rows), 2)
@@ -213,13 +213,13 @@ def _differences(comparison: Comparison) -> CompareTable:
 
 def _doubts(comparison: Comparison) -> CompareTable:
     rows = tuple((r.sequence, r.method, str(r.seed), r.reason) for r in comparison.degraded)
-    title = f"{counted(len(rows), 'run')} degraded: part of it is doubted"
+    title = f"{count_of(len(rows), 'run')} degraded: part of it is doubted"
     return CompareTable(title, ("sequence", "method", "seed", "reason"), rows, 4)
 
 
 def _failures(comparison: Comparison) -> CompareTable:
     rows = tuple((r.sequence, r.method, str(r.seed), r.status, r.reason) for r in comparison.failed)
-    title = f"{counted(len(rows), 'run')} failed"
+    title = f"{count_of(len(rows), 'run')} failed"
     return CompareTable(title, ("sequence", "method", "seed", "outcome", "reason"), rows, 5)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lslam.core.printable import counted
+from lslam.core.printable import count_of
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.comparison import Table
 from lslam.core.types.imu import XYZ
@@ -243,7 +243,7 @@ def _map_note(manifest: Mapping[str, Any]) -> str:
 
 def _differences_note(found: Mapping[str, Any]) -> str:
     """What differs between drive and map, in words."""
-    new, gone = counted(found["not_in_the_map"], "thing"), counted(found["gone"], "thing")
+    new, gone = count_of(found["not_in_the_map"], "thing"), count_of(found["gone"], "thing")
     return (
         f"Against the map: {gone} gone, that beams passed through, and {new} not in it, new or hidden when it was made; by "
         f"the scans that the map holds, in cells of {found['voxel_m']:g} m. lslam map --changes compares both drives by all "

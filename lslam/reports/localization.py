@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.printable import counted
+from lslam.core.printable import count_of
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import MapFix
 from lslam.core.types.run_record import RunRecord
@@ -48,7 +48,7 @@ def localization_tracks(record: RunRecord) -> tuple[list[Track], list[tuple[str,
         if own.any():
             reach = own | np.append(False, own[:-1])
             tracks.append(Track(word, np.where(reach[:, None], xy, np.nan), style))
-            legend.append((style, f"{word}, {counted(int(own.sum()), 'scan')}"))
+            legend.append((style, f"{word}, {count_of(int(own.sum()), 'scan')}"))
     return tracks, legend
 
 
@@ -73,7 +73,7 @@ def localization_figures(record: RunRecord) -> list[Figure]:
     carried = way[~is_held]
     share = np.array([fix.inlier_share for fix in fixes])
     moved = np.array([fix.innovation[0] for fix in fixes])
-    legend = (("failed", f"carried by odometry, {counted(len(carried), 'scan')}"),) if len(carried) else ()
+    legend = (("failed", f"carried by odometry, {count_of(len(carried), 'scan')}"),) if len(carried) else ()
 
     def figure(title: str, label: str, values: NDArray[Any], caption: str) -> Figure:
         line = svg.Line(label, way, np.where(is_held, values, np.nan), "s1")

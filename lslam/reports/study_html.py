@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lslam.core.errors import OutputError, cause
-from lslam.core.printable import counted
+from lslam.core.printable import count_of
 from lslam.core.types.study import StudyResult, StudyRow
 from lslam.io.formats.atomic import atomic_write
 from lslam.reports.compare_table import CompareTable, as_text
@@ -71,7 +71,7 @@ def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
         return []
     were_several = any(row.at_once > 1 for row in usable)
     return [
-        f"{shared} of {counted(len(usable), 'run')} shared a core or ran on a cluster: times of this study cannot be compared, "
+        f"{shared} of {count_of(len(usable), 'run')} shared a core or ran on a cluster: times of this study cannot be compared, "
         "and findings about time are left undecided. To have them judged, run it on an idle machine into another folder: "
         f"lslam sweep STUDY{' --jobs 1' if were_several else ''} --out DIR"
     ]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lslam.core.config.config import with_unit
-from lslam.core.printable import counted, fixed, metres
+from lslam.core.printable import count_of, metres, with_decimals
 from lslam.core.types.study import CurveResult, Interval, Law, StudyResult, StudyRow
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.curves import normalise
@@ -144,7 +144,7 @@ def _means(result: StudyResult) -> CompareTable:
         curve, share = r.curve, [normalise(r.medians[name]) for name in ("efficiency", "total_efficiency")]
         for v, value in enumerate(curve.values):
             cells = [_mean(r.means[name], v, name) for name in _UNITS if not name.endswith("efficiency")]
-            cells += [fixed(e[v], 2) if math.isfinite(e[v]) else UNKNOWN for e in share]
+            cells += [with_decimals(e[v], 2) if math.isfinite(e[v]) else UNKNOWN for e in share]
             best |= {(len(rows), 7 + k) for k, e in enumerate(share) if e[v] == 1}
             rows.append((curve.label, curve.name_of(value), *cells, f"{curve.lost[v].sum()}/{curve.ran[v].sum()}"))
     return CompareTable("means over seeds", head, tuple(rows), 1, frozenset(best))
@@ -167,14 +167,14 @@ def _failures(result: StudyResult) -> CompareTable:
         )
         for row in result.failed
     )
-    title = f"{counted(len(rows), 'run')} without a result"
+    title = f"{count_of(len(rows), 'run')} without a result"
     return CompareTable(title, ("method", "at", "seed", "outcome", "reason"), rows, 5)
 
 
 def _numbers(row: StudyRow) -> Iterable[str]:
     yield metres(row.error) if math.isfinite(row.error) else UNKNOWN
     for value, decimals in ((row.angular_rmse_deg, 3), (row.time_per_scan_ms, 1), (row.total_time_s, 2)):
-        yield fixed(value, decimals) if math.isfinite(value) else UNKNOWN
+        yield with_decimals(value, decimals) if math.isfinite(value) else UNKNOWN
 
 
 def _mean(means: Interval, v: int, name: str) -> str:
@@ -184,10 +184,10 @@ def _mean(means: Interval, v: int, name: str) -> str:
     text = (
         metres(mean)
         if name == "translation"
-        else fixed(mean, {"angular": 3, "time_per_scan": 1, "total_time": 2, "fallback": 1}[name])
+        else with_decimals(mean, {"angular": 3, "time_per_scan": 1, "total_time": 2, "fallback": 1}[name])
     )
     half = float(means.high[v] - mean)
-    return f"{text} ± {fixed(half, len(text.partition('.')[2]))}" if math.isfinite(half) else text
+    return f"{text} ± {with_decimals(half, len(text.partition('.')[2]))}" if math.isfinite(half) else text
 
 
 def _range(result: CurveResult) -> str:

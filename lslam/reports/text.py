@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lslam.core.printable import counted, metres
+from lslam.core.printable import count_of, metres
 from lslam.core.types.run_record import RunRecord
-from lslam.core.types.scan_result import summed
+from lslam.core.types.scan_result import sum_stages
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.maps.colour import ColourCounts
 from lslam.reports.back_end import back_end_rows, before_and_after
@@ -33,9 +33,9 @@ def localization_rows(record: RunRecord, evaluation: Evaluation | None) -> list[
     shares = float(np.median([fix.inlier_share for fix in held]))
     moves = float(np.median([fix.innovation[0] for fix in held]))
     rows = [
-        ("in the map", f"{about.get('map', '')}: it holds {len(held)} of {counted(len(fixes), 'scan')}"),
+        ("in the map", f"{about.get('map', '')}: it holds {len(held)} of {count_of(len(fixes), 'scan')}"),
         ("", f"{shares:.0%} of the points agree, odometry is corrected by {metres(moves)} m a scan (medians)"),
-        ("start", f"found by {start.get('votes')} of {counted(start.get('tried', 0), 'keyframe')} tried"),
+        ("start", f"found by {start.get('votes')} of {count_of(start.get('tried', 0), 'keyframe')} tried"),
     ]
     if evaluation is not None and evaluation.odometry is not None:
         rows.append(("", before_and_after(evaluation, evaluation.odometry, "localisation")))
@@ -124,7 +124,7 @@ def wheel_rows(record: RunRecord) -> list[tuple[str, str]]:
         ]
     used = "used" if wheels["used"] else "refused on the way"
     parts = [f"scale {wheels['scale']:.4f} ({wheels['scale_sigma']:.4f})"]
-    parts += [f"slip in {counted(wheels['scans_with_slip'], 'scan')}"] if wheels["scans_with_slip"] else []
+    parts += [f"slip in {count_of(wheels['scans_with_slip'], 'scan')}"] if wheels["scans_with_slip"] else []
     return [
         (
             "wheels",
@@ -159,7 +159,7 @@ def _saving_text(imu: dict[str, Any]) -> str:
     saved = imu["saved_ms_per_scan"]
     what = "saved" if saved >= 0 else "lost"
     return (
-        f"on {counted(imu['compared_scans'], 'scan')} {imu['compared_iterations']:.1f} of the "
+        f"on {count_of(imu['compared_scans'], 'scan')} {imu['compared_iterations']:.1f} of the "
         f"{imu['constant_velocity_iterations']:.1f} that constant velocity takes on the same map, "
         f"{abs(saved):.1f} ms per scan {what} with the IMU's own work counted"
     )
@@ -185,7 +185,7 @@ def _refined_rows(record: RunRecord) -> list[tuple[str, str]]:
         return [("refined", f"no scan: {facts['why']}")]
     thickness = f"planes of the points kept out {facts['thickness_mm']} mm thick, {facts['thickness_before_mm']} before"
     moved = f"poses moved {facts['moved_rms_m']} m rms, {facts['moved_most_m']} m at most"
-    return [("refined", f"{counted(facts['scans'], 'scan')}: {thickness}; {moved}")]
+    return [("refined", f"{count_of(facts['scans'], 'scan')}: {thickness}; {moved}")]
 
 
 def _map_rows(record: RunRecord) -> list[tuple[str, str]]:
@@ -218,7 +218,7 @@ def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
                 f"limit of {1e3 * record.real_time_limit:.0f} ms",
             )
         )
-    if later := summed(record.back_end_seconds.values()):
+    if later := sum_stages(record.back_end_seconds.values()):
         each = ", ".join(f"{name} {s:.2f}" for name, s in later.items())
         rows.append(("back end", f"{sum(later.values()):.1f} s on {len(record.keyframe_scans)} keyframes: {each}"))
     return rows

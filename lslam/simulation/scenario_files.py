@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from lslam.core.config.config import setting_value, shipped
+from lslam.core.config.config import read_package_files, setting_value
 from lslam.core.config.input import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, cause, nearest
 from lslam.core.geometry import portable
@@ -262,7 +262,7 @@ class Scenario(Section):
 
 def scenario_names() -> tuple[str, ...]:
     """Names of the scenarios that ship with the package."""
-    return tuple(sorted(shipped("lslam.simulation", "ready")))
+    return tuple(sorted(read_package_files("lslam.simulation", "ready")))
 
 
 def scenario_named(name: str, settings: Iterable[str] = ()) -> Scenario:
@@ -287,7 +287,7 @@ def scenario_text(scenario: Scenario) -> str:
 def _ready(name: str) -> dict[str, Any]:
     if name not in scenario_names():
         raise UsageError(f"no scenario {name!r} and no file NAME.toml; {nearest(name, scenario_names())}")
-    return parse_toml(shipped("lslam.simulation", "ready")[name])
+    return parse_toml(read_package_files("lslam.simulation", "ready")[name])
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

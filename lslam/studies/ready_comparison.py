@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from lslam.core.config import load_config
-from lslam.core.config.config import explain, shipped
+from lslam.core.config.config import explain, read_package_files
 from lslam.core.config.input import Section
 from lslam.core.errors import ConfigError, InputError, UsageError, nearest
 from lslam.core.geometry import geodesy, se2
@@ -318,7 +318,7 @@ def _spread(values: Sequence[float]) -> str:
 
 def comparison_names() -> tuple[str, ...]:
     """Names of the comparisons that ship with lslam."""
-    return tuple(sorted(shipped("lslam.studies", "comparisons")))
+    return tuple(sorted(read_package_files("lslam.studies", "comparisons")))
 
 
 def find_comparison(name: str) -> ReadyComparison:
@@ -326,6 +326,6 @@ def find_comparison(name: str) -> ReadyComparison:
     if name not in comparison_names():
         raise UsageError(f"no ready comparison {name!r}; {nearest(name, comparison_names())}")
     try:
-        return ReadyComparison.model_validate(parse_toml(shipped("lslam.studies", "comparisons")[name]))
+        return ReadyComparison.model_validate(parse_toml(read_package_files("lslam.studies", "comparisons")[name]))
     except ValidationError as error:
         raise ConfigError(explain(error, f"comparison {name!r}")) from None

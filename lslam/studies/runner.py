@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from lslam.core.stopping import heeded, is_too_late
+from lslam.core.stopping import handle_signals, is_too_late
 
 log = logging.getLogger("lslam")
 _PATIENCE_S = 20.0
@@ -164,7 +164,7 @@ def _child(pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
     # A group that is ended asks twice, the system and the parent; who has no patience left kills.
-    with heeded([signal.SIGTERM], may_force=False) as stop:
+    with handle_signals([signal.SIGTERM], may_force=False) as stop:
         try:
             while (task := pipe.recv()) is not None:
                 _do(task)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lslam.core.config.config import shipped
+from lslam.core.config.config import read_package_files
 from lslam.core.config.study import StudyConfig, parse_study, read_study
 from lslam.core.errors import UsageError, nearest
 from lslam.core.untrusted import parse_toml
@@ -12,7 +12,7 @@ from lslam.core.untrusted import parse_toml
 
 def study_names() -> tuple[str, ...]:
     """Names of the studies that ship with lslam: those of Girolimetto's chapter 5.3."""
-    return tuple(sorted(shipped("lslam.studies", "ready")))
+    return tuple(sorted(read_package_files("lslam.studies", "ready")))
 
 
 def find_study(word: str) -> StudyConfig:
@@ -24,4 +24,4 @@ def find_study(word: str) -> StudyConfig:
         return read_study(Path(word))
     if word not in study_names():
         raise UsageError(f"no study {word!r} and no TOML file; {nearest(word, study_names())}")
-    return parse_study(parse_toml(shipped("lslam.studies", "ready")[word]), f"study {word!r}", word)
+    return parse_study(parse_toml(read_package_files("lslam.studies", "ready")[word]), f"study {word!r}", word)

@@ -61,7 +61,7 @@ def off(folder: Path) -> np.ndarray:
     found = read_trajectory(folder / "trajectory.tum").poses
     found[:, :3, 3] = geodesy.to_local(geodesy.from_local(found[:, :3, 3], place), origin)
     error = se2.of_se3(found) - se2.of_se3(poses[: len(found)])
-    error[:, 2] = np.degrees(se2.wrapped(error[:, 2]))
+    error[:, 2] = np.degrees(se2.wrap(error[:, 2]))
     return np.abs(error)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from lslam.core.types.cloud import CloudBlock, thinned
+from lslam.core.types.cloud import CloudBlock, thin_out
 from lslam.maps.floor_plan import top_view
 
 
@@ -103,7 +103,7 @@ class Stream:
 
 def test_a_map_of_any_size_is_seen_in_the_memory_of_a_few_blocks() -> None:
     block = Stream.SIZE * 3 * 8
-    for look in (lambda cloud: top_view(cloud, longest=100), lambda cloud: thinned(cloud, 1000)):
+    for look in (lambda cloud: top_view(cloud, longest=100), lambda cloud: thin_out(cloud, 1000)):
         tracemalloc.start()
         look(Stream(24))
         _, peak = tracemalloc.get_traced_memory()

@@ -40,7 +40,7 @@ def test_the_scan_finds_its_place_among_all_buildings(seed: int) -> None:
     found = lay_scan(flatten_scan(scan(seed), 60.0), walls, truth + rng.uniform(-1, 1, 3) * [0.8, 0.8, 0.04])
     assert found is not None
     assert np.linalg.norm(found.pose[:2] - truth[:2]) < 0.15
-    assert abs(se2.wrapped(found.pose[2] - truth[2])) < np.radians(0.6)
+    assert abs(se2.wrap(found.pose[2] - truth[2])) < np.radians(0.6)
     assert found.rmse < 0.5
 
 

@@ -77,7 +77,7 @@ def off(located: Located, way: np.ndarray) -> np.ndarray:
     """(K, 3) m, m, deg, of the accepted matches."""
     accepted = [m for m in located.matches if m.verdict == "accepted"]
     error = np.array([m.pose - way[m.keyframe] for m in accepted]).reshape(-1, 3)
-    error[:, 2] = np.degrees(se2.wrapped(error[:, 2]))
+    error[:, 2] = np.degrees(se2.wrap(error[:, 2]))
     return np.abs(error)
 
 

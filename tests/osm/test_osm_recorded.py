@@ -46,4 +46,4 @@ def test_from_a_start_3_m_and_10_deg_off_it_ends_where_it_was(
     np.testing.assert_array_equal(record.trajectory.stamps_ns, truth.stamps_ns)
     away = se2.of_se3(found[1:]) - se2.of_se3(real[:-1])
     assert np.linalg.norm(away[:, :2], axis=1).max() < 1.0
-    assert np.abs(np.degrees(se2.wrapped(away[:, 2]))).max() < 2.0
+    assert np.abs(np.degrees(se2.wrap(away[:, 2]))).max() < 2.0

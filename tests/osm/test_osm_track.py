@@ -60,7 +60,7 @@ def test_the_filter_restarts_at_a_match() -> None:
     np.testing.assert_array_equal(one.pose, [1.0, 2.0, 3.0])
     np.testing.assert_allclose(one.covariance, np.diag([0.26, 0.26, 5e-4]))
     one.move(np.array([0.0, 0.0, 1.0]), 0.0)
-    assert abs(one.pose[2] - se2.wrapped(4.0)) < 1e-12
+    assert abs(one.pose[2] - se2.wrap(4.0)) < 1e-12
 
 
 SURE, WALL = np.diag([1e4, 1e4, 1e6]), np.diag([0.0, 1e4, 1e6])

@@ -149,7 +149,7 @@ def test_without_a_start_a_path_or_walls_there_is_no_estimate() -> None:
 def unsure(drift: WallDrift, straight: PoseGraph) -> float:
     """Normalised squared error a coordinate, of the poses but for the first ones."""
     error = se2.of_se3(straight.poses) - se2.of_se3(REAL)
-    error[:, 2] = se2.wrapped(error[:, 2])
+    error[:, 2] = se2.wrap(error[:, 2])
     planar = drift.spread[:, [[0], [1], [5]], [0, 1, 5]]
     return float(np.einsum("ki,kij,kj->k", error[10:], np.linalg.inv(planar[10:]), error[10:]).mean() / 3)
 

@@ -19,7 +19,7 @@ from lslam.core.config import Config, load_config
 from lslam.core.config.config import known_presets
 from lslam.core.errors import InterruptedRunError
 from lslam.core.types.sequence import StatedTimes
-from lslam.core.types.warned import MOST_ALIKE, hearing, warnings_so_far
+from lslam.core.types.warned import MOST_ALIKE, collect_warnings, warnings_so_far
 from lslam.odometry.frontend.checkpoints import CheckpointSchedule
 from lslam.pipeline import stages
 from lslam.pipeline.doctor.inspect import inspect
@@ -117,7 +117,7 @@ def test_keys_that_a_preset_set_are_not_warned_of(preset: str) -> None:
 
 
 def test_warnings_before_a_run_are_problems_of_the_run(tmp_path: Path) -> None:
-    with hearing():
+    with collect_warnings():
         LOG.warning("times.txt has 3 stamps")
         lslam.run(sample(4), config_of("map.write=false"), out=tmp_path / "out")
     assert manifest(tmp_path / "out")["problems"] == ["times.txt has 3 stamps"]
@@ -203,7 +203,7 @@ def test_a_failed_run_lists_its_warnings(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_similar_warnings_are_counted_and_listed_once() -> None:
-    with hearing() as heard:
+    with collect_warnings() as heard:
         for scan in range(100):
             LOG.warning("scan %d skipped: no points", scan)
         LOG.warning("icp: the frames look WRONG")

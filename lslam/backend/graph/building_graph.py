@@ -121,7 +121,7 @@ def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[i
         own = axes[:, values > FREE * values[-1]]
         others = np.flatnonzero((owners == match.building) & (np.arange(len(matches)) != k))
         away = measured[others] - measured[k]
-        away[:, 2] = se2.wrapped(away[:, 2])
+        away[:, 2] = se2.wrap(away[:, 2])
         is_near = np.einsum("mi,ij,mj->m", away, weights[k], away) <= quantile(PROBABILITY, max(match.rank, 1))
         shared = np.einsum("ia,mij,ja->ma", own, weights[others], own)
         knows = (shared >= ALIKE * np.einsum("ia,ij,ja->a", own, weights[k], own)).all(axis=1)
@@ -162,7 +162,7 @@ def _squared(
 ) -> Floats:
     """(M,) whitened squared residuals of the matches."""
     away = measured - solution[0][owners]
-    away[:, 2] = se2.wrapped(away[:, 2])
+    away[:, 2] = se2.wrap(away[:, 2])
     return np.asarray(np.einsum("mi,mij,mj->m", away, weights, away))
 
 

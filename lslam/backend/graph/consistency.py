@@ -99,7 +99,7 @@ class Ends:
 
 def as_twists(covariance: Floats, T: Floats) -> Floats:
     """Covariances of t' = t + d[:3], R' = exp(d[3:]) R as those of exp(xi) T."""
-    return noise.transported(covariance, -T[..., :3, 3])
+    return noise.transport(covariance, -T[..., :3, 3])
 
 
 def _against_odometry(graph: PoseGraph, ends: Ends, drift: Drift) -> tuple[Floats, Floats]:
@@ -107,7 +107,7 @@ def _against_odometry(graph: PoseGraph, ends: Ends, drift: Drift) -> tuple[Float
     odometry = se3.relative(graph.poses[ends.a], graph.poses[ends.b])
     turn = ends.T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2)
     twists = np.concatenate([ends.T[:, :3, 3] - odometry[:, :3, 3], so3.log(turn)], axis=1)
-    own = noise.transported(ends.covariances, ends.T[:, :3, 3])
+    own = noise.transport(ends.covariances, ends.T[:, :3, 3])
     return twists, drift.covariance(ends.a, ends.b) + own + _slack(len(ends.a))
 
 

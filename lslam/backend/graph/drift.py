@@ -93,13 +93,13 @@ def _accumulated(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
     """(K, 6, 6) of each pose in the world by steps to keyframes `b` (P,) from those before, of covariances `own` (P, 6, 6)."""
     # About one point the covariances of all steps add up.
     about_origin = np.zeros((len(poses), 6, 6))
-    about_origin[b] = noise.transported(noise.rotated(own, poses[b - 1, :3, :3]), -poses[b, :3, 3])
-    return noise.transported(np.cumsum(about_origin, axis=0), poses[:, :3, 3])
+    about_origin[b] = noise.transport(noise.rotate(own, poses[b - 1, :3, :3]), -poses[b, :3, 3])
+    return noise.transport(np.cumsum(about_origin, axis=0), poses[:, :3, 3])
 
 
 def _between(chain: Floats, poses: Floats, a: NDArray[np.intp], b: NDArray[np.intp]) -> Floats:
     """(P, 6, 6) of keyframes `b` relative to `a`, world axes."""
-    return np.asarray(chain[b] - noise.transported(chain[a], poses[b, :3, 3] - poses[a, :3, 3]))
+    return np.asarray(chain[b] - noise.transport(chain[a], poses[b, :3, 3] - poses[a, :3, 3]))
 
 
 def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drift: Floats) -> float:
@@ -111,7 +111,7 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drif
     turn = so3.log(T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2))
     error = np.concatenate([T[:, :3, 3] - odometry[:, :3, 3], turn], axis=1)
     own, grown = (
-        noise.rotated(_between(chain, graph.poses, a, b), np.swapaxes(R_a, -1, -2)) for chain in (white, drift)
+        noise.rotate(_between(chain, graph.poses, a, b), np.swapaxes(R_a, -1, -2)) for chain in (white, drift)
     )
     return _fitting(error, own + np.stack([c.covariance for c in few]), grown)
 

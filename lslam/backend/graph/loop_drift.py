@@ -105,7 +105,7 @@ class _Fit:
                 at_end[is_here] = effects[end[is_here] - k.start]
         self._rows = (at_ends[1] - at_ends[0]).reshape(-1, len(found))
         self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
-        self._chains = [noise.transported(chain, -P[:, :3, 3]) for chain in chains(graph, config)]
+        self._chains = [noise.transport(chain, -P[:, :3, 3]) for chain in chains(graph, config)]
         self._known, self._walk = (_shared(chain, ends) for chain in self._chains)
         self._known += _on_diagonal(moved(ends.covariances, P[ends.a]))
         roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS, _apart(graph.distances), is_smooth=False)
@@ -136,7 +136,7 @@ class _Fit:
             rest = effects - _walked_along(chain, np.arange(len(chain))[k], self._ends) @ weights
             spread = (rest.reshape(-1, len(covariance)) @ covariance).reshape(rest.shape)
             about_middle[k] = spread @ np.swapaxes(rest, -1, -2)
-        return noise.transported(about_middle, self._poses[:, :3, 3])
+        return noise.transport(about_middle, self._poses[:, :3, 3])
 
     def _choice(self) -> tuple[Floats, float]:
         """The prior covariance of the rates with maximum likelihood, and the variance of the random walk."""

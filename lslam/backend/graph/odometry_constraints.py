@@ -49,7 +49,7 @@ def odometry_constraints(
             covariance = fitness_covariance(fitness[k], config)
         else:
             grown = growth(a, b, after.distance - before.distance, config)
-            covariance = noise.rotated(grown, a.T_world_lidar[:3, :3].T)
+            covariance = noise.rotate(grown, a.T_world_lidar[:3, :3].T)
         covariance = in_plane(covariance) if config.planar else covariance
         constraints.append(Constraint(before.number, after.number, T, covariance, "odometry"))
     return constraints
@@ -95,7 +95,7 @@ def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Flo
         turn = np.deg2rad(config.drift_deg_per_100m) / 100 * way + LEAST_RAD
         sigma = 0.01 * config.drift_percent * way + LEAST_M
         return np.diag(np.repeat([sigma**2, turn**2], 3))
-    return positive(of_b - noise.transported(of_a, b.T_world_lidar[:3, 3] - a.T_world_lidar[:3, 3]))
+    return positive(of_b - noise.transport(of_a, b.T_world_lidar[:3, 3] - a.T_world_lidar[:3, 3]))
 
 
 def corrected(
@@ -169,8 +169,8 @@ def _covariance(
     grown = growth(first, last, way, config) + drift * drift_covariance(way, config)
     if result.registration_covariance is not None:
         grown = grown + result.registration_covariance
-    turned = noise.rotated(grown, so3.normalise(final[:3, :3] @ moved[:3, :3].T))
-    return np.asarray(noise.transported(covariance, step) + turned)
+    turned = noise.rotate(grown, so3.normalise(final[:3, :3] @ moved[:3, :3].T))
+    return np.asarray(noise.transport(covariance, step) + turned)
 
 
 def _of_map(result: ScanResult) -> Floats | None:

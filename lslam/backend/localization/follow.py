@@ -59,10 +59,8 @@ class MapFollower(Stateful):
         step = se3.relative(before.T_world_lidar, result.T_world_lidar)
         T = se3.normalise(self.T @ step)
         way = float(np.linalg.norm(step[:3, 3]))
-        grown = noise.rotated(
-            growth(before, result, way, self.config.graph), T[:3, :3] @ result.T_world_lidar[:3, :3].T
-        )
-        self.P = noise.transported(self.P, T[:3, 3] - self.T[:3, 3]) + grown + drift_covariance(way, self.config.graph)
+        grown = noise.rotate(growth(before, result, way, self.config.graph), T[:3, :3] @ result.T_world_lidar[:3, :3].T)
+        self.P = noise.transport(self.P, T[:3, 3] - self.T[:3, 3]) + grown + drift_covariance(way, self.config.graph)
         self.T = T
         self.way += way
 

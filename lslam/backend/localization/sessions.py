@@ -101,7 +101,7 @@ class Chain:
             first = int(self.firsts[n])
             for k, (a, b) in enumerate(zip(session.keyframes, session.keyframes[1:], strict=False), first):
                 T = se3.relative(a.T_world_lidar, b.T_world_lidar)
-                grown = noise.rotated(self._growth(a, b), a.T_world_lidar[:3, :3].T)
+                grown = noise.rotate(self._growth(a, b), a.T_world_lidar[:3, :3].T)
                 out.append(Constraint(k, k + 1, T, grown, "odometry"))
         return out
 
@@ -114,8 +114,8 @@ class Chain:
         for number, (own, T) in enumerate(zip(single, poses, strict=True)):
             if number:
                 before = poses[number - 1]
-                covariance = noise.transported(covariance, T[:3, 3] - before[:3, 3])
-                covariance = covariance + noise.rotated(constraints[number - 1].covariance, before[:3, :3])
+                covariance = noise.transport(covariance, T[:3, 3] - before[:3, 3])
+                covariance = covariance + noise.rotate(constraints[number - 1].covariance, before[:3, :3])
                 is_break = number in self.firsts
                 distance += self.config.loops.min_travel if is_break else own.distance - single[number - 1].distance
             out.append(Keyframe(number, own.scan, own.stamp_ns, T, covariance, distance))
@@ -129,7 +129,7 @@ class Chain:
             turn = np.deg2rad(c.drift_deg_per_100m) / 100 * way
             return np.asarray(np.diag(np.repeat([(0.01 * c.drift_percent * way) ** 2, turn**2], 3)) + least)
         step = b.T_world_lidar[:3, 3] - a.T_world_lidar[:3, 3]
-        return positive(b.covariance - noise.transported(a.covariance, step)) + least
+        return positive(b.covariance - noise.transport(a.covariance, step)) + least
 
     def _break(self, n: int) -> Constraint:
         """The initial tie of a session to the end of the one before, as uncertain as odometry leaves it over the ways between."""

@@ -64,13 +64,13 @@ def unit_of(key: str) -> str:
     return found[1] if found else ""
 
 
-def with_unit(key: str, shown: str = "") -> str:
-    """A key, or what is shown in its place, as axes and columns name it.
+def with_unit(key: str, label: str = "") -> str:
+    """A key, or the label in its place, as axes and columns name it.
 
     >>> with_unit("map.voxel"), with_unit("map.voxel", "voxel"), with_unit("input.skip_frames")
     ('map.voxel, m', 'voxel, m', 'input.skip_frames')
     """
-    return ", ".join(filter(None, (shown or key, unit_of(key))))
+    return ", ".join(filter(None, (label or key, unit_of(key))))
 
 
 def known_presets() -> dict[str, str]:
@@ -95,7 +95,7 @@ def read_preset(name: str) -> dict[str, Any]:
 
 
 def _presets() -> dict[str, str]:
-    return shipped("lslam.core.config", "presets")
+    return read_package_files("lslam.core.config", "presets")
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 @cache
-def shipped(package: str, folder: str) -> dict[str, str]:
+def read_package_files(package: str, folder: str) -> dict[str, str]:
     """Text of each TOML file that ships in a folder of a package of ours by name, in the order of the files."""
     files = sorted(resources.files(package).joinpath(folder).iterdir(), key=lambda file: file.name)
     return {f.name.removesuffix(".toml"): f.read_text(encoding="utf-8") for f in files if f.name.endswith(".toml")}

@@ -280,15 +280,15 @@ class FrontEndConfig(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _with_needed_imu(cls, given: Any) -> Any:
+    def _with_needed_imu(cls, tree: Any) -> Any:
         """A tightly coupled method cannot do without the IMU.
 
         >>> FrontEndConfig.model_validate({"odometry": {"method": "fast-lio2"}}).imu.use
         True
         """
-        odometry = given.get("odometry") if isinstance(given, dict) else None
+        odometry = tree.get("odometry") if isinstance(tree, dict) else None
         method = odometry.get("method") if isinstance(odometry, dict) else getattr(odometry, "method", None)
         if method not in TIGHTLY_COUPLED:
-            return given
-        imu = given.get("imu", {})
-        return {**given, "imu": {**(imu if isinstance(imu, dict) else imu.model_dump()), "use": True}}
+            return tree
+        imu = tree.get("imu", {})
+        return {**tree, "imu": {**(imu if isinstance(imu, dict) else imu.model_dump()), "use": True}}

@@ -16,10 +16,10 @@ from lslam.core.geometry import so3
 Floats = NDArray[np.float64]
 
 
-def changes(T: NDArray[Any], changed: NDArray[Any]) -> Floats:
-    """(..., 6) d that lead from poses `T` to `changed` (..., 4, 4)."""
-    turns = so3.log(changed[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2))
-    return np.concatenate([changed[..., :3, 3] - T[..., :3, 3], turns], axis=-1)
+def changes(T: NDArray[Any], after: NDArray[Any]) -> Floats:
+    """(..., 6) d that lead from poses `T` to `after` (..., 4, 4)."""
+    turns = so3.log(after[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2))
+    return np.concatenate([after[..., :3, 3] - T[..., :3, 3], turns], axis=-1)
 
 
 def to_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
@@ -34,7 +34,7 @@ def from_body(covariance: NDArray[Any], T: NDArray[Any]) -> Floats:
     return np.asarray(J @ np.asarray(covariance, np.float64) @ np.swapaxes(J, -1, -2))
 
 
-def transported(covariance: NDArray[Any], step: NDArray[Any]) -> Floats:
+def transport(covariance: NDArray[Any], step: NDArray[Any]) -> Floats:
     """(..., 6, 6) covariance of a pose, carried to one that is `step` (..., 3), m, further: a turn moves what lies ahead."""
     F = np.zeros((*np.asarray(step).shape[:-1], 6, 6))
     F[...] = np.eye(6)
@@ -42,7 +42,7 @@ def transported(covariance: NDArray[Any], step: NDArray[Any]) -> Floats:
     return np.asarray(F @ np.asarray(covariance, np.float64) @ np.swapaxes(F, -1, -2))
 
 
-def rotated(covariance: NDArray[Any], R: NDArray[Any]) -> Floats:
+def rotate(covariance: NDArray[Any], R: NDArray[Any]) -> Floats:
     """(..., 6, 6) covariances with both halves turned by `R` (..., 3, 3), from one frame's axes into another's."""
     R = np.asarray(R, np.float64)
     B = np.zeros((*R.shape[:-2], 6, 6))

@@ -21,7 +21,7 @@ class Normal:
 
     def step(self) -> Floats:
         """(N,) the update to the minimum; NaN where H is not positive definite."""
-        return -linalg.solved(self.H, self.g)
+        return -linalg.solve(self.H, self.g)
 
     def without(self, out: NDArray[np.bool_]) -> Normal:
         """The Schur complement: the variables `out` (N,) are marginalised."""

@@ -224,7 +224,7 @@ def _sine_cosine(x: Array) -> tuple[Array, Array]:
 
 def _sine_cosine_block(x: Array) -> tuple[Array, Array]:
     turns = np.rint(np.where(np.isfinite(x), x, 0.0) * _TWO_OVER_PI)
-    r, tail = _reduced(x, turns)
+    r, tail = _reduce(x, turns)
     s, c = _kernels(r, tail)
     quarter = turns.astype(np.int64) & 3
     is_odd = (quarter & 1) == 1
@@ -237,7 +237,7 @@ def sine_cosine_of(x: float) -> tuple[float, float]:
     if x - x != 0:
         return np.nan, np.nan
     turns = float(round(x * _TWO_OVER_PI))
-    s, c = _kernels(*_reduced(x, turns))
+    s, c = _kernels(*_reduce(x, turns))
     match int(turns) & 3:
         case 0:
             return s, c
@@ -249,7 +249,7 @@ def sine_cosine_of(x: float) -> tuple[float, float]:
             return -c, s
 
 
-def _reduced(x: Any, turns: Any) -> tuple[Any, Any]:
+def _reduce(x: Any, turns: Any) -> tuple[Any, Any]:
     """What is left of angles after quarter turns, as the sum of two numbers."""
     left = x - turns * _HALF_PI[0]
     step = turns * _HALF_PI[1]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def wrapped(angle: NDArray[Any] | float) -> Floats:
+def wrap(angle: NDArray[Any] | float) -> Floats:
     """Angles, rad, in -pi..pi."""
     return np.asarray((np.asarray(angle, np.float64) + np.pi) % (2 * np.pi) - np.pi)
 
@@ -27,7 +27,7 @@ def compose(a: NDArray[Any], b: NDArray[Any]) -> Floats:
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
     y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, wrapped(a[..., 2] + b[..., 2])], axis=-1)
+    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
 
 
 def inverse(pose: NDArray[Any]) -> Floats:
@@ -35,7 +35,7 @@ def inverse(pose: NDArray[Any]) -> Floats:
     pose = np.asarray(pose, np.float64)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x, y = pose[..., 0], pose[..., 1]
-    return np.stack([-c * x - s * y, s * x - c * y, wrapped(-pose[..., 2])], axis=-1)
+    return np.stack([-c * x - s * y, s * x - c * y, wrap(-pose[..., 2])], axis=-1)
 
 
 def relative(a: NDArray[Any], b: NDArray[Any]) -> Floats:

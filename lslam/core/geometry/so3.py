@@ -214,7 +214,7 @@ def normalise(R: NDArray[Any]) -> Floats:
     """Nearest rotation to (..., 3, 3) matrices that rounding moved off SO(3)."""
     R = np.asarray(R, np.float64)
     if R.ndim == 2 and np.isfinite(R).all():
-        return _normalised(R)
+        return _normalise_one(R)
     for _ in range(6):
         # Newton and Schulz's iteration for the polar factor squares the distance; far off the singular vectors tell.
         off = portable.product(np.swapaxes(R, -1, -2), R) - np.eye(3)
@@ -227,7 +227,7 @@ def normalise(R: NDArray[Any]) -> Floats:
     return R if bool(np.all(np.linalg.det(R) > 0)) else _nearest(R)
 
 
-def _normalised(R: Floats) -> Floats:
+def _normalise_one(R: Floats) -> Floats:
     """The same operations on plain floats, with the same results."""
     rows = R.tolist()
     for _ in range(6):

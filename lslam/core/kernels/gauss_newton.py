@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from lslam.core.kernels.jit import inline, inline_with_arrays, kernel
-from lslam.core.kernels.linalg import eigen, extent, rotate_left
+from lslam.core.kernels.linalg import eigen, extent, rotate_in_place
 from lslam.core.kernels.linearisation import INFORMATION, LEVER, MATCHED, POPULATION, Floats, Pose, Sums
 from lslam.core.kernels.residuals import solve_on_surfaces
 
@@ -21,7 +21,7 @@ ROUNDING_SHARE = 1e-12
 
 
 @inline_with_arrays
-def solve_observed(
+def solve_guarded_step(
     H: Floats, g: Floats, facts: Floats, weak_share: float, least: float, unseen: float, d: Floats, weak: Floats
 ) -> int:
     """Step d = -inv(H) g, (6,) m and rad, in the observed directions; returns the number of degenerate ones, rows of `weak`.
@@ -88,7 +88,7 @@ def move_by(d: Floats, move: float, turn: float, scale: float, R: Floats, t: Flo
     t[0] += d[0]
     t[1] += d[1]
     t[2] += d[2]
-    rotate_left(R, d[3], d[4], d[5])
+    rotate_in_place(R, d[3], d[4], d[5])
     return True
 
 
@@ -106,16 +106,16 @@ def scale_by_population(H: Floats, S: Floats, g: Floats, facts: Floats) -> None:
 
 
 @inline_with_arrays
-def within(allowed: Floats, H: Floats) -> Floats:
-    """A H A, the information (6, 6) along the directions on which A = `allowed` (6, 6) projects; H where it has no rows."""
-    if len(allowed) == 0:
+def within(projector: Floats, H: Floats) -> Floats:
+    """A H A, the information (6, 6) along the directions on which A = `projector` (6, 6) projects; H where it has no rows."""
+    if len(projector) == 0:
         return H
     A = np.zeros((6, 6))
     for i in range(6):
         for k in range(6):
             for m in range(6):
                 for j in range(6):
-                    A[i, j] += allowed[i, k] * H[k, m] * allowed[m, j]
+                    A[i, j] += projector[i, k] * H[k, m] * projector[m, j]
     return A
 
 
@@ -130,14 +130,14 @@ def make_whole(sums: Sums) -> None:
 
 @kernel
 def step(
-    pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats, weak: Floats
+    pose: Pose, sums: Sums, scale: float, limits: Limits, projector: Floats, d: Floats, weak: Floats
 ) -> tuple[bool, int, float, float]:
     """Move the pose by one step in the observed directions, and write the step to d (6,), m and rad.
 
     sums : of a linearisation; H has its upper triangle alone, and is filled in
     scale : width of the robust kernel, m
     limits : `weak_share`, `least` and `unseen` of `solve_observed`
-    allowed : (6, 6) projector on the directions that may be estimated; (0, 6) allows all
+    projector : (6, 6) on the directions that may be estimated; (0, 6) allows all
     weak : (6, 6), whose first rows become the degenerate directions
 
     Returns whether the step is finite, the number of degenerate directions, and the step's translation, m, and rotation, rad.
@@ -146,27 +146,27 @@ def step(
     H, _, g, facts = sums
     make_whole(sums)
     # Directions that the projector excludes have eigenvalue 0, so that their part of g does not enter the step.
-    count = solve_observed(within(allowed, H), g, facts, limits[0], limits[1], limits[2], d, weak)
+    count = solve_guarded_step(within(projector, H), g, facts, limits[0], limits[1], limits[2], d, weak)
     move, turn = step_norms(d)
     return move_by(d, move, turn, scale, R, t), count, move, turn
 
 
 @kernel
 def step_on_surfaces(
-    pose: Pose, sums: Sums, scale: float, limits: Limits, allowed: Floats, d: Floats, weak: Floats
+    pose: Pose, sums: Sums, scale: float, limits: Limits, projector: Floats, d: Floats, weak: Floats
 ) -> tuple[bool, int, float, float]:
     """As `step`, with degenerate directions by S; a kernel of its own, so that runs of other residuals need not compile it."""
     R, t = pose
     H, S, g, facts = sums
     make_whole(sums)
     mirror(S)
-    count = solve_on_surfaces(within(allowed, H), within(allowed, S), g, facts, limits[0], limits[1], d, weak)
+    count = solve_on_surfaces(within(projector, H), within(projector, S), g, facts, limits[0], limits[1], d, weak)
     move, turn = step_norms(d)
     return move_by(d, move, turn, scale, R, t), count, move, turn
 
 
 @kernel
-def trimmed(away2: Floats, share: float, gate2: float) -> float:
+def trimming_bound(away2: Floats, share: float, gate2: float) -> float:
     """Squared distance, m2, within which `share` of the matched points within `gate2` lie: that quantile of `away2` (S,).
 
     Unmatched points have a negative distance. Bisection needs no copy and no sort, and is the same for any order of points.

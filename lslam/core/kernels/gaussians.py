@@ -43,7 +43,7 @@ def find(key: int, keys: Longs, table: Ints) -> int:
 
 @inline
 def _claim(
-    key: int, moments: Floats, planes: Floats, keys: Longs, refreshed: Floats, table: Ints, state: Longs, free: Ints
+    key: int, moments: Floats, planes: Floats, keys: Longs, counts: Floats, table: Ints, state: Longs, free: Ints
 ) -> int:
     """Slot of a key, taking a fresh one when it is new; -1 when the pool is full."""
     h = place_of(key, keys, table)
@@ -61,7 +61,7 @@ def _claim(
     keys[slot] = key
     moments[slot] = 0.0
     planes[slot, 7] = EMPTY
-    refreshed[slot] = 0.0
+    counts[slot] = 0.0
     state[LIVE] += 1
     return slot
 
@@ -99,7 +99,7 @@ def _refresh(
     min_points: float,
     planarity: float,
     floor: float,
-    shared: float,
+    common: float,
     breadth: float,
 ) -> None:
     """Mean, normal and kind of one voxel, its row of `planes`, from its moments.
@@ -135,7 +135,7 @@ def _refresh(
         p[6] = max(l0, 0.0) + floor
         # The normal of a narrow strip is uncertain about the strip's axis. The scatter of points averages out, what those of a
         # scan share does not.
-        p[7] = (p[6] / n + shared) / max(l1, 1e-12)
+        p[7] = (p[6] / n + common) / max(l1, 1e-12)
     else:
         p[6] = max((l0 + l1 + l2) / 3.0, 0.0) + floor
         p[7] = BLOB
@@ -173,13 +173,13 @@ def insert(
     min_points: float,
     planarity: float,
     floor: float,
-    shared: float,
+    common: float,
     breadth: float,
     reach: float,
     moments: Floats,
     planes: Floats,
     keys: Longs,
-    refreshed: Floats,
+    counts: Floats,
     table: Ints,
     state: Longs,
     free: Ints,
@@ -231,7 +231,7 @@ def insert(
             if key != last_key:
                 slot = int(likely[k])
                 if slot < 0:
-                    slot = _claim(key, moments, planes, keys, refreshed, table, state, free)
+                    slot = _claim(key, moments, planes, keys, counts, table, state, free)
                 last_key = key
                 if slot >= 0:
                     touched[count] = slot
@@ -257,13 +257,13 @@ def insert(
     for j in range(count):
         slot = int(np.int64(touched[j]))  # of one type wherever `_refresh` is called: it is compiled once
         s = moments[slot]
-        if s[0] >= 1.1 * refreshed[slot]:
+        if s[0] >= 1.1 * counts[slot]:
             if s[0] > cap:
                 w = cap / s[0]
                 for k in range(13):
                     s[k] *= w
-            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, shared, breadth)
-            refreshed[slot] = s[0]
+            _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, common, breadth)
+            counts[slot] = s[0]
     _evict(2 * count, t, size, reach, keys, table, state, free, planes)
     return lost
 
@@ -291,10 +291,10 @@ def _evict(
 
 
 @kernel
-def rehash(keys: Longs, table: Ints, used: int) -> None:
+def rehash(keys: Longs, table: Ints, size: int) -> None:
     """Fill an empty table with the keys of a grown pool."""
     mask = len(table) - 1
-    for slot in range(used):
+    for slot in range(size):
         if keys[slot] != FREE:
             h = hash_key(keys[slot], mask)
             while table[h] >= 0:
@@ -309,28 +309,28 @@ def coarsen(
     min_points: float,
     planarity: float,
     floor: float,
-    shared: float,
+    common: float,
     breadth: float,
     fine_moments: Floats,
     fine_keys: Longs,
-    used: int,
+    pool_size: int,
     moments: Floats,
     planes: Floats,
     keys: Longs,
-    refreshed: Floats,
+    counts: Floats,
     table: Ints,
     state: Longs,
     free: Ints,
 ) -> None:
     """Fill an empty map of voxels of `size`, m, = factor * fine size with the moments of a finer map, which add up exactly."""
     fine = size / factor
-    for j in range(used):
+    for j in range(pool_size):
         key = fine_keys[j]
         if key == FREE:
             continue
         ix, iy, iz = (key >> 42) - OFFSET, ((key >> 21) & MASK) - OFFSET, (key & MASK) - OFFSET
         cx, cy, cz = ix // factor, iy // factor, iz // factor
-        slot = _claim(pack(cx, cy, cz), moments, planes, keys, refreshed, table, state, free)
+        slot = _claim(pack(cx, cy, cz), moments, planes, keys, counts, table, state, free)
         if slot < 0:
             continue
         ox, oy, oz = (
@@ -355,5 +355,5 @@ def coarsen(
         s[11] += m[11] + n * oy
         s[12] += m[12] + n * oz
     for slot in range(state[USED]):
-        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, shared, breadth)
-        refreshed[slot] = moments[slot, 0]
+        _refresh(slot, size, moments, planes, keys, min_points, planarity, floor, common, breadth)
+        counts[slot] = moments[slot, 0]

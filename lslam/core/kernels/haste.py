@@ -50,13 +50,13 @@ def remember_signatures() -> None:
     function, stack = _numba("core.types.functions").BaseFunction, _numba("core.targetconfig").ConfigStack
     resolve, flags = function.get_call_type, stack.top_or_none
 
-    def remembered(called: Any, context: Any, args: Any, kws: Any) -> Any:
+    def remembered(function_type: Any, context: Any, args: Any, kws: Any) -> Any:
         if kws or not all(a.is_precise() for a in args):
-            return resolve(called, context, args, kws)
-        known = called.__dict__.setdefault("_lslam_signatures", {})
+            return resolve(function_type, context, args, kws)
+        known = function_type.__dict__.setdefault("_lslam_signatures", {})
         key = context, tuple(args), flags()
         if key not in known:
-            known[key] = resolve(called, context, args, kws)
+            known[key] = resolve(function_type, context, args, kws)
         return known[key]
 
     function.get_call_type = remembered

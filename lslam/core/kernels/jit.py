@@ -66,7 +66,7 @@ _register("numba:compile", _compiled)
 _when_ready: list[Callable[[str, bool], None]] = []
 
 
-def has_compiled() -> bool:
+def did_compile() -> bool:
     """Whether this process has compiled a kernel, and not only loaded some."""
     return _compiled.has_called
 
@@ -81,13 +81,13 @@ def kernel(function: F) -> F:
     return cast(F, compiled)
 
 
-def _share(compiled: Any) -> None:
+def _share(dispatcher: Any) -> None:
     """Let one process compile a kernel while others that need it wait, and then load it.
 
     A damaged or full cache means to compile again: numba passes on every error of unpickling and writing.
     """
-    cache, held = compiled._cache, contextlib.ExitStack()
-    save, name = cache.save_overload, compiled.py_func.__qualname__
+    cache, held = dispatcher._cache, contextlib.ExitStack()
+    save, name = cache.save_overload, dispatcher.py_func.__qualname__
 
     def found(signature: Any, context: Any) -> Any:
         try:
@@ -125,11 +125,11 @@ def _share(compiled: Any) -> None:
     cache.load_overload, cache.save_overload = load_or_wait, save_if_possible
 
 
-def _wait_for(held: contextlib.ExitStack, folder: Path, name: str) -> None:
+def _wait_for(locks: contextlib.ExitStack, folder: Path, name: str) -> None:
     import fcntl
 
     folder.mkdir(parents=True, exist_ok=True)
-    fcntl.flock(held.enter_context((folder / f"{name}.lock").open("a")), fcntl.LOCK_EX)
+    fcntl.flock(locks.enter_context((folder / f"{name}.lock").open("a")), fcntl.LOCK_EX)
 
 
 def _tell(name: str, is_ready: bool) -> None:
@@ -143,25 +143,25 @@ def inline(function: F) -> F:
     Without numba's runtime the references to its array arguments are not counted at each call. Counting takes two atomic
     operations per array, ten times the cost of a lookup in a hash table.
     """
-    return _inlined(function, _nrt=False)
+    return _compile_inline(function, _nrt=False)
 
 
 def inline_with_arrays(function: F) -> F:
     """As `inline`, for functions that allocate arrays. References are counted at each call: for one call per step at most."""
-    return _inlined(function)
+    return _compile_inline(function)
 
 
-class _Inlined(CPUDispatcher):
+class _InlineDispatcher(CPUDispatcher):
     """Function without an entry for Python, where its source runs."""
 
     def __call__(self, *args: Any) -> Any:
         return self.py_func(*args)
 
 
-def _inlined(function: F, **more: bool) -> F:
+def _compile_inline(function: F, **more: bool) -> F:
     options: dict[str, Any] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True} | more
     compiled: Any = numba.njit(**options)(function)
-    compiled.__class__ = _Inlined
+    compiled.__class__ = _InlineDispatcher
     return cast(F, compiled)
 
 
@@ -171,7 +171,7 @@ def lock_file() -> Path | None:
 
 
 @contextlib.contextmanager
-def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
+def announce_compiling(log: logging.Logger, on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Log a line when the first kernel is compiled within the block, and call `on_first`; loading kernels does neither."""
 
     def announce() -> None:
@@ -187,7 +187,7 @@ def announced(log: logging.Logger, on_first: Callable[[], None] = lambda: None) 
 
 
 @contextlib.contextmanager
-def counted(log: logging.Logger, total: int | None, every_s: float = 2.0) -> Iterator[None]:
+def count_kernels(log: logging.Logger, total: int | None, every_s: float = 2.0) -> Iterator[None]:
     """Log, every now and then within the block, which kernel is compiled, and how many are ready; `total` : of how many.
 
     Loading says nothing.

@@ -99,7 +99,7 @@ def eigen(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.
 
 
 @inline
-def rotate_left(R: NDArray[np.float64], wx: float, wy: float, wz: float) -> None:
+def rotate_in_place(R: NDArray[np.float64], wx: float, wy: float, wz: float) -> None:
     """R <- exp((wx, wy, wz)) R in place, then back onto SO(3) by Gram-Schmidt of its rows."""
     theta2 = wx * wx + wy * wy + wz * wz
     theta = math.sqrt(theta2)
@@ -293,7 +293,7 @@ def complement(A: Floats, B: Floats, C: Floats) -> Floats:
 
 
 @kernel
-def solved(A: Floats, b: Floats) -> Floats:
+def solve(A: Floats, b: Floats) -> Floats:
     """Solution x (N,) of A x = b with A (N, N) and b (N,)."""
     n = len(b)
     scale, L, column, x = np.empty(n), np.zeros((n, n)), np.empty(n), np.empty(n)

@@ -46,12 +46,10 @@ def place(source: Floats, i: int, R: Floats, t: Floats) -> tuple[float, float, f
 
 
 @inline
-def add_facts(
-    facts: Floats, information: float, squared: float, robust: float, rx: float, ry: float, rz: float
-) -> None:
+def add_facts(facts: Floats, information: float, square: float, robust: float, rx: float, ry: float, rz: float) -> None:
     """Sums of one residual at a point r, seen from the sensor: its information, its weighted square and its robust weight."""
     facts[INFORMATION] += information
-    facts[SQUARED] += squared
+    facts[SQUARED] += square
     facts[LEVER] += information * (rx * rx + ry * ry + rz * rz)
     facts[ROBUST] += robust
 
@@ -84,19 +82,19 @@ def octant_slots(
 
 @inline
 def nearest(
-    x: float, y: float, z: float, i: int, slots: Ints, chosen: Ints, asked: Floats, planes: Floats
+    x: float, y: float, z: float, i: int, slots: Ints, last_slots: Ints, spheres: Floats, planes: Floats
 ) -> tuple[int, float, int, float]:
     """Nearest plane and nearest blob among the slots of point i: for each the slot, or -1, and its mean's squared distance, m2.
 
     The nearest one stays the same while the point moves by less than half of the difference between the distances to the
     second nearest and to the nearest one. The blob is kept up to date only without a plane.
-    chosen : (S, 2) plane and blob found last; asked : (S, 4) where the point was then, m, and the squared distance, m2, within
-        which they stay the same
+    last_slots : (S, 2) plane and blob found last
+    spheres : (S, 4) where the point was then, m, and the squared distance, m2, within which they stay the same
     """
-    best, blob = int(chosen[i, 0]), int(chosen[i, 1])
+    best, blob = int(last_slots[i, 0]), int(last_slots[i, 1])
     best_d, blob_d = 1e300, 1e300
-    moved2 = (x - asked[i, 0]) ** 2 + (y - asked[i, 1]) ** 2 + (z - asked[i, 2]) ** 2
-    if moved2 < asked[i, 3]:
+    moved2 = (x - spheres[i, 0]) ** 2 + (y - spheres[i, 1]) ** 2 + (z - spheres[i, 2]) ** 2
+    if moved2 < spheres[i, 3]:
         if best >= 0:
             best_d = (x - planes[best, 0]) ** 2 + (y - planes[best, 1]) ** 2 + (z - planes[best, 2]) ** 2
         elif blob >= 0:
@@ -118,10 +116,10 @@ def nearest(
         next_blob_d = min(next_blob_d, max(blob_d, far_d))
         blob = s if far_d < blob_d else blob
         blob_d = min(blob_d, far_d)
-    chosen[i, 0], chosen[i, 1] = best, blob
-    asked[i, 0], asked[i, 1], asked[i, 2] = x, y, z
+    last_slots[i, 0], last_slots[i, 1] = best, blob
+    spheres[i, 0], spheres[i, 1], spheres[i, 2] = x, y, z
     margin = math.sqrt(next_d) - math.sqrt(best_d) if best >= 0 else math.sqrt(next_blob_d) - math.sqrt(blob_d)
-    asked[i, 3] = 0.25 * margin * margin if best >= 0 or blob >= 0 else 1e300
+    spheres[i, 3] = 0.25 * margin * margin if best >= 0 or blob >= 0 else 1e300
     return best, best_d, blob, blob_d
 
 
@@ -306,10 +304,10 @@ def add_information(
 # directions are found without it, and the pose keeps the motion prior along them.
 @inline
 def add_surface(
-    S: Floats, unused: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float, rz: float
+    S: Floats, rest: Floats, w: float, nx: float, ny: float, nz: float, rx: float, ry: float, rz: float
 ) -> None:
-    """Upper triangle of S (6, 6) += w j j^T with j = [n, r x n]; `unused` (6,) takes no gradient."""
-    add_information(S, unused, w, nx * nx, nx * ny, nx * nz, ny * ny, ny * nz, nz * nz, 0.0, 0.0, 0.0, rx, ry, rz)
+    """Upper triangle of S (6, 6) += w j j^T with j = [n, r x n]; `rest` (6,) takes no gradient."""
+    add_information(S, rest, w, nx * nx, nx * ny, nx * nz, ny * ny, ny * nz, nz * nz, 0.0, 0.0, 0.0, rx, ry, rz)
 
 
 @inline

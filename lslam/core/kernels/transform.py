@@ -13,19 +13,19 @@ Floats = NDArray[np.float32]
 
 
 @kernel
-def transform(points: NDArray[np.float32], T: NDArray[np.float64], moved: NDArray[np.float32]) -> None:
-    """Write T (4, 4) applied to points (N, 3), m, into `moved` (N, 3); computed in float64."""
+def transform(points: NDArray[np.float32], T: NDArray[np.float64], out: NDArray[np.float32]) -> None:
+    """Write T (4, 4) applied to points (N, 3), m, into `out` (N, 3); computed in float64."""
     for i in range(len(points)):
         x, y, z = float(points[i, 0]), float(points[i, 1]), float(points[i, 2])
         for j in range(3):
-            moved[i, j] = T[j, 0] * x + T[j, 1] * y + T[j, 2] * z + T[j, 3]
+            out[i, j] = T[j, 0] * x + T[j, 1] * y + T[j, 2] * z + T[j, 3]
 
 
 @kernel
 def deskew(
-    points: Any, times: NDArray[np.float32], start: float, step: float, knots: NDArray[np.float64], moved: Any
+    points: Any, times: NDArray[np.float32], start: float, step: float, knots: NDArray[np.float64], out: Any
 ) -> None:
-    """Write points (N, 3), m, transformed by the pose at their times (N,), s, to `moved` (N, 3).
+    """Write points (N, 3), m, transformed by the pose at their times (N,), s, to `out` (N, 3).
 
     knots : (K, 3, 4) transforms at start, start + step, ..., s. Matrices are interpolated linearly between two knots, and
         extrapolated from the outer pair before the first and after the last one.
@@ -41,7 +41,7 @@ def deskew(
         p, q = knots[k], knots[k + 1]
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for j in range(3):
-            moved[i, j] = (
+            out[i, j] = (
                 (a * p[j, 0] + b * q[j, 0]) * x
                 + (a * p[j, 1] + b * q[j, 1]) * y
                 + (a * p[j, 2] + b * q[j, 2]) * z

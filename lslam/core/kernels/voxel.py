@@ -77,7 +77,7 @@ def gate(
 
 
 @kernel
-def gated(
+def select_in_gate(
     points: NDArray[np.float32],
     times: NDArray[np.float32],
     range_min: float,
@@ -291,7 +291,7 @@ def means(
 
 
 @kernel
-def accompanied(
+def find_neighboured_cells(
     points: NDArray[np.float32], counts: NDArray[np.int32], least: float, size: float, least_around: float
 ) -> NDArray[np.int64]:
     """Indices of the points (N, 3) whose count times range reaches `least`, and whose voxel's count reaches `least_around`.

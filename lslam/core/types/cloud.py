@@ -121,7 +121,7 @@ def bounds(cloud: Cloud) -> tuple[Floats, Floats]:
     return (low, high) if np.isfinite(low).all() else (np.full(3, np.nan), np.full(3, np.nan))
 
 
-def thinned(cloud: Cloud, most: int, columns: Sequence[str] = ()) -> ArrayCloud:
+def thin_out(cloud: Cloud, most: int, columns: Sequence[str] = ()) -> ArrayCloud:
     """At most `most` points of a cloud, the same ones every time: one of each run of so many points of its order.
 
     Which one is as good as random, since every n-th point of a voxel map draws stripes.

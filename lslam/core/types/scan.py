@@ -19,7 +19,7 @@ LEVER_M = 10.0
 NO_RING = 65535
 
 
-def is_measured(points: NDArray[Any]) -> Bools:
+def has_return(points: NDArray[Any]) -> Bools:
     """(N,) whether points (N, 3), m, are somewhere a LiDAR sees: NaN, zeros and numbers beyond reason stand for no return."""
     with np.errstate(invalid="ignore"):
         return np.asarray((np.abs(points) < FARTHEST_M).all(axis=1) & (points != 0).any(axis=1))

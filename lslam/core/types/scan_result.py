@@ -33,7 +33,7 @@ class StageClock:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
 
 
-def summed(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
+def sum_stages(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Seconds per stage of several scans, in the order in which the stages come first."""
     found: dict[str, float] = {}
     for row in rows:
@@ -50,7 +50,7 @@ class KeyframeClocks(defaultdict[int, StageClock]):
 
     def totals(self) -> dict[str, float]:
         """Seconds per stage of all keyframes."""
-        return summed(self[number].seconds for number in sorted(self))
+        return sum_stages(self[number].seconds for number in sorted(self))
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ class ScanResult:
         R = T[:3, :3]
 
         def turned(covariance: Floats | None) -> Floats | None:
-            return None if covariance is None else noise.rotated(covariance, R)
+            return None if covariance is None else noise.rotate(covariance, R)
 
         return replace(
             self,

@@ -30,13 +30,13 @@ class Warnings(logging.Filter):
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Remember a warning of this run."""
-        if record.levelno >= logging.WARNING and _heard.get() is self:
+        if record.levelno >= logging.WARNING and _collector.get() is self:
             self._places.setdefault(_text(record), f"{record.module}:{record.lineno}")
         return True
 
-    def beyond(self, told: Collection[str]) -> list[str]:
-        """The sentences that say more than what is `told` already, of many alike the first."""
-        new = [(text, place) for text, place in list(self._places.items()) if not _is_told(text, told)]
+    def beyond(self, messages: Collection[str]) -> list[str]:
+        """The sentences that say more than the `messages` do already, of many alike the first."""
+        new = [(text, place) for text, place in list(self._places.items()) if not _repeats(text, messages)]
         alike, seen = Counter(place for _, place in new), Counter[str]()
         said = []
         for text, place in new:
@@ -58,18 +58,18 @@ class Warnings(logging.Filter):
             self._places.setdefault(text, place)
 
 
-_heard: ContextVar[Warnings | None] = ContextVar("lslam_warnings", default=None)
+_collector: ContextVar[Warnings | None] = ContextVar("lslam_warnings", default=None)
 
 
 def warnings_so_far() -> Warnings:
     """Those of the run in whose context this is; where there is none, some that nobody looks at."""
-    return _heard.get() or Warnings()
+    return _collector.get() or Warnings()
 
 
 @contextmanager
-def hearing() -> Iterator[Warnings]:
+def collect_warnings() -> Iterator[Warnings]:
     """Hear the warnings of the block, after those of a block around it: a run may begin before `run` is called."""
-    heard, outer = Warnings(), _heard.get()
+    heard, outer = Warnings(), _collector.get()
     if outer is not None:
         heard.take_over(outer.state())
     level = log.level
@@ -77,18 +77,18 @@ def hearing() -> Iterator[Warnings]:
     if is_deaf:
         log.setLevel(logging.WARNING)
     log.addFilter(heard)
-    token = _heard.set(heard)
+    token = _collector.set(heard)
     try:
         yield heard
     finally:
-        _heard.reset(token)
+        _collector.reset(token)
         log.removeFilter(heard)
         if is_deaf:
             log.setLevel(level)
 
 
-def _is_told(text: str, told: Collection[str]) -> bool:
-    return any(sentence and sentence in text for sentence in told)
+def _repeats(text: str, messages: Collection[str]) -> bool:
+    return any(sentence and sentence in text for sentence in messages)
 
 
 def _text(record: logging.LogRecord) -> str:

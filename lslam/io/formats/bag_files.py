@@ -23,7 +23,7 @@ import numpy as np
 
 from lslam.core.errors import InputError, OutputError, UsageError, cause, input_errors
 from lslam.core.kernels.cache import cache_folder
-from lslam.core.printable import shown
+from lslam.core.printable import first_of
 from lslam.core.types.arrays import Longs
 from lslam.io.formats.bag_chunks import LARGEST, Topic, damage, unpack, zstd
 from lslam.io.formats.bag_listing import SUFFIXES, left_out, list_bag_files, missing_parts, packing_of, suffix_of
@@ -199,7 +199,7 @@ def _recordings(files: list[Path], notes: list[str], losses: list[str]) -> list[
     if packed:
         are = "is" if len(packed) == 1 else "are"
         notes.append(
-            f"{shown(packed)} {are} compressed as a whole: unpacked in the user's cache for as long as the recording is read"
+            f"{first_of(packed)} {are} compressed as a whole: unpacked in the user's cache for as long as the recording is read"
         )
     return recordings
 

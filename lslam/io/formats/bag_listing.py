@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from lslam.core.printable import shown
+from lslam.core.printable import first_of
 
 SUFFIXES = (".bag", ".bag.active", ".mcap", ".db3")
 # Endings of files that were compressed as a whole, as recorders and people do.
@@ -72,7 +72,7 @@ def missing_parts(path: Path, files: list[Path]) -> list[str]:
         missing = sorted(set(range(have[0], have[-1])) - set(have))
         # More numbers missing than there are: they count something else, days or minutes.
         if 0 < len(missing) <= 10 * len(have):
-            which = f"part {missing[0]} is" if len(missing) == 1 else f"parts {shown(missing)} are"
+            which = f"part {missing[0]} is" if len(missing) == 1 else f"parts {first_of(missing)} are"
             sentences.append(
                 f"{which} missing: the parts in {path} are numbered from {have[0]} ({numbers[have[0]].name}) to "
                 f"{have[-1]} ({numbers[have[-1]].name})"
@@ -138,7 +138,7 @@ def _missing_by_metadata(path: Path, files: list[Path]) -> list[str]:
     if not absent:
         return []
     are = "is" if len(absent) == 1 else "are"
-    return [f"{path / METADATA} lists {len(listed)} files, of which {shown(absent)} {are} not there"]
+    return [f"{path / METADATA} lists {len(listed)} files, of which {first_of(absent)} {are} not there"]
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.types.arrays import Floats, Longs
-from lslam.core.types.scan import NO_RING, is_measured
+from lslam.core.types.scan import NO_RING, has_return
 from lslam.io.formats.time_columns import UNITS_NS
 
 AXES = ("x", "y", "z")
@@ -291,7 +291,7 @@ def _find_rings(
                 is_ring = (values >= 0) & (values < NO_RING) & (np.floor(values) == values)
             rings = np.where(is_ring, values, NO_RING).astype(np.uint16)
             if not is_ring.all():
-                measured = is_measured(points)
+                measured = has_return(points)
                 if 2 * np.count_nonzero(is_ring & measured) < np.count_nonzero(measured):
                     continue
         if plain_name(name) not in _SURE_RING_NAMES and len(rings) > _TOO_SMALL:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
-from lslam.core.printable import shown
+from lslam.core.printable import first_of
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream, WheelStream
@@ -61,7 +61,7 @@ def read_stamped_csv(
     values[:, [k is not None for k in where]] = table.values(columns_read)
     rest = unread_columns(table, clock.columns.union(columns_read))
     order = _order(clock.stamps_ns, values)
-    said = [clock.note, rest and f"columns left out: {shown(rest)}"]
+    said = [clock.note, rest and f"columns left out: {first_of(rest)}"]
     if order is not None:
         copies = f", {len(values) - len(order)} copies left out" if len(order) < len(values) else ""
         said.append(f"its rows are in another order than their stamps: sorted{copies}")

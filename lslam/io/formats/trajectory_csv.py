@@ -12,7 +12,7 @@ import numpy as np
 
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
-from lslam.core.printable import shown
+from lslam.core.printable import first_of
 from lslam.core.types.arrays import Floats
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.formats.atomic import write_text
@@ -163,7 +163,7 @@ def parse(table: TextTable, scalar: str = "", default_ns: int | None = None, fra
     left_out = unread_columns(table, clock.columns.union(columns))
     if left_out:
         hint = "" if len(columns) > 3 else "; rotations are read as quaternions (qx, qy, qz, qw)"
-        notes.append(f"left out: {shown(left_out)}{hint}")
+        notes.append(f"left out: {first_of(left_out)}{hint}")
     notes += [*rotation_notes, *filter(None, [clock.note])]
     if lost.any():
         notes.append(f"{int(lost.sum())} of {len(lost)} rows hold NaN or no numbers: lost poses, left out")

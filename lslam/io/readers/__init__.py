@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lslam.core.errors import InputError, LslamError, UsageError, cause
-from lslam.core.extras import load, registered
+from lslam.core.extras import find_plugins, load
 from lslam.io.formats.bag_listing import holds_recording
 from lslam.io.readers.lookup import find_folder
 from lslam.io.remote import RemotePath
@@ -148,7 +148,7 @@ def _open(folder: Path, overrides: SequenceInfo) -> Sequence:
         if sequence is not None:
             return sequence
     nothing = _nothing_in(folder)
-    for entry in registered(GROUP, READERS).values():
+    for entry in find_plugins(GROUP, READERS).values():
         try:
             sequence = _opened_by(load(entry, "reader"), folder, overrides)
         except LslamError as error:

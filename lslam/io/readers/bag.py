@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lslam.core.geometry import portable, se3
-from lslam.core.printable import printable, shown
+from lslam.core.printable import first_of, printable
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.gnss import GnssStream
 from lslam.core.types.imu import ImuStream
@@ -141,7 +141,7 @@ def _others(path: Path) -> str:
     names = [p.name for p in parts_beside(path)]
     if not names:
         return ""
-    one, several = f"by its name {names[0]} is another part", f"by their names {shown(names)} are other parts"
+    one, several = f"by its name {names[0]} is another part", f"by their names {first_of(names)} are other parts"
     return f"; {one if len(names) == 1 else several} of it: a folder of its parts is read as one"
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Longs, Stamps
-from lslam.core.types.scan import NO_RING, is_measured
+from lslam.core.types.scan import NO_RING, has_return
 from lslam.io.formats.bag_files import Bag, BagTopic, read_header
 from lslam.io.formats.bag_streams import Transforms, chain, is_static, read_transforms
 from lslam.io.formats.point_cloud import PointCloud
@@ -184,7 +184,7 @@ def join(a: PointCloud, b: PointCloud, later_ns: int = 0) -> PointCloud | None:
     if later_ns:
         a, b = _shift_times(a, 0), _shift_times(b, later_ns)
     is_alike = (a.times is None) == (b.times is None) and (a.rings is None) == (b.rings is None)
-    if not is_alike or not _is_complement(a.select(is_measured(a.points)), b.select(is_measured(b.points))):
+    if not is_alike or not _is_complement(a.select(has_return(a.points)), b.select(has_return(b.points))):
         return None
     first, last = a, b
     if a.times is not None and b.times is not None and _when(b.times)[1] < _when(a.times)[1]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.types.arrays import Bools, Longs, Stamps
-from lslam.core.types.scan import is_measured
+from lslam.core.types.scan import has_return
 from lslam.core.types.sequence import readable
 from lslam.io.formats.point_cloud import PointCloud
 from lslam.io.formats.sequence_toml import SequenceInfo
@@ -109,7 +109,7 @@ class PointClock:
         if 2 * np.count_nonzero(good) <= np.count_nonzero(usable) or not self._is_sound(values[good], len(cloud)):
             return self._by_itself(cloud, stamp_ns, f"field {rule.field!r} does not hold times as in the other scans")
         times, shift = apply_rule(rule, np.where(good, values, values[good].min()), stamp_ns)
-        wrong = is_measured(cloud.points) & ~good
+        wrong = has_return(cloud.points) & ~good
         count = np.count_nonzero(wrong)
         faults = []
         if over:

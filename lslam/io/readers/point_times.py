@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lslam.core.errors import InputError
 from lslam.core.types.arrays import Bools
-from lslam.core.types.scan import Span, is_measured
+from lslam.core.types.scan import Span, has_return
 from lslam.io.formats.point_cloud import UNITS, PointCloud, TimeColumn
 
 # A field's unit is that in which the scan lasts so many of its periods; an offset that begins later is a clock's reading.
@@ -172,7 +172,7 @@ def _read(clock: TimeColumn, sample: Sample, rate_hz: float, unit: str | None, r
 
 def is_usable(cloud: PointCloud, values: NDArray[Any]) -> Bools:
     """(N,) whether a point's time counts: it is a number, and the point was measured (if any point of the scan was)."""
-    measured = is_measured(cloud.points)
+    measured = has_return(cloud.points)
     if not measured.any():
         measured[:] = True
     return measured & np.isfinite(values) if values.dtype.kind == "f" else measured

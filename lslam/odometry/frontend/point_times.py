@@ -101,7 +101,7 @@ def _by_agreement(
 
 def _decided(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
     """As `choose_clock`, with the kernels compiled before."""
-    with jit.announced(log):
+    with jit.announce_compiling(log):
         create_odometry(Config()).warm_up()
         return choose_clock(sequence, proposal, sample, preprocess)
 

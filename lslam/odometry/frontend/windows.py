@@ -78,7 +78,7 @@ def _priors(decided: list[Tracked]) -> list[MotionPrior]:
 def _tied(tracked: Tracked, position: Floats, covariance: Floats) -> Tracked:
     """With the covariance (6, 6) of the pose at `position` (3,), m, to which its own is relative."""
     result = tracked.result
-    spread = noise.transported(covariance, result.T_world_lidar[:3, 3] - position)
+    spread = noise.transport(covariance, result.T_world_lidar[:3, 3] - position)
     own, by_points = (None if C is None else C + spread for C in (result.covariance, result.points_covariance))
     return replace(tracked, result=replace(result, covariance=own, points_covariance=by_points))
 
@@ -284,7 +284,7 @@ class WindowTracker(Stateful):
         if self._rest is None:
             return [], [out[0].at(pose), *out[1:]]
         if covariance is not None:
-            self._start = before[:3, 3], noise.rotated(covariance, self._world[:3, :3])
+            self._start = before[:3, 3], noise.rotate(covariance, self._world[:3, :3])
         self._rest = None
         return out[:here], out[here:]
 

@@ -49,7 +49,7 @@ class FilterMotion(InertialMotion):
         state = self._now.propagated(self._since_last(instant_ns))
         self._next = instant_ns, state
         back = prior.pose[:3, 3] - middle[:3, 3]
-        return replace(prior, covariance=noise.transported(self._of_lidar(state), back))
+        return replace(prior, covariance=noise.transport(self._of_lidar(state), back))
 
     def refine(self, prior: MotionPrior, stamp_ns: int, pose: Floats) -> MotionPrior:
         """The prior itself: a sweep is deskewed once, by back propagation.
@@ -79,7 +79,7 @@ class FilterMotion(InertialMotion):
         instant_ns, state = self._next
         middle, _ = middle_of(prior, stamp_ns, result.T_world_lidar)
         T_world_imu = middle @ self.T_lidar_imu
-        covariance = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
+        covariance = noise.transport(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
         self._posterior = instant_ns, state.moved_to(T_world_imu, covariance)
         return result
 
@@ -107,4 +107,4 @@ class FilterMotion(InertialMotion):
     def _of_lidar(self, state: NavigationState) -> Floats:
         """(6, 6) covariance of the LiDAR's pose, world axes."""
         lever = (state.T_world_imu @ self.T_imu_lidar)[:3, 3] - state.T_world_imu[:3, 3]
-        return noise.transported(state.covariance[POSE, POSE], lever)
+        return noise.transport(state.covariance[POSE, POSE], lever)

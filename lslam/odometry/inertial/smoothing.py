@@ -72,7 +72,7 @@ class SmootherMotion(InertialMotion):
         if C is None or not result.is_accepted or step is None:
             return result
         T_world_imu = middle @ self.T_lidar_imu
-        there = noise.transported(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
+        there = noise.transport(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
         begin = (self._pose @ self.T_lidar_imu)[:3, :3]
         self._taught = instant_ns, self.estimate.taught(step, begin, T_world_imu[:3, :3], C[3:, 3:]), C[:3, :3]
         try:
@@ -81,12 +81,12 @@ class SmootherMotion(InertialMotion):
             self._is_begun = False
             # The IMU's pose is as sure as the IMU, whatever registration said of its own.
             lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
-            covariance = noise.transported(self._imu_motion(step)[1], lever)
+            covariance = noise.transport(self._imu_motion(step)[1], lever)
             return result.rejected(str(error), prior.pose, covariance)
         self._added = instant_ns, state
         within = se3.relative(result.T_world_lidar, middle)
         pose = se3.normalise(state.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
-        covariance = noise.transported(state.covariance[:6, :6], pose[:3, 3] - state.T_world_imu[:3, 3])
+        covariance = noise.transport(state.covariance[:6, :6], pose[:3, 3] - state.T_world_imu[:3, 3])
         return result.moved(pose, covariance)
 
     def correct(

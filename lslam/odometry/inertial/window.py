@@ -139,7 +139,7 @@ class Window:
         window, H = self, np.zeros((0, 0))
         for _ in range(MOST_STEPS):
             H, g = window.equations(imu)
-            d = -linalg.solved(H, g)
+            d = -linalg.solve(H, g)
             if not np.isfinite(d).all():
                 break
             window = window.moved(d)

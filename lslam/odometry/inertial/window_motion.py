@@ -71,7 +71,7 @@ class WindowMotion(FilterMotion):
             return result
         self._joint, self._posterior = window, (instant_ns, newest)
         lever = pose[:3, 3] - newest.T_world_imu[:3, 3]
-        covariance = noise.transported(newest.covariance[POSE, POSE], lever)
+        covariance = noise.transport(newest.covariance[POSE, POSE], lever)
         return result.moved(pose, covariance)
 
     def stale(self) -> dict[int, Floats]:

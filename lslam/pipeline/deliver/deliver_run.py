@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lslam.core import __version__
 from lslam.core.errors import InputError, OutputExistsError, UsageError
 from lslam.core.extras import install_command
-from lslam.core.printable import counted
+from lslam.core.printable import count_of
 from lslam.core.untrusted import MISFIT
 from lslam.io.formats.atomic import atomic_write, write_text
 from lslam.io.formats.geotiff import write_geotiff
@@ -121,7 +121,7 @@ def _write_map(folder: Path, survey: Survey) -> tuple[dict[str, str], list[str]]
     named = ["intensity", *(name for name in attributes if name != "time")]
     named += ["colour"] if "red" in cloud.column_types else []
     voxel = f"one in each voxel of {_voxel(survey):g} m" if _voxel(survey) else "every point of every scan"
-    about = f"{counted(len(cloud), 'point')}, {voxel}; with {', '.join(named)}"
+    about = f"{count_of(len(cloud), 'point')}, {voxel}; with {', '.join(named)}"
     if "time" in attributes:
         is_unix = is_unix_time(int(next(iter(survey.drives.values())).trajectory.stamps_ns[0]))
         about += ", GPS time (adjusted standard)" if is_unix else ", times by the recording's clock (as week time)"

@@ -14,7 +14,7 @@ from lslam.backend.control_points import control_residuals
 from lslam.backend.manual import read_control_points, require_instants
 from lslam.core.errors import InputError, RunFailedError, UsageError, input_errors
 from lslam.core.geometry import geodesy, noise, se3
-from lslam.core.printable import shown
+from lslam.core.printable import first_of
 from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.core.untrusted import MISFIT
@@ -74,7 +74,7 @@ class Survey:
     @property
     def name(self) -> str:
         """Names of the drives, the first of many."""
-        return shown(list(self.drives))
+        return first_of(list(self.drives))
 
     @property
     def status(self) -> str:
@@ -89,7 +89,7 @@ class Survey:
     def covariances(self, run: EarlierRun) -> Floats | None:
         """(N, 6, 6) of the poses of a drive about the axes of the delivered coordinates, m2 and rad2; None where unknown."""
         known = covariances_of(run)
-        return None if known is None else noise.rotated(known, self.frame.carry(np.eye(4))[0, :3, :3])
+        return None if known is None else noise.rotate(known, self.frame.carry(np.eye(4))[0, :3, :3])
 
     @property
     def sigmas(self) -> Floats:

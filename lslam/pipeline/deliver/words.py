@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lslam.core import __version__
-from lslam.core.printable import counted, fixed
+from lslam.core.printable import count_of, with_decimals
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import Projection
 from lslam.pipeline.deliver.survey import FINISHED, Survey
@@ -26,14 +26,14 @@ def accuracy(survey: Survey) -> list[str]:
     said = []
     if (kept := by_kind.get("kept out")) is not None:
         said.append(
-            f"Measured at {counted(len(kept.names), 'check point')} that the run did not use: RMS {_pair(kept.rms)}, "
+            f"Measured at {count_of(len(kept.names), 'check point')} that the run did not use: RMS {_pair(kept.rms)}, "
             f"largest {_pair(kept.worst)}."
         )
     else:
         said.append("Accuracy was not measured: no check point was kept out of the run.")
     if (used := by_kind.get("used")) is not None:
         said.append(
-            f"{counted(len(used.names), 'control point')} held the run: residuals of RMS {_pair(used.rms)}, largest "
+            f"{count_of(len(used.names), 'control point')} held the run: residuals of RMS {_pair(used.rms)}, largest "
             f"{_pair(used.worst)}. They say how well the trajectory follows these points, not how accurate it is elsewhere."
         )
         facts = survey.manifest.get("graph", {}).get("control_points", {})
@@ -52,7 +52,7 @@ def accuracy(survey: Survey) -> list[str]:
 
 
 def _pair(values: Any) -> str:
-    return f"{fixed(float(values[0]), 3)} m horizontally, {fixed(float(values[1]), 3)} m vertically"
+    return f"{with_decimals(float(values[0]), 3)} m horizontally, {with_decimals(float(values[1]), 3)} m vertically"
 
 
 def _fixes(survey: Survey) -> list[str]:
@@ -117,9 +117,9 @@ def making(survey: Survey) -> list[str]:
     registered = sum(status == "ok" for one in survey.drives.values() for status in one.statuses)
     length = sum(float(one.trajectory.path_lengths[-1]) for one in survey.drives.values())
     return [
-        f"Recording: {survey.name}; {counted(scans, 'scan')}, {registered} registered; {length:.1f} m of way.",
+        f"Recording: {survey.name}; {count_of(scans, 'scan')}, {registered} registered; {length:.1f} m of way.",
         f"Method: {run.config.odometry.method}, lslam {manifest.get('lslam', 'of unknown version')}; "
-        f"{counted(int(manifest.get('graph', {}).get('loops', 0)), 'loop closure')}.",
+        f"{count_of(int(manifest.get('graph', {}).get('loops', 0)), 'loop closure')}.",
         *([f"Processed: {str(manifest['written'])[:10]}."] if "written" in manifest else []),
     ]
 

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.types.arrays import Floats
-from lslam.core.types.cloud import thinned
+from lslam.core.types.cloud import thin_out
 from lslam.core.untrusted import parse_json
 from lslam.io.formats.stored_clouds import MapCloud
 from lslam.maps.georeference import Projection
@@ -102,7 +102,7 @@ class MapTiles:
             self._said = {"error": str(error)}
 
     def _write(self, folder: Path, cloud: MapCloud) -> None:
-        sample = thinned(cloud, SAMPLE).intensity
+        sample = thin_out(cloud, SAMPLE).intensity
         shades = usual_range(np.zeros(0) if sample is None else sample.astype(np.float64))
         with tempfile.TemporaryDirectory(prefix="part-", dir=folder.parent) as place:
             with (Path(place) / NODES).open("wb") as stream:

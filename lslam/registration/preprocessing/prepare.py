@@ -41,7 +41,7 @@ def on_surfaces(centroids: NDArray[np.float32], counts: NDArray[np.int32], leaf:
     """
     pulses = int(counts.sum())
     needed = least_line / np.sqrt(FIELD_OF_VIEW_SR / max(pulses, 1))
-    is_accompanied = voxel.accompanied(centroids, counts, leaf * needed, WIDE_CELL_M, WIDE_CELL_M * needed)
+    is_accompanied = voxel.find_neighboured_cells(centroids, counts, leaf * needed, WIDE_CELL_M, WIDE_CELL_M * needed)
     is_clear = len(counts) - len(is_accompanied) < SPARSE_CELLS_SHARE * len(counts)
     are_most_gone = int(counts[is_accompanied].sum()) < MOST_REMOVED_SHARE * pulses
     return np.arange(len(counts)) if is_clear or are_most_gone else is_accompanied
@@ -198,7 +198,7 @@ def _gated(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The points that `gate_points` keeps, and their times: in one pass where only the gate asks."""
     if not (config.remove_ground or config.denoise):
-        return voxel.gated(cloud, times, *_gate_of(config))
+        return voxel.select_in_gate(cloud, times, *_gate_of(config))
     rows = gate_points(cloud, config)
     return voxel.take(cloud, rows), times[rows] if len(times) else times
 

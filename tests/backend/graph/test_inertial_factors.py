@@ -173,7 +173,7 @@ def smoothed(seed: int) -> tuple[PoseGraph, list[Keyframe], list[ScanResult], Fl
     results = [ScanResult(0, 0, pose, covariance=nothing, registration_covariance=nothing, points_covariance=nothing)]
     for k, (link, true) in enumerate(zip(chain.links, se3.relative(real[:-1], real[1:]), strict=True), 1):
         registered = pose @ measured(true[None], SIGMAS, rng)[0]
-        turned_own = noise.rotated(own, pose[:3, :3])
+        turned_own = noise.rotate(own, pose[:3, :3])
         found = smoother.add(replace(link.step, T_world_imu=registered, covariance=turned_own))
         step, before = found.T_world_imu[:3, 3] - pose[:3, 3], results[-1]
         assert before.covariance is not None
@@ -182,8 +182,8 @@ def smoothed(seed: int) -> tuple[PoseGraph, list[Keyframe], list[ScanResult], Fl
         results.append(
             ScanResult(
                 k, 1_000_000_000 * k, pose, registration_covariance=nothing,
-                covariance=noise.transported(before.covariance, step) + found.covariance[:6, :6],
-                points_covariance=noise.transported(before.points_covariance, step) + turned_own,
+                covariance=noise.transport(before.covariance, step) + found.covariance[:6, :6],
+                points_covariance=noise.transport(before.points_covariance, step) + turned_own,
             )
         )  # fmt: skip
     keyframes = [Keyframe(r.index, r.index, r.stamp_ns, r.T_world_lidar, r.covariance, 1.0 * r.index) for r in results]

@@ -29,8 +29,8 @@ def results_of(poses: np.ndarray, has_covariances: bool = True) -> list[ScanResu
     total, out = np.zeros((6, 6)), []
     for i, pose in enumerate(poses):
         if i:
-            step = noise.rotated(np.diag(STEP_SIGMAS**2), poses[i - 1, :3, :3])
-            total = noise.transported(total, pose[:3, 3] - poses[i - 1, :3, 3]) + step
+            step = noise.rotate(np.diag(STEP_SIGMAS**2), poses[i - 1, :3, :3])
+            total = noise.transport(total, pose[:3, 3] - poses[i - 1, :3, 3]) + step
         known = (total + OWN, OWN) if has_covariances else (None, None)
         out.append(
             ScanResult(i, i * 100_000_000, pose, "ok", covariance=known[0], registration_covariance=known[1], rmse=0.1)

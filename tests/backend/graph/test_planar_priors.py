@@ -29,7 +29,7 @@ def held(seed: int, every: int = 2, information: np.ndarray = SHARP, rank: int =
 
 def off(poses: np.ndarray, real: np.ndarray = REAL) -> np.ndarray:
     error = se2.of_se3(poses) - se2.of_se3(real)
-    error[:, 2] = se2.wrapped(error[:, 2])
+    error[:, 2] = se2.wrap(error[:, 2])
     return np.abs(error)
 
 

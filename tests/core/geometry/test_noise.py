@@ -44,11 +44,11 @@ def test_transport_is_that_of_sampled_poses() -> None:
     step = np.array([4.0, -1.0, 2.0])
     ahead = disturbed(40_000) @ se3.make(np.eye(3), T[:3, :3].T @ step)
     sampled = np.cov((ahead[:, :3, 3] - ahead[:, :3, 3].mean(0)).T)
-    carried = noise.transported(COVARIANCE, step)[:3, :3]
+    carried = noise.transport(COVARIANCE, step)[:3, :3]
     np.testing.assert_allclose(carried, sampled, atol=0.03 * carried.max())
 
 
 def test_rotation_of_axes_keeps_the_spectrum() -> None:
-    turned = noise.rotated(COVARIANCE, T[:3, :3])
+    turned = noise.rotate(COVARIANCE, T[:3, :3])
     np.testing.assert_allclose(np.linalg.eigvalsh(turned[:3, :3]), np.linalg.eigvalsh(COVARIANCE[:3, :3]), rtol=1e-9)
     np.testing.assert_allclose(turned[:3, 3:], T[:3, :3] @ COVARIANCE[:3, 3:] @ T[:3, :3].T, atol=1e-18)

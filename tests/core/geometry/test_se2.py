@@ -12,7 +12,7 @@ def _poses(seed: int, count: int = 50) -> np.ndarray:
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
     away = np.asarray(a) - np.asarray(b)
-    away[..., 2] = se2.wrapped(away[..., 2])
+    away[..., 2] = se2.wrap(away[..., 2])
     return bool(np.abs(away).max() < 1e-10)
 
 

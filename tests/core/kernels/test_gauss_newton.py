@@ -22,7 +22,7 @@ def solve(
     information = float(np.trace(H[:3, :3]))
     facts = np.zeros(at.COUNT)
     facts[[at.INFORMATION, at.LEVER]] = information, information * lever**2
-    count = gauss_newton.solve_observed(H, g, facts, weak_share, least, UNSEEN, d, weak)
+    count = gauss_newton.solve_guarded_step(H, g, facts, weak_share, least, UNSEEN, d, weak)
     return d, weak[:count]
 
 
@@ -118,7 +118,7 @@ def test_a_step_stays_within_the_directions_allowed() -> None:
     upright = np.diag([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
     for seed in range(20):
         H, g = random_problem(seed, 6)
-        R, t, _, weak, _ = step(H, g, allowed=upright)
+        R, t, _, weak, _ = step(H, g, projector=upright)
         expected = -np.linalg.solve(H[2:5, 2:5], g[2:5])
         np.testing.assert_allclose(t, [0, 0, expected[0]], atol=1e-9)
         np.testing.assert_allclose(so3.log(R), [expected[1], expected[2], 0], atol=1e-8)
@@ -162,8 +162,8 @@ def test_a_long_step_is_cut_and_one_that_is_no_number_not_made() -> None:
 def test_trimming_keeps_the_share_of_the_nearest(share: float, bound: float) -> None:
     rng = np.random.default_rng(4)
     away2 = np.where(rng.uniform(size=2000) < 0.2, -1.0, rng.exponential(0.2, 2000))
-    limit = gauss_newton.trimmed(away2, share, bound)
+    limit = gauss_newton.trimming_bound(away2, share, bound)
     candidates = away2[(away2 >= 0) & (away2 <= bound)]
     assert np.mean(candidates <= limit) == pytest.approx(share, abs=1.5 / len(candidates))
-    assert gauss_newton.trimmed(away2[::-1].copy(), share, bound) == limit
-    assert gauss_newton.trimmed(away2, 1.0, bound) == bound
+    assert gauss_newton.trimming_bound(away2[::-1].copy(), share, bound) == limit
+    assert gauss_newton.trimming_bound(away2, 1.0, bound) == bound

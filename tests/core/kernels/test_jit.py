@@ -155,12 +155,12 @@ def test_only_compiling_is_announced_and_once(caplog: pytest.LogCaptureFixture) 
     calls: list[str] = []
     log = logging.getLogger(__name__)  # that of lslam is as the command lines of other tests left it
     with caplog.at_level("INFO", __name__):
-        with jit.announced(log, lambda: calls.append("loaded")):
+        with jit.announce_compiling(log, lambda: calls.append("loaded")):
             time.sleep(0.05)
         assert not caplog.messages
-        with jit.announced(log, lambda: calls.append("compiled")):
+        with jit.announce_compiling(log, lambda: calls.append("compiled")):
             assert (twice(1.0), twice(1)) == (2.0, 2)
-        with jit.announced(log, lambda: calls.append("compiled before")):
+        with jit.announce_compiling(log, lambda: calls.append("compiled before")):
             twice(2.0)
     assert calls == ["compiled"]
     assert len(caplog.messages) == 1
@@ -177,10 +177,10 @@ def test_what_is_compiled_is_named_and_what_is_ready_counted(caplog: pytest.LogC
     log = logging.getLogger(__name__)
     with caplog.at_level("INFO", __name__):
         for total in (5, None, 1):
-            with jit.counted(log, total, every_s=0.0):
+            with jit.count_kernels(log, total, every_s=0.0):
                 assert (thrice(1.0), thrice(np.float32(1.0))) == (3.0, 3.0)
             thrice = jit.kernel(thrice.py_func)  # type: ignore[attr-defined]
-        with jit.counted(log, 5):
+        with jit.count_kernels(log, 5):
             thrice(1.0)
     assert caplog.messages == [f"compiling kernels, once: {name} ({n} of 5)" for n in (1, 2)], "the others are loaded"
     events = [vars(record)["event"] for record in caplog.records]

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 @kernel
 def rotate_many(R: Floats, steps: Floats) -> None:
     for i in range(len(steps)):
-        linalg.rotate_left(R, steps[i, 0], steps[i, 1], steps[i, 2])
+        linalg.rotate_in_place(R, steps[i, 0], steps[i, 1], steps[i, 2])
 
 
 def plane(m: Floats) -> tuple[Floats, Floats]:
@@ -120,7 +120,7 @@ def test_rotate_left_is_the_exponential_map(scale: float) -> None:
         R = so3.exp(rng.normal(size=3))
         w = rng.normal(size=3) * scale
         expected = so3.exp(w) @ R
-        linalg.rotate_left(R, *w)
+        linalg.rotate_in_place(R, *w)
         np.testing.assert_allclose(R, expected, atol=2e-15 + 1e-15 * scale)
 
 
@@ -138,7 +138,7 @@ def test_one_update_puts_a_matrix_back_on_the_manifold(row: int) -> None:
     R = so3.exp(np.array([0.3, -0.2, 0.9]))
     R[row] = 1.01 * R[row] + 0.01 * R[(row + 1) % 3]
     assert np.abs(R @ R.T - np.eye(3)).max() > 5e-3
-    linalg.rotate_left(R, 0.01, 0.02, -0.03)
+    linalg.rotate_in_place(R, 0.01, 0.02, -0.03)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-14)
 

@@ -208,6 +208,6 @@ def test_gated_points_are_those_that_the_gate_names(is_timed: bool, box: NDArray
     times = np.arange(len(points), dtype=np.float32) if is_timed else UNTIMED
     chosen = voxel.gate(points, 2.0, 15.0, True, box)
     assert 0 < len(chosen) < len(points)
-    kept, when = voxel.gated(points, times, 2.0, 15.0, True, box)
+    kept, when = voxel.select_in_gate(points, times, 2.0, 15.0, True, box)
     np.testing.assert_array_equal(kept, points[chosen])
     np.testing.assert_array_equal(when, chosen.astype(np.float32) if is_timed else UNTIMED)
