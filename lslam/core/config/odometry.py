@@ -150,6 +150,8 @@ class LoamConfig(Section):
     """Features of LOAM and LeGO-LOAM. Numbers are the papers' own unless the description says more."""
 
     regions: int = Field(6, ge=1, description="parts of a ring with equally many points, each with its own features")
+    max_edge_points: int = Field(2, ge=1, description="sharp edges per region")
+    max_less_edge_points: int = Field(20, ge=1, description="edges per region, the sharp ones included")
     max_planar_points: int = Field(4, ge=1, description="planar points per region")
     grid_step: float = Field(0.2, ge=0, description="m; grid of the less planar points, 0 keeps all")
     feature_map_voxel: float = Field(
@@ -164,6 +166,15 @@ class LoamConfig(Section):
         "one-to-many",
         description="scan to scan: a feature matches the line or plane through several of the other scan's, or the nearest alone",
     )
+
+    @model_validator(mode="after")
+    def _check(self) -> LoamConfig:
+        if self.max_less_edge_points < self.max_edge_points:
+            raise ValueError(
+                f"max_less_edge_points = {self.max_less_edge_points} must be at least max_edge_points = "
+                f"{self.max_edge_points}"
+            )
+        return self
 
 
 class LioSamConfig(Section):

@@ -30,8 +30,6 @@ _MANY_TURNS = 0.1
 _SPINS = 0.5
 # Neighbours farther apart than this many steps have missing returns between them: one lost return is bridged.
 _GAP_STEPS = 2.5
-# Sharp edges per region, and edges, the sharp ones included (Zhang and Singh 2014).
-MAX_EDGE_POINTS, MAX_LESS_EDGE_POINTS = 2, 20
 # Curvature of equation 2.21 over the angle between beams: edges have more, planes less; a right angle has 2.7.
 EDGE_CURVATURE, PLANAR_CURVATURE = 1.0, 0.5
 # An edge's curvature over what the noise of the ranges makes, which is measured in each scan.
@@ -152,7 +150,7 @@ def features_along(
         both[walk.order],
         walk.starts,
         config.regions,
-        (MAX_EDGE_POINTS, MAX_LESS_EDGE_POINTS, config.max_planar_points),
+        (config.max_edge_points, config.max_less_edge_points, config.max_planar_points),
         EDGE_CURVATURE * walk.step,
         PLANAR_CURVATURE * walk.step,
         EDGE_NOISE_RATIO * noise,

@@ -17,8 +17,6 @@ from lslam.registration.kernels.curvature import WIDEST_STEP
 from lslam.registration.preprocessing.features import (
     EDGE_CURVATURE,
     EDGE_NOISE_RATIO,
-    MAX_EDGE_POINTS,
-    MAX_LESS_EDGE_POINTS,
     MAY_BE_EDGE,
     OCCLUSION_M,
     PARALLEL_DEG,
@@ -71,7 +69,7 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         np.sin(np.radians(PARALLEL_DEG)),
     )
     allowed, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.PETAL_SIDE)
-    limits, usual = (MAX_EDGE_POINTS, MAX_LESS_EDGE_POINTS), _SHORTER * walk.step
+    limits, usual = (config.max_edge_points, config.max_less_edge_points), _SHORTER * walk.step
     labels = curvature.pick(
         curved,
         bend,

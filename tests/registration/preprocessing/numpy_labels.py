@@ -82,8 +82,8 @@ def _one_ring(ring: Ring, r: Any, step: float, slope: float, noise: float, confi
         ]
         picked = 0
         for i in sorted(sharp, key=lambda i: (-c[i], i)):
-            if i not in taken and picked < features.MAX_LESS_EDGE_POINTS:
-                labels[i] = 2 if picked < features.MAX_EDGE_POINTS else 1
+            if i not in taken and picked < config.max_less_edge_points:
+                labels[i] = 2 if picked < config.max_edge_points else 1
                 picked += 1
                 suppress(i)
         smooth = [

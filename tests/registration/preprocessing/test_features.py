@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from numpy_labels import reference_labels
 from scipy.spatial import cKDTree
 
+from lslam.core.config.config import load_config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import LoamConfig
-from lslam.core.errors import InputError
+from lslam.core.errors import ConfigError, InputError
 from lslam.core.geometry import so3
 from lslam.core.types.scan import Scan
 from lslam.registration.preprocessing import features
@@ -64,8 +65,8 @@ def picks_of_reference(scan: Scan, config: LoamConfig) -> NDArray[np.int64]:
     [
         (LoamConfig(), {}),
         (
-            LoamConfig(regions=4, max_planar_points=9),
-            {"MAX_EDGE_POINTS": 1, "MAX_LESS_EDGE_POINTS": 3, "OCCLUSION_M": 0.5},
+            LoamConfig(regions=4, max_edge_points=1, max_less_edge_points=3, max_planar_points=9),
+            {"OCCLUSION_M": 0.5},
         ),
         (
             LoamConfig(regions=1),
@@ -82,7 +83,7 @@ def test_the_kernels_pick_what_the_plain_reference_picks(
         expected = picks_of_reference(scan, config)
         got = extract_features(scan, config, GATE).labels
         np.testing.assert_array_equal(got, expected)
-        assert {-2, -1, 0, 1, 2} <= set(got.tolist()) or features.MAX_LESS_EDGE_POINTS == 3
+        assert {-2, -1, 0, 1, 2} <= set(got.tolist()) or config.max_less_edge_points == 3
 
 
 def test_scans_without_rings_or_with_lines_that_skip_about_are_refused() -> None:
@@ -91,6 +92,11 @@ def test_scans_without_rings_or_with_lines_that_skip_about_are_refused() -> None
         extract_features(scan)
     with pytest.raises(InputError, match="--rings"):
         extract_features(replace(scan, rings=None))
+
+
+def test_more_sharp_edges_than_edges_are_refused() -> None:
+    with pytest.raises(ConfigError, match="max_less_edge_points = 1"):
+        load_config(None, ["loam.max_less_edge_points=1"], {})
 
 
 STEP = np.radians(0.2)
