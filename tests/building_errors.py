@@ -81,6 +81,6 @@ def map_errors(buildings: Sequence[Building], perturbation: Perturbation) -> dic
             continue
         real, drawn = join_outlines(known[change.id], change, known), on_map[change.id]
         real = simplify_outlines(real, change.simplify_m) if change.simplify_m > 0 else real
-        moved = drawn.displaced(np.array([0.0, 0.0, -change.turn_rad]))
+        moved = drawn.displace(np.array([0.0, 0.0, -change.turn_rad]))
         found[change.id] = np.array([*(real.middle - moved.middle), -change.turn_rad])
     return found

@@ -89,7 +89,7 @@ def _held(
     owner = int(np.clip(np.searchsorted(stamps, stamp_ns, side="right") - 1, 0, len(stamps) - 2))
     share = float(np.clip((stamp_ns - stamps[owner]) / (stamps[owner + 1] - stamps[owner]), 0.0, 1.0))
     arms = [se3.apply(se3.inverse(results[keyframes[k].scan].T_world_lidar), own[None])[0] for k in (owner, owner + 1)]
-    return PositionFix(owner, position, sigma, arms[0], is_held=True, share=share, next_arm=arms[1])
+    return PositionFix(owner, position, sigma, arms[0], is_binding=True, share=share, next_arm=arms[1])
 
 
 def control_residuals(
@@ -127,7 +127,7 @@ def against_odometry(
     sigma = np.sqrt(drift.covariance(nearest[:-1], nearest[1:])[:, 0, 0] + own[:-1] + own[1:])
     off = np.linalg.norm(np.diff(enu, axis=0), axis=1) - np.linalg.norm(np.diff(seen, axis=0), axis=1)
     times = np.abs(off) / (float(np.sqrt(quantile(probability, 1))) * sigma)
-    names = [points[i].at.said for i in order]
+    names = [points[i].at.source for i in order]
     texts = [
         f"{names[k]} and {names[k + 1]}: the control points are {abs(off[k]):.2f} m "
         f"{'farther apart' if off[k] > 0 else 'nearer to each other'} than odometry has them, {times[k]:.1f} times what it may "
@@ -162,7 +162,7 @@ def contradicting(residuals: Many[ControlResidual], probability: float) -> list[
     limit = float(np.sqrt(quantile(probability, 3)))
     wrong = sorted((one for one in residuals if one.size > limit), key=lambda one: -one.size)
     texts = [
-        f"{one.point.at.said}: the control point is left off by {np.linalg.norm(one.residual):.2f} m, {one.size:.1f} sigmas: "
+        f"{one.point.at.source}: the control point is left off by {np.linalg.norm(one.residual):.2f} m, {one.size:.1f} sigmas: "
         "is it the right scan, sigma and CRS?"
         for one in wrong
     ]
@@ -182,7 +182,9 @@ def _on_earth(points: Many[ControlPoint], geoid: str) -> Floats:
 def _seen(points: Many[ControlPoint], stamps: Longs, results: Many[ScanResult]) -> Floats:
     """(N, 3) m, where the results have the points, in their world."""
     poses = poses_at(np.array([r.stamp_ns for r in results]), np.stack([r.T_world_lidar for r in results]), stamps)
-    return np.asarray(np.einsum("nij,nj->ni", poses[:, :3, :3], np.stack([p.seen for p in points])) + poses[:, :3, 3])
+    return np.asarray(
+        np.einsum("nij,nj->ni", poses[:, :3, :3], np.stack([p.point_lidar for p in points])) + poses[:, :3, 3]
+    )
 
 
 def _aligned(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
@@ -250,7 +252,7 @@ def doubts(
 ) -> list[str]:
     """A sentence for each known pair that does not register, and for each that odometry contradicts, which holds all the same."""
     texts = [
-        f"{pair.said}: the scans of the known pair do not close a loop: {candidate.reason}"
+        f"{pair.source}: the scans of the known pair do not close a loop: {candidate.reason}"
         for pair, candidate in zip(pairs, known, strict=True)
         if not candidate.is_accepted
     ]
@@ -259,7 +261,7 @@ def doubts(
         graph = _graph_of(keyframes, [constraint for _, constraint in held], results, config)
         reasons = judge_loops(graph, config.graph)
         texts += [
-            f"{pair.said}: the known pair holds, though {reason}"
+            f"{pair.source}: the known pair holds, though {reason}"
             for (pair, _), reason in zip(held, reasons, strict=True)
             if reason
         ]

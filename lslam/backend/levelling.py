@@ -86,7 +86,7 @@ def level_results(results: list[ScanResult], level: Level) -> list[ScanResult]:
     if not level.is_turned:
         return results
     T = se3.make(level.R, np.zeros(3))
-    return [r.moved(T) for r in results]
+    return [r.in_world(T) for r in results]
 
 
 def _up_by_gravity(results: list[ScanResult]) -> tuple[Floats | None, float]:

@@ -147,7 +147,7 @@ def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
     rows = ["point,stamp_ns,east_m,north_m,up_m,sigma_m,sigma_up_m,sigmas,lat_deg,lon_deg,height_m"]
     for one in residuals:
         (east, north, up), (sigma, _, sigma_up) = one.residual.tolist(), one.point.sigma.tolist()
-        name = one.point.at.said.replace(",", "")
+        name = one.point.at.source.replace(",", "")
         lat, lon, height = one.place
         off = f"{east:.4f},{north:.4f},{up:.4f},{sigma:g},{sigma_up:g},{one.size:.2f}"
         rows.append(f"{name},{one.stamp_ns},{off},{lat:.9f},{lon:.9f},{height:.4f}")
@@ -231,11 +231,11 @@ def require_instants(instants: Iterable[Instant], numbers: Longs, stamps_ns: Lon
     for instant in instants:
         if instant.scan is not None and instant.scan not in numbers:
             raise InputError(
-                f"{instant.said}: scan {instant.scan} is none of the run's, which are {numbers[0]} to {numbers[-1]}"
+                f"{instant.source}: scan {instant.scan} is none of the run's, which are {numbers[0]} to {numbers[-1]}"
             )
         if instant.stamp_ns is not None and not span[0] <= instant.stamp_ns <= span[1]:
             raise InputError(
-                f"{instant.said}: the stamp {1e-9 * instant.stamp_ns:.3f} s is none of the run's, which are "
+                f"{instant.source}: the stamp {1e-9 * instant.stamp_ns:.3f} s is none of the run's, which are "
                 f"{1e-9 * span[0]:.3f} to {1e-9 * span[1]:.3f} s"
             )
 
@@ -260,15 +260,15 @@ def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes:
         (a, _), (b, _) = ends
         numbers = {(known.a, known.b) for known in found.known}
         if a == b:
-            found.problems.append(f"{pair.first.said}: both scans belong to one keyframe: there is no loop to close")
+            found.problems.append(f"{pair.first.source}: both scans belong to one keyframe: there is no loop to close")
         elif pair.verdict == "forbidden":
             found.forbidden.append((min(a, b), max(a, b)))
         elif (min(a, b), max(a, b)) in numbers:
-            found.problems.append(f"{pair.first.said}: the pair is named twice, it counts once")
+            found.problems.append(f"{pair.first.source}: the pair is named twice, it counts once")
         else:
             found.known.append(_known(pair, ends, results, keyframes))
     found.problems.extend(
-        f"{known.said}: the pair is known and forbidden: it holds, and nothing else is closed there"
+        f"{known.source}: the pair is known and forbidden: it holds, and nothing else is closed there"
         for known in found.known
         if (known.a, known.b) in found.forbidden
     )
@@ -289,4 +289,4 @@ def _known(
     a, b = min(first, second), max(first, second)
     if a != first:
         shift = -shift
-    return KnownPair(a, b, keyframes[a].T_world_lidar[:3, :3].T @ shift, pair.within, pair.first.said)
+    return KnownPair(a, b, keyframes[a].T_world_lidar[:3, :3].T @ shift, pair.within, pair.first.source)

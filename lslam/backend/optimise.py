@@ -164,7 +164,7 @@ def _without_one(graph: PoseGraph, without: Floats, given: Given) -> str:
             log.debug("the graph without a control point: %s", error)
             continue
         if change is not None and not change.is_clear(RIGHT_PROBABILITY):
-            names.append(points[i].at.said)
+            names.append(points[i].at.source)
     if not names:
         return "; no single one of them is why"
     return f"; without {' or without '.join(names)} the others do not: are scan, sigma and CRS right?"

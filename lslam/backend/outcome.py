@@ -102,7 +102,7 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
     except (GraphError, np.linalg.LinAlgError) as error:
         given.problems.append(f"{error}; the run goes on without it")
         return None
-    free = [not fix.is_held for fix in graph.fixes]
+    free = [not fix.is_binding for fix in graph.fixes]
     accepted_fixes = int(solution.fix_inliers[free].sum())
     if any(free) and accepted_fixes < MIN_FIXES:
         text = f"GNSS: the pose graph accepts {accepted_fixes} of {sum(free)} fixes"
@@ -195,7 +195,7 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
     used = [
         fix
         for fix, is_inlier in zip(graph.fixes, solution.fix_inliers, strict=True)
-        if is_inlier and fix.is_held == is_control
+        if is_inlier and fix.is_binding == is_control
     ]
     if not used:
         if not graph.fixes:
@@ -219,7 +219,9 @@ def _facts(
     return {
         "loop_candidates": len(candidates),
         "loops": len(accepted),
-        "fixes": sum(bool(ok) and not fix.is_held for fix, ok in zip(graph.fixes, solution.fix_inliers, strict=True)),
+        "fixes": sum(
+            bool(ok) and not fix.is_binding for fix, ok in zip(graph.fixes, solution.fix_inliers, strict=True)
+        ),
         "gravity_factors": len(graph.free_ups),
         **({} if graph.inertial is None else {"imu_factors": len(graph.inertial.links)}),
         "imu_orientation_factors": len(graph.turns),

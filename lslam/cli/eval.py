@@ -154,7 +154,7 @@ def _evaluate_all(
     calibration = _calibration(truth, given["calib"])
     evaluations = []
     for path in estimates:
-        if config.frame not in calibration.known() and given["calib"] is None and path.is_dir():
+        if config.frame not in calibration.poses_in_lidar() and given["calib"] is None and path.is_dir():
             from lslam.pipeline.rebuild import read_run
             from lslam.pipeline.resume import open_again
 

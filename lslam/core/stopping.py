@@ -60,7 +60,7 @@ class Stop:
         if self.is_gentle and not self._is_forced:
             return
         names = [(str(f.f_globals.get("__name__")), f) for f in _outwards(frame)]
-        if any(name == __name__ for name, _ in names[:_DEEP]):  # in `on_lost`, where it would be lost once more
+        if any(name == __name__ for name, _ in names[:_DEEP]):  # in `on_loss`, where it would be lost once more
             self._come_again()
             return
         left = dropwhile(lambda named: _package(named[0]) not in _FOREIGN, names)
@@ -69,7 +69,7 @@ class Stop:
             raise Interrupt
         _raise_after(caller)
 
-    def on_lost(
+    def on_loss(
         self, hook_arguments: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableHookArgs], object]
     ) -> None:
         """Python loses what is raised in a finaliser or a callback of LLVM, where compiling spends its time: raise it again."""
@@ -107,7 +107,7 @@ def handle_signals(numbers: Sequence[int] = SIGNALS, may_force: bool = True) -> 
     _current = stop = Stop(may_force)
     previous = [(number, signal.signal(number, stop.on_signal)) for number in numbers]
     report = sys.unraisablehook
-    sys.unraisablehook = lambda lost: stop.on_lost(lost, report)
+    sys.unraisablehook = lambda lost: stop.on_loss(lost, report)
     try:
         yield stop
     finally:

@@ -91,7 +91,7 @@ def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
 
     translation, angular = table(lambda row: row.error), table(lambda row: row.angular_rmse_deg)
     per_scan, total = table(registration_ms), table(lambda row: row.total_time_s)
-    lost = mask(lambda row: row.is_diverged) | (translation > limit)
+    lost = mask(lambda row: row.diverges) | (translation > limit)
     stages = list(dict.fromkeys(name for row in rows for name in row.stages_ms))
     return Curve(
         sequence=rows[0].sequence,
@@ -110,9 +110,9 @@ def _curve(rows: Sequence[StudyRow], limit: float) -> Curve:
             "total_efficiency": np.where(lost, 0.0, efficiency(translation, angular, total)),
         },
         stages={name: table(lambda row, name=name: row.stages_ms.get(name, np.nan)) for name in stages},  # type: ignore[misc]
-        lost=lost,
+        losses=lost,
         # A run that failed otherwise, for want of memory or a file, says nothing about its parameters.
-        ran=mask(lambda row: row.is_usable or row.is_diverged),
+        ran=mask(lambda row: row.is_usable or row.diverges),
         at=tuple(at),
         words=() if is_number else tuple(str(value) for value in order),
         is_timed_alone=all(row.is_timing_comparable for row in rows if row.is_usable),
@@ -169,8 +169,8 @@ def divergence(curve: Curve) -> Divergence:
     A value is lost when more than half of its runs are. The curve is lost from the first lost value from which on more than
     half of the values are lost. So one unlucky value is not a divergence.
     """
-    scored = curve.scored.any(1)
-    values, bad = curve.values[scored], curve.is_lost[scored]
+    scored = curve.with_score.any(1)
+    values, bad = curve.values[scored], curve.loses_most[scored]
     for i in np.flatnonzero(bad):
         if 2 * bad[i:].sum() > len(bad) - i:
             before = float(values[i - 1]) if i else None
@@ -263,7 +263,7 @@ def contrast(first: Floats, second: Floats) -> Contrast:
 
 def errors_of(curve: Curve) -> Floats:
     """(V, S) translation rmse of the runs that were not lost, m; nan for the others."""
-    return np.where(curve.lost, np.nan, curve.quantities["translation"])
+    return np.where(curve.losses, np.nan, curve.quantities["translation"])
 
 
 def plateau(curve: Curve, value: float) -> Floats:
@@ -277,7 +277,7 @@ def plateau(curve: Curve, value: float) -> Floats:
 
 def rise_at(curve: Curve, index: int, level: Floats) -> Rise:
     """Whether the error at a value is worse than a level (S,), m; a value at which most runs are lost is worse."""
-    if curve.is_lost[index]:
+    if curve.loses_most[index]:
         return "worse"
     ratio = contrast(errors_of(curve)[index], level)
     return "worse" if ratio.is_more else "as good" if ratio.is_no_more else "unknown"
@@ -285,7 +285,7 @@ def rise_at(curve: Curve, index: int, level: Floats) -> Rise:
 
 def rise_below(curve: Curve, value: float) -> Rise:
     """Whether the error below a value is worse than from there on: `worse` if any value is, `as good` if all are."""
-    below = np.flatnonzero((curve.values < value) & curve.scored.any(1))
+    below = np.flatnonzero((curve.values < value) & curve.with_score.any(1))
     rises = {rise_at(curve, int(index), plateau(curve, value)) for index in below}
     return "worse" if "worse" in rises else "as good" if rises == {"as good"} else "unknown"
 
@@ -340,7 +340,7 @@ def rival(law: Law) -> tuple[str, float]:
 
     Over a narrow range a line and a hyperbola are alike, and a product is not tested by a parameter that hardly varied.
     """
-    x, t = law.points, law.observed
+    x, t = law.points, law.times
     inverse = [] if (x[:, 0] == 0).any() else [("a / x", design("inverse", x))]
     designs = {
         "linear": inverse,

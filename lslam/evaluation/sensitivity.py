@@ -112,7 +112,7 @@ def _judge_one(finding: ExpectedFinding, result: CurveResult, results: Sequence[
 def _has_errors(curve: Curve) -> bool:
     """Whether runs were scored. Without scores it is unknown whether a run is lost."""
     are_scored = np.isfinite(curve.quantities["translation"]).any()
-    return bool(are_scored or curve.lost[curve.ran].all())
+    return bool(are_scored or curve.losses[curve.ran].all())
 
 
 def _is_of_time(finding: ExpectedFinding) -> bool:
@@ -162,7 +162,7 @@ def _evaluate(rows: Sequence[StudyRow], beside: Sequence[StudyRow], findings: Se
 
 def _result(curve: Curve) -> CurveResult:
     tables = {
-        name: table if name in EFFICIENCIES else np.where(curve.lost, np.nan, table)
+        name: table if name in EFFICIENCIES else np.where(curve.losses, np.nan, table)
         for name, table in curve.quantities.items()
     }
     means = {name: over_seeds(table) for name, table in tables.items()}
@@ -172,7 +172,7 @@ def _result(curve: Curve) -> CurveResult:
         curve=curve,
         means=means,
         medians=medians,
-        stage_means={name: over_seeds(np.where(curve.lost, np.nan, table)) for name, table in curve.stages.items()},
+        stage_means={name: over_seeds(np.where(curve.losses, np.nan, table)) for name, table in curve.stages.items()},
         divergence=divergence(curve),
         optimum=optimum(curve.values, medians["efficiency"]),
         law=law,

@@ -67,7 +67,7 @@ def judge_imu(finding: ExpectedFinding, result: CurveResult, others: Sequence[Cu
 def _kept(finding: ExpectedFinding, result: CurveResult) -> Floats:
     """(V, S) of the runs that were not lost, nan for the others."""
     curve = result.curve
-    return np.where(curve.lost, np.nan, curve.quantities[finding.of])
+    return np.where(curve.losses, np.nan, curve.quantities[finding.of])
 
 
 def _medians(part: Floats) -> Floats:

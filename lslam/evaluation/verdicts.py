@@ -45,15 +45,15 @@ def judge_matters_little(finding: ExpectedFinding, result: CurveResult) -> Judge
     known = np.isfinite(medians) & (medians > 0)
     if known.sum() < FEWEST_VALUES:
         return "undecided", f"fewer than {FEWEST_VALUES} values have a result"
-    table = np.where(curve.lost, np.nan, curve.quantities[finding.of])
+    table = np.where(curve.losses, np.nan, curve.quantities[finding.of])
     top, bottom = (int(pick(np.where(known, medians, np.nan))) for pick in (np.nanargmax, np.nanargmin))
     largest, smallest = medians[top], medians[bottom]
     name, unit = finding.of.replace("_", " "), UNITS.get(finding.of, "")
     said = f"{name} goes from {smallest:.3g} to {largest:.3g} {unit}".rstrip()
     said += f", a factor of {largest / smallest:.2f}"
-    lost = curve.is_lost
+    lost = curve.loses_most
     if lost.any():
-        outcome: Outcome = "refuted" if (curve.lost.sum(1)[lost] > 1).any() else "undecided"
+        outcome: Outcome = "refuted" if (curve.losses.sum(1)[lost] > 1).any() else "undecided"
         return outcome, f"{said}, and it diverges at {_value_list(curve, lost)}"
     least, pairs = finding.values[0], permutations(table[known], 2)
     if contrast(table[top], table[bottom]).exceeds(least):
@@ -102,7 +102,7 @@ def _law(finding: ExpectedFinding, law: Law | None) -> Judged:
         return "confirmed", said
     if r2 >= least:
         return "refuted", f"{said}; {other} has R2 {r2:.3f}"
-    misfit, scatter = _rms((law.observed - law.fitted) / law.observed), _rms(law.scatter / law.observed)
+    misfit, scatter = _rms((law.times - law.law_times) / law.times), _rms(law.scatter / law.times)
     if misfit > scatter:
         return "refuted", said
     return "undecided", f"{said}, which is no more than runs at one value scatter, as far as that is known"
@@ -142,7 +142,7 @@ def _changes(curve: Curve) -> tuple[dict[str, float], float | None]:
     A stage that a timed run lacks counts as 0. Empty, and None, where fewer than 3 values were timed.
     """
     tables = {
-        name: np.where(curve.lost, np.nan, table)
+        name: np.where(curve.losses, np.nan, table)
         for name, table in curve.stages.items()
         if name not in NOT_REGISTRATION
     }
@@ -191,7 +191,7 @@ def _as_most_seeds(says: Callable[[Curve], Judged], curve: Curve) -> Judged:
     outcome, said = says(curve)
     if outcome == "undecided":
         return outcome, said
-    scored = [int(seed) for seed in np.flatnonzero(curve.scored.any(0))]
+    scored = [int(seed) for seed in np.flatnonzero(curve.with_score.any(0))]
     agree = sum(says(curve.of_seed(seed))[0] == outcome for seed in scored)
     if 2 * agree > len(scored):
         return outcome, said
@@ -252,7 +252,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
     """
     low, high = finding.values
     curve = result.curve
-    medians = np.where(curve.is_lost, np.nan, result.medians[finding.of])
+    medians = np.where(curve.loses_most, np.nan, result.medians[finding.of])
     best = optimum(curve.values, medians, is_highest_best=is_highest)
     if best is None or np.isfinite(medians).sum() < 3:
         return "undecided", "fewer than 3 values have a result"
@@ -261,7 +261,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
     )
     word = "largest" if finding.kind == "largest_between" else "best"
     said = f"{finding.of.replace('_', ' ')} is {word} at {best.value:g} ({flat})"
-    known = np.isfinite(medians) | curve.is_lost
+    known = np.isfinite(medians) | curve.loses_most
     is_inside = (curve.values >= low) & (curve.values <= high)
     inside = optimum(curve.values[is_inside], medians[is_inside], is_highest_best=is_highest)
     if not (known & is_inside).any():
@@ -271,7 +271,7 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
     base = int(np.flatnonzero(curve.values == inside.value)[0])
     rankings = {int(k): _ranking(finding, curve, int(k), base, is_highest) for k in np.flatnonzero(known & ~is_inside)}
     # Of many values some are better by luck, the best of all is so least.
-    if any(how == "better" and (curve.is_lost[k] or curve.values[k] == best.value) for k, how in rankings.items()):
+    if any(how == "better" and (curve.loses_most[k] or curve.values[k] == best.value) for k, how in rankings.items()):
         return "refuted", said
     sides = [{how for k, how in rankings.items() if side[k]} for side in (curve.values < low, curve.values > high)]
     outside = sides[0] | sides[1]
@@ -293,12 +293,12 @@ def _between(finding: ExpectedFinding, result: CurveResult, *, is_highest: bool)
 
 def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_highest: bool) -> Ranking:
     """Ranking of the value at index `other` against that at `base`."""
-    if curve.is_lost[other]:
+    if curve.loses_most[other]:
         if finding.kind == "best_between" or finding.of.endswith("efficiency"):
             return "worse"
         # Of lost runs the errors are the largest there are; their times say nothing.
         return "better" if finding.of in ("translation", "angular") else "unknown"
-    table = np.where(curve.lost, np.nan, curve.quantities[finding.of])
+    table = np.where(curve.losses, np.nan, curve.quantities[finding.of])
     ours, theirs = (table[base], table[other]) if is_highest else (table[other], table[base])
     lead, lag = contrast(ours, theirs), contrast(theirs, ours)
     if lead.is_more:
@@ -310,7 +310,7 @@ def _ranking(finding: ExpectedFinding, curve: Curve, other: int, base: int, is_h
 
 def _best_by_seed(finding: ExpectedFinding, result: CurveResult, is_highest: bool) -> list[Optimum]:
     """Best value of each seed alone, for seeds that have any result."""
-    table = np.where(result.curve.lost, np.nan, result.curve.quantities[finding.of])
+    table = np.where(result.curve.losses, np.nan, result.curve.quantities[finding.of])
     found = [optimum(result.curve.values, column, is_highest_best=is_highest) for column in table.T]
     return [best for best in found if best is not None]
 
@@ -378,12 +378,12 @@ def _only_if_as_good(rise: Rise) -> Outcome:
 
 
 def _elbow(result: CurveResult) -> float | None:
-    return elbow(result.curve.values, result.medians["translation"], result.curve.is_lost)
+    return elbow(result.curve.values, result.medians["translation"], result.curve.loses_most)
 
 
 def _scored_values(curve: Curve) -> Floats:
     """Values with at least one scored run."""
-    return curve.values[curve.scored.any(1)]
+    return curve.values[curve.with_score.any(1)]
 
 
 def _place(values: Floats, value: float) -> int:
@@ -393,7 +393,7 @@ def _place(values: Floats, value: float) -> int:
 
 def _lost(curve: Curve, last: float) -> str:
     """Remark on the number of lost runs at values up to `last`, which work for most seeds; empty if none is lost."""
-    at = curve.lost.any(1) & (curve.values <= last)
-    lost, ran = int(curve.lost[at].sum()), int(curve.scored[at].sum())
+    at = curve.losses.any(1) & (curve.values <= last)
+    lost, ran = int(curve.losses[at].sum()), int(curve.with_score[at].sum())
     listed = ", ".join(f"{value:g}" for value in curve.values[at])
     return f", though {lost} of {ran} runs at {listed} {'is' if lost == 1 else 'are'} lost" if lost else ""

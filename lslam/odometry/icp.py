@@ -59,7 +59,7 @@ class Icp(MapMethod):
     """Points on the local map."""
 
     deskew = "by the motion prior, and again by the motion that registration finds"
-    CLEARED: ClassVar[tuple[str, ...]] = ("_surfaces",)
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("_surfaces",)
 
     def __init__(self, registration: Registration) -> None:
         c = registration.config

@@ -84,7 +84,7 @@ class Kiss(Traits):
         _, source = self._kiss.register_frame(points, times if len(times) else np.zeros(len(points)))
         pose = np.asarray(self._kiss.last_pose, np.float64).copy()
         if self._with_deskew:
-            pose = self._at_stamp(pose, np.asarray(self._kiss.last_delta, np.float64), scan.span.passed)
+            pose = self._at_stamp(pose, np.asarray(self._kiss.last_delta, np.float64), scan.span.stamp_share)
         took = time.perf_counter() - began
         pose = se3.normalise(pose) if np.isfinite(pose).all() else pose
         return ScanResult(scan.index, scan.stamp_ns, pose, source_points=len(source), stages={"register": took})

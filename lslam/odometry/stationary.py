@@ -63,7 +63,7 @@ class StationaryDetector(Stateful):
             self._last.T_world_lidar.copy(),
             reason=f"standing since scan {self._last.index}",
             is_stationary=True,
-            is_repeated=True,
+            repeats_pose=True,
             covariance=self._last.covariance,
             registration_covariance=self._last.registration_covariance,
             points_covariance=self._last.points_covariance,

@@ -30,8 +30,8 @@ def write_corrected(path: Path, found: CorrectedMap) -> None:
     `@id` is the element's number in OpenStreetMap; displacements are real minus map, east, north, m, and counter-clockwise
     about the middle of the box round the outlines on the map. Raises OutputError when the file cannot be written.
     """
-    stuck: dict[int, list[str]] = {k: [] for pair in found.left for k in pair}
-    for i, j in found.left:
+    stuck: dict[int, list[str]] = {k: [] for pair in found.overlaps for k in pair}
+    for i, j in found.overlaps:
         stuck[i].append(found.buildings[j].building.osm_id)
         stuck[j].append(found.buildings[i].building.osm_id)
     features = [_feature(c, found.origin, stuck.get(k, [])) for k, c in enumerate(found.buildings)]
@@ -89,7 +89,7 @@ def _feature(correction: BuildingCorrection, origin: Floats, overlaps: list[str]
     building, (east, north, yaw) = correction.building, correction.displacement
     polygons = [
         [_positions(np.concatenate([ring, ring[:1]]), origin) for ring in footprint.rings]
-        for footprint in correction.corrected.footprints
+        for footprint in correction.real_building.footprints
     ]
     properties = {
         "@id": building.osm_id,
@@ -100,8 +100,8 @@ def _feature(correction: BuildingCorrection, origin: Floats, overlaps: list[str]
         "turn_deg": round(float(np.degrees(yaw)), 5),
         "confidence": round(correction.confidence, 4),
         "covariance": [[float(f"{v:.6g}") for v in row] for row in correction.covariance],
-        "matches": correction.used,
-        "matches_rejected": correction.rejected,
+        "matches": correction.used_matches,
+        "matches_rejected": correction.rejected_matches,
         "overlaps": overlaps,
         "height_m": building.height,
         "base_m": building.base,
@@ -134,8 +134,8 @@ def _correction(feature: dict[str, Any], origin: Floats) -> BuildingCorrection:
 def _undone(there: Building, displacement: Floats) -> Building:
     """The building as on the map; what it was turned about is the middle of the box round it there."""
     R = se2.rotation(float(displacement[2]))
-    upright = there.moved(R.T, np.zeros(2))
-    return upright.moved(np.eye(2), R @ upright.middle - displacement[:2] - upright.middle)
+    upright = there.transform(R.T, np.zeros(2))
+    return upright.transform(np.eye(2), R @ upright.middle - displacement[:2] - upright.middle)
 
 
 def _positions(points: Floats, origin: Floats) -> list[list[float]]:

@@ -218,7 +218,7 @@ def place_buildings(
         information = np.asarray(np.linalg.inv(solution.covariances), np.float64)
         untangled = remove_overlaps(matches.buildings, solution.displacements, information)
     displacements = untangled.displacements
-    displaced = [b.displaced(d) for b, d in zip(matches.buildings, displacements, strict=True)]
+    displaced = [b.displace(d) for b, d in zip(matches.buildings, displacements, strict=True)]
     absent = absent_buildings(displaced, matches.keyframes, place)
     used, rejected = _counts(matches, local, solution)
     found = tuple(

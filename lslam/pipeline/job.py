@@ -198,9 +198,9 @@ def announce(job: PreparedRun) -> None:
 
 def _set_by_hand(config: Config) -> list[str]:
     """Keys of the IMU that are neither the defaults' nor the preset's."""
-    keys, preset = config.imu.changed(), config.odometry.preset
+    keys, preset = config.imu.changed_keys(), config.odometry.preset
     if keys and preset:
-        keys = config.imu.changed(load_config(None, [f"odometry.preset={preset}"], {}).imu)
+        keys = config.imu.changed_keys(load_config(None, [f"odometry.preset={preset}"], {}).imu)
     return [f"imu.{key}" for key in keys]
 
 

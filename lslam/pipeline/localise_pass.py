@@ -225,7 +225,7 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
         replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotate(f.covariance, T[:3, :3]))
         for f in doubted(fixes)
     ]
-    held = [k for k, fix in enumerate(into_map) if fix.is_held]
+    held = [k for k, fix in enumerate(into_map) if fix.is_binding]
     if not held:
         raise RunFailedError(f"no scan agrees with {prior_map.source} where the drive was found: {fixes[0].reason}")
     first = held[0]
@@ -247,8 +247,8 @@ def _tell(record: RunRecord, prior_map: PriorMap, start: dict[str, Any], config:
     """Write the results of the scans into manifest and problems."""
     fixes = record.map_fixes
     counts = Counter[str](fix.status for fix in fixes)
-    doubtful = sum(fix.is_doubted for fix in fixes)
-    shares = [fix.inlier_share for fix in fixes if fix.is_held]
+    doubtful = sum(fix.is_doubtful for fix in fixes)
+    shares = [fix.inlier_share for fix in fixes if fix.is_binding]
     manifest.world = record.world
     manifest.localization = {
         "map": config.localize.map,

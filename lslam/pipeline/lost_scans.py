@@ -38,7 +38,9 @@ def mark_lost_finally(
     The monitor's measurements between scans are compared with the motion of the final poses.
     """
     raised = _alerts(results, [_of_final_poses(check, results) for check in checks])
-    new = [alert for alert in raised if not all(results[k].is_lost for k in range(alert.first, alert.last + 1))]
+    new = [
+        alert for alert in raised if not all(results[k].may_be_elsewhere for k in range(alert.first, alert.last + 1))
+    ]
     manifest.integrity["final_alerts"] = len(new)
     return _mark(results, new, manifest, f"after {cause}, ")
 
@@ -47,8 +49,8 @@ def _of_final_poses(check: MotionCheck, results: list[ScanResult]) -> MotionChec
     """Motion check with the motion of the final poses."""
     motion = se3.relative(results[check.first].T_world_lidar, results[check.last].T_world_lidar)
     # How many points lie on surfaces at a pose that was moved far was not counted: as good as none.
-    is_moved = bool(np.any(np.abs(motion_apart(check.claimed, motion)) > LARGE))
-    return replace(check, claimed=motion, claimed_agreement=0.0 if is_moved else check.claimed_agreement)
+    is_moved = bool(np.any(np.abs(motion_apart(check.claimed_motion, motion)) > LARGE))
+    return replace(check, claimed_motion=motion, claimed_agreement=0.0 if is_moved else check.claimed_agreement)
 
 
 def _report_stamps(results: list[ScanResult]) -> None:
@@ -83,7 +85,7 @@ def _mark(results: list[ScanResult], raised: list[Alert], manifest: Manifest, af
         log.warning("%s", sentence)
     manifest.problems += sentences
     lost = {k for alert in raised for k in range(alert.first, alert.last + 1)}
-    return [replace(r, is_lost=True) if k in lost else r for k, r in enumerate(results)]
+    return [replace(r, may_be_elsewhere=True) if k in lost else r for k, r in enumerate(results)]
 
 
 def _sentence(results: list[ScanResult], alert: Alert) -> str:

@@ -135,7 +135,7 @@ class Manifest:
     def take_over(self, record: RunRecord) -> None:
         """Add problems of the result."""
         self.problems += record.problems
-        self.unscored = record.unscored
+        self.unscored = record.no_score_reason
 
     def interrupt(self, where: str) -> None:
         """Mark the run as ended early by request."""

@@ -267,7 +267,7 @@ def write_scans(folder: RunFolder, record: RunRecord) -> None:
             f"{r.prior_norm:.5f}",
             "" if r.imu.steady_norm is None else f"{r.imu.steady_norm:.5f}",
             "" if r.imu.steady_iterations is None else r.imu.steady_iterations,
-            int(r.is_lost),
+            int(r.may_be_elsewhere),
             r.segment,
             r.frame,
         )
@@ -294,7 +294,7 @@ def write_localization(folder: RunFolder, record: RunRecord) -> None:
             result.index,
             result.stamp_ns,
             fix.status,
-            int(fix.is_doubted),
+            int(fix.is_doubtful),
             f"{fix.overlap:.4f}",
             f"{fix.inlier_share:.4f}",
             f"{fix.innovation[0]:.5f}",

@@ -38,7 +38,7 @@ def view_prior_map(job: PreparedRun, record: RunRecord, prior_map: PriorMap) -> 
     positions = se3.apply(se3.inverse(prior_map.T_map_level), record.trajectory.positions)
     near = se3.apply(prior_map.T_map_level, prior_map.along(positions, section.occupancy_range).astype(np.float64))
     apart = spread_out(record.trajectory.path_lengths)
-    looked_at = [f.is_held and far for f, far in zip(record.map_fixes, apart, strict=True)]
+    looked_at = [f.is_binding and far for f, far in zip(record.map_fixes, apart, strict=True)]
     held = [r if looked else replace(r, status="bridged") for r, looked in zip(results, looked_at, strict=True)]
     found = _observed(job, held)
     changes = differences(found, near)

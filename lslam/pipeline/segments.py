@@ -67,7 +67,7 @@ def join_segments(
     _say([part.segment for part in placed], manifest)
     # Where a frame of its own lies, nobody knows.
     return [
-        replace(r, frame=part.segment.frame, is_lost=part.segment.frame > 0)
+        replace(r, frame=part.segment.frame, may_be_elsewhere=part.segment.frame > 0)
         for part in placed
         for r in moved[part.segment.number]
     ]
@@ -204,7 +204,7 @@ def _bridge(results: list[ScanResult], T: Floats, following: Session) -> list[Sc
 
 def _move(result: ScanResult, T: Floats, origin: Floats, base: Floats) -> ScanResult:
     """Result in the world reached by T (4, 4), with its covariance added to that of the segment's `origin` (3,), m."""
-    moved = result.moved(T)
+    moved = result.in_world(T)
 
     def chained(own: Floats | None) -> Floats | None:
         step = moved.T_world_lidar[:3, 3] - origin

@@ -93,7 +93,7 @@ def score(record: RunRecord, sequence: Sequence, config: Config) -> Evaluation |
             )
             score = replace(score, odometry=before)
     except LslamError as error:
-        record.unscored = str(error)
+        record.no_score_reason = str(error)
         record.problems.append(f"not scored: {error}")
         log.warning("not scored: %s", error)
         if record.folder is not None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
 from lslam.core.kernels import linearisation as at
-from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimming_bound
+from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimming_distance2
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.registration.result import LEAST_MATCHED, RegistrationResult
@@ -126,7 +126,7 @@ def optimise(
         converged = scale <= end and move < STEP_M and turn < STEP_RAD
         scale = max(scale * annealing.decay, end)
         if inlier_ratio < 1.0:
-            gate2 = trimming_bound(matches.away2, float(inlier_ratio), farthest2)
+            gate2 = trimming_distance2(matches.away2, float(inlier_ratio), farthest2)
     weak = weak[:count]
     if len(limits.allowed):
         weak = weak[np.linalg.norm(weak @ limits.allowed, axis=1) > 0.5]

@@ -171,7 +171,7 @@ class Rest(Stateful):
     """
 
     STATE = ("scans", "T_world_lidar", "_cloud", "_squares")
-    CLEARED = ("_walls",)
+    TRANSIENT = ("_walls",)
 
     def __init__(self, preprocess: PreprocessConfig, sigma: float, voxel_size: float) -> None:
         self.preprocess, self.sigma, self.voxel_size, self.scans = preprocess, sigma, voxel_size, 0

@@ -66,7 +66,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         rows.append(
             (
                 "OpenStreetMap",
-                f"{len(record.osm.accepted)} of {len(record.osm.keyframes)} keyframes held by "
+                f"{len(record.osm.accepted_matches)} of {len(record.osm.keyframes)} keyframes held by "
                 f"{len(record.osm.buildings)} buildings, "
                 f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
             )
@@ -78,7 +78,7 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         gone = sum(c.status == "absent" for c in found.buildings)
         said = f"{len(moves)} seen" + (f", moved by {np.median(moves):.2f} m (median)" if moves else "")
         new = f"{count_of(len(found.new_walls), 'wall')} without a building"
-        rows.append(("buildings", f"{said}; {gone} absent; {new}; {count_of(len(found.left), 'overlap')} left"))
+        rows.append(("buildings", f"{said}; {gone} absent; {new}; {count_of(len(found.overlaps), 'overlap')} left"))
     return rows
 
 

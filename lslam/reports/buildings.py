@@ -52,8 +52,8 @@ def building_figures(found: CorrectedMap, matches: OsmMatches, poses: Floats) ->
     drawn = [
         ("s5", "walls seen", _segments(walls)),
         ("gt", "buildings on the map", _outlines(c.building for c in near)),
-        ("s1", "where they stand", _outlines(c.corrected for c in near if c.status != "absent")),
-        ("s2", "absent in the scans", _outlines(c.corrected for c in gone)),
+        ("s1", "where they stand", _outlines(c.real_building for c in near if c.status != "absent")),
+        ("s2", "absent in the scans", _outlines(c.real_building for c in gone)),
         ("s4", "new: walls without a building", _segments(found.new_walls)),
     ]
     tracks = [Track(label, part, style) for style, label, lines in drawn for part in _parts(lines)]
@@ -107,7 +107,7 @@ def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
     recipe = (
         f"Real minus map, about the middle of each building; {count_of(len(found.buildings), 'building')}: {counts['seen']} "
         f"seen, {counts['unseen']} not, {counts['absent']} absent; the map as a whole lies {east:+.2f} m east and {north:+.2f} m "
-        f"north of the run; {count_of(len(found.left), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
+        f"north of the run; {count_of(len(found.overlaps), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
     )
     header = ("building", "status", "east, m", "north, m", "turn, deg", "confidence", "matches", "given up")
     tables = [Table("Displacement of buildings", header, rows, recipe)]
@@ -129,8 +129,8 @@ def _row(correction: BuildingCorrection) -> tuple[str, ...]:
         f"{north:+.2f}",
         f"{np.degrees(yaw):+.2f}",
         f"{correction.confidence:.2f}",
-        str(correction.used),
-        str(correction.rejected),
+        str(correction.used_matches),
+        str(correction.rejected_matches),
     )
 
 

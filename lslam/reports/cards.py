@@ -28,13 +28,13 @@ class Card:
 
 def run_cards(record: RunRecord, facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
     """Status of registration, path, error, doubtful scans, speed: those that are known."""
-    held = sum(fix.is_held for fix in record.map_fixes)
+    held = sum(fix.is_binding for fix in record.map_fixes)
     registered = (
         Card(f"{held}/{len(record.map_fixes)}", "", "scans held by the map")
         if record.map_fixes
         else Card(f"{facts.registered}/{facts.scans}", "", "scans registered")
     )
-    doubtful = sum(r.status != "ok" or r.is_lost or len(r.degenerate) > 0 for r in record.results)
+    doubtful = sum(r.status != "ok" or r.may_be_elsewhere or len(r.degenerate) > 0 for r in record.results)
     cards = [registered, Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s")]
     cards += _error_card(record, evaluation)
     share = 100 * doubtful / max(facts.scans, 1)
@@ -53,7 +53,7 @@ def _error_card(record: RunRecord, evaluation: Evaluation | None) -> list[Card]:
     if control is not None:
         name = f"rms at {count_of(control['count'], 'control point')}, horizontally"
         return [Card(metres(control["rms_horizontal_m"]), "m", name)]
-    moves = [fix.innovation[0] for fix in record.map_fixes if fix.is_held]
+    moves = [fix.innovation[0] for fix in record.map_fixes if fix.is_binding]
     if moves:
         return [Card(metres(float(np.median(moves))), "m", "correction by the map a scan, median")]
     residuals = loop_residuals(record)

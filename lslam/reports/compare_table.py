@@ -11,7 +11,7 @@ from typing import Any
 
 from lslam.core import __version__
 from lslam.core.printable import count_of, metres, with_decimals
-from lslam.core.types.comparison import Comparison, Metric, RunScore, Spread, SummaryRow
+from lslam.core.types.comparison import Comparison, Metric, RunScore, SeedStatistics, SummaryRow
 from lslam.io.formats.atomic import write_text
 from lslam.reports.evaluations import strict
 from lslam.reports.text import Grid, aligned, comma_separated, latex, markdown
@@ -166,7 +166,7 @@ def _cell(metric: Metric, row: SummaryRow) -> str:
     return text if metric.group != "time" or row.is_timed_alone else f"~{text}"
 
 
-def _with_spread(mean: str, value: Spread) -> str:
+def _with_spread(mean: str, value: SeedStatistics) -> str:
     """Text of the mean with the standard deviation over seeds, with equal decimals."""
     return mean if value.n < 2 else f"{mean} ± {with_decimals(value.std, len(mean.partition('.')[2]))}"
 
@@ -195,7 +195,7 @@ def _is_best(metric: Metric, row: SummaryRow, rivals: Sequence[SummaryRow]) -> b
 def _pairs(comparison: Comparison) -> CompareTable:
     header = ("method", "against", "pairs", "ratio of ATE", "wins/ties/losses", "p")
     rows = []
-    for pair in comparison.paired:
+    for pair in comparison.pairs:
         p = pair.note if math.isnan(pair.p) else f"{pair.p:.3g}"
         ratio = with_decimals(pair.ratio, 3) if pair.n else "-"
         score = f"{pair.wins}/{pair.ties}/{pair.losses}"
@@ -251,7 +251,7 @@ def to_document(comparison: Comparison) -> dict[str, Any]:
         "metrics": [asdict(metric) for metric in c.metrics],
         "runs": [_run(run) for run in c.runs],
         "rows": [asdict(row) for row in c.rows],
-        "paired": [asdict(pair) for pair in c.paired],
+        "paired": [asdict(pair) for pair in c.pairs],
         "differences": [asdict(difference) for difference in c.differences],
         "beside": [asdict(table) for table in c.beside],
     }

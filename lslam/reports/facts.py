@@ -91,7 +91,7 @@ def run_facts(record: RunRecord) -> RunFacts:
         status=status,
         reasons=reasons,
         scans=len(results),
-        registered=sum(r.status == "ok" and not r.is_repeated for r in results),
+        registered=sum(r.status == "ok" and not r.repeats_pose for r in results),
         bridged=sum(r.status == "bridged" for r in results),
         skipped=sum(r.status == "skipped" for r in results),
         standing=sum(r.is_stationary for r in results),

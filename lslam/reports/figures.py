@@ -169,7 +169,7 @@ def _buildings(figure: Any, run: PlottedRun) -> None:
     for k, one in enumerate(run.buildings.buildings):
         for building, colour, name in (
             (one.building, COLOURS[4], "on the map"),
-            (one.corrected, COLOURS[0], "corrected"),
+            (one.real_building, COLOURS[0], "corrected"),
         ):
             for footprint in building.footprints:
                 ring = footprint.outer

@@ -28,7 +28,7 @@ WORDS = {"gone": "gone", "appeared": "not in the map"}
 
 def state_of(fix: MapFix) -> str:
     """Key of `STATES` of a scan."""
-    return "doubted" if fix.is_held and fix.is_doubted else fix.status
+    return "doubted" if fix.is_binding and fix.is_doubtful else fix.status
 
 
 def state_codes(record: RunRecord) -> NDArray[np.uint8]:
@@ -69,14 +69,14 @@ def localization_figures(record: RunRecord) -> list[Figure]:
     fixes = record.map_fixes
     if not fixes:
         return []
-    way, is_held = record.trajectory.path_lengths, np.array([fix.is_held for fix in fixes])
-    carried = way[~is_held]
+    way, is_binding = record.trajectory.path_lengths, np.array([fix.is_binding for fix in fixes])
+    carried = way[~is_binding]
     share = np.array([fix.inlier_share for fix in fixes])
     moved = np.array([fix.innovation[0] for fix in fixes])
     legend = (("failed", f"carried by odometry, {count_of(len(carried), 'scan')}"),) if len(carried) else ()
 
     def figure(title: str, label: str, values: NDArray[Any], caption: str) -> Figure:
-        line = svg.Line(label, way, np.where(is_held, values, np.nan), "s1")
+        line = svg.Line(label, way, np.where(is_binding, values, np.nan), "s1")
         chart = svg.line_chart([line], "distance travelled, m", label, title.lower(), marks=carried, by="way")
         return Figure(title, chart, (("s1", "held by the map"), *legend), caption)
 

@@ -225,7 +225,7 @@ def _status(result: ScanResult | None) -> int:
     if result is None:
         return STATUSES.index("not known")
     word = "standing" if result.is_stationary else "registered" if result.status == "ok" else result.status
-    degenerate, lost = FLAGS["degenerate"] * bool(len(result.degenerate)), FLAGS["lost"] * result.is_lost
+    degenerate, lost = FLAGS["degenerate"] * bool(len(result.degenerate)), FLAGS["lost"] * result.may_be_elsewhere
     return STATUSES.index(word) + degenerate + lost
 
 

@@ -166,7 +166,7 @@ def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
 
 def _zoom(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
     """Figure without the lost points; only where some curves diverge and others do not."""
-    steady = [r for r in shown if not r.curve.is_lost.any()]
+    steady = [r for r in shown if not r.curve.loses_most.any()]
     return len(steady) < len(shown) and bool(steady) and _errors(figure, result, steady)
 
 
@@ -229,8 +229,8 @@ def _quantity(
     rows_of_crosses = 0
     for r, look in _with_looks(result, shown):
         means, values = r.means[name], r.curve.values
-        if r.curve.is_lost.any():
-            lost, height = values[r.curve.is_lost], 1.0 + 0.03 * rows_of_crosses
+        if r.curve.loses_most.any():
+            lost, height = values[r.curve.loses_most], 1.0 + 0.03 * rows_of_crosses
             rows_of_crosses += 1
             above = {"transform": plot.get_xaxis_transform(), "clip_on": False}
             plot.plot(
@@ -350,7 +350,7 @@ def _single(upper: Any, lower: Any, law: Law, curve: str, colour: str) -> None:
     x = law.points[:, 0]
     line = np.linspace(x.min(), x.max(), SAMPLES)
     fitted, half = band(law, line)
-    upper.plot(x, law.observed, "o", ms=3.5, color=colour, label=f"_{curve}")
+    upper.plot(x, law.times, "o", ms=3.5, color=colour, label=f"_{curve}")
     upper.plot(line, fitted, color=colour, lw=1.2, label=f"{curve}: {law.text} s, R2 {law.r2:.3f}")
     upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
     lower.plot(x, 100 * law.residuals, "o", ms=3, color=colour, label=f"_{curve}")
@@ -368,7 +368,7 @@ def _product(upper: Any, lower: Any, law: Law, name: str) -> None:
         line = np.linspace(x.min(), x.max(), SAMPLES)
         fitted, half = band(law, np.stack([line, np.full(SAMPLES, second)], 1))
         curve = f"{key} {second:g} {unit}".rstrip()
-        upper.plot(x, law.observed[own], "o", ms=3, color=colour, label=f"_{curve}")
+        upper.plot(x, law.times[own], "o", ms=3, color=colour, label=f"_{curve}")
         upper.plot(line, fitted, lw=1.1, color=colour, label=curve)
         upper.fill_between(line, fitted - half, fitted + half, color=colour, alpha=0.2, lw=0)
         lower.plot(x, 100 * law.residuals[own], "o", ms=2.5, color=colour, label=f"_{curve}")

@@ -56,7 +56,7 @@ def means_grid(results: Sequence[StudyResult]) -> Grid:
             at = "; ".join(f"{key}={value}" for key, value in curve.at)
             for v, value in enumerate(curve.values):
                 row = [result.study, result.sequence, curve.method, str(curve.uses_imu).lower(), curve.parameter]
-                row += [curve.name_of(value), at, str(int(curve.ran[v].sum())), str(int(curve.lost[v].sum()))]
+                row += [curve.name_of(value), at, str(int(curve.ran[v].sum())), str(int(curve.losses[v].sum()))]
                 for name in _UNITS:
                     m = r.means[name]
                     numbers = (m.mean[v], m.low[v], m.high[v], r.medians[name][v])
@@ -86,7 +86,7 @@ def study_recipes(result: StudyResult) -> list[str]:
 
 
 def _verdicts(result: StudyResult) -> CompareTable:
-    rows = tuple((v.outcome, v.text, v.measured, v.source or UNKNOWN) for v in result.verdicts)
+    rows = tuple((v.outcome, v.text, v.numbers, v.source or UNKNOWN) for v in result.verdicts)
     return CompareTable("findings", ("verdict", "finding", "here", "source"), rows, 4)
 
 
@@ -96,13 +96,13 @@ def _landmarks(result: StudyResult) -> CompareTable:
     for r in result.results:
         curve, found = r.curve, r.divergence
         name = curve.name_of
-        least = np.where(curve.is_lost, np.nan, r.medians["translation"])
-        cells = ["no result" if not curve.scored.any() else "nowhere", UNKNOWN]
+        least = np.where(curve.loses_most, np.nan, r.medians["translation"])
+        cells = ["no result" if not curve.with_score.any() else "nowhere", UNKNOWN]
         if found.first_bad is not None:
             cells = [name(found.first_bad), UNKNOWN if found.last_good is None else name(found.last_good)]
         cells += [UNKNOWN] * 2 if r.optimum is None else [name(r.optimum.value), _range(r)]
         cells.append(name(curve.values[np.nanargmin(least)]) if np.isfinite(least).any() else UNKNOWN)
-        rows.append((curve.label, *cells, f"{curve.lost.sum()}/{curve.ran.sum()}"))
+        rows.append((curve.label, *cells, f"{curve.losses.sum()}/{curve.ran.sum()}"))
     return CompareTable(f"landmarks of {with_unit(result.parameters[0])}", header, tuple(rows), 1)
 
 
@@ -121,7 +121,7 @@ def _law_row(name: str, law: Law) -> tuple[str, ...]:
     pairs = zip(law.coefficients, law.margins, strict=True)
     coefficients = ", ".join(f"{value:.4g} ± {margin:.2g}" for value, margin in pairs)
     worst = f"{100 * np.abs(law.residuals).max():.1f} %"
-    return name, law.text, coefficients, f"{law.r2:.4f}", worst, str(len(law.observed))
+    return name, law.text, coefficients, f"{law.r2:.4f}", worst, str(len(law.times))
 
 
 def _means(result: StudyResult) -> CompareTable:
@@ -146,7 +146,7 @@ def _means(result: StudyResult) -> CompareTable:
             cells = [_mean(r.means[name], v, name) for name in _UNITS if not name.endswith("efficiency")]
             cells += [with_decimals(e[v], 2) if math.isfinite(e[v]) else UNKNOWN for e in share]
             best |= {(len(rows), 7 + k) for k, e in enumerate(share) if e[v] == 1}
-            rows.append((curve.label, curve.name_of(value), *cells, f"{curve.lost[v].sum()}/{curve.ran[v].sum()}"))
+            rows.append((curve.label, curve.name_of(value), *cells, f"{curve.losses[v].sum()}/{curve.ran[v].sum()}"))
     return CompareTable("means over seeds", head, tuple(rows), 1, frozenset(best))
 
 

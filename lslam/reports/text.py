@@ -27,7 +27,7 @@ def localization_rows(record: RunRecord, evaluation: Evaluation | None) -> list[
     fixes = record.map_fixes
     if not fixes:
         return []
-    held = [fix for fix in fixes if fix.is_held]
+    held = [fix for fix in fixes if fix.is_binding]
     about = record.manifest.get("localization", {})
     start = about.get("start", {})
     shares = float(np.median([fix.inlier_share for fix in held]))

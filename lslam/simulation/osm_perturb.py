@@ -69,8 +69,8 @@ def perturb(buildings: Sequence[Building], perturbation: Perturbation) -> list[B
         if change.turn_rad == 0:
             # Nothing but the shift, to the last bit.
             R, middle = np.eye(2), np.zeros(2)
-        found.append(building.moved(R, middle - portable.rotate(R, middle) + np.array(change.shift_m) + common))
-    return found + [building.moved(np.eye(2), common) for building in perturbation.not_yet_built]
+        found.append(building.transform(R, middle - portable.rotate(R, middle) + np.array(change.shift_m) + common))
+    return found + [building.transform(np.eye(2), common) for building in perturbation.not_yet_built]
 
 
 def join_outlines(building: Building, change: Change, known: dict[str, Building]) -> Building:

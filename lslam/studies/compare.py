@@ -267,7 +267,7 @@ def _weigh(plan: Plan, jobs: Sequence[Job], scores: Sequence[RunScore]) -> tuple
         metrics=tuple(metrics_of([variant.config.eval for variant in plan.variants], scores)),
         runs=tuple(scores),
         rows=tuple(summarise(scores)),
-        paired=tuple(compare_pairs(scores, methods, ((v.name, v.without) for v in plan.variants if v.without))),
+        pairs=tuple(compare_pairs(scores, methods, ((v.name, v.without) for v in plan.variants if v.without))),
         differences=tuple(differences),
         notes=tuple(_notes(scores)),
         configs={v.name: v.config.model_dump(mode="json") for v in plan.variants},

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from lslam.core.types.comparison import Paired, RunScore, Spread, SummaryRow
+from lslam.core.types.comparison import PairedComparison, RunScore, SeedStatistics, SummaryRow
 
 TIE_M = 0.01
 FEWEST_PAIRS = 6
@@ -33,7 +33,7 @@ def summarise(runs: Sequence[RunScore]) -> list[SummaryRow]:
     return rows
 
 
-def spread(values: Sequence[float]) -> Spread:
+def spread(values: Sequence[float]) -> SeedStatistics:
     """Mean and sample standard deviation of at least one value.
 
     >>> spread([1.0, 3.0])
@@ -41,12 +41,12 @@ def spread(values: Sequence[float]) -> Spread:
     """
     array = np.asarray(values, np.float64)
     std = float(np.std(array, ddof=1)) if len(array) > 1 else float("nan")
-    return Spread(float(np.mean(array)), std, len(array))
+    return SeedStatistics(float(np.mean(array)), std, len(array))
 
 
 def compare_pairs(
     runs: Sequence[RunScore], methods: Sequence[str], more: Iterable[tuple[str, str]] = ()
-) -> list[Paired]:
+) -> list[PairedComparison]:
     """Every method but the first against the first, over runs of the same sequence and seed that have a ground truth.
 
     more : further pairs (method, reference), such as a method with and without the IMU
@@ -78,7 +78,7 @@ def _run_of(table: dict[tuple[str, str, int], RunScore], sequence: str, method: 
     return others[0] if len(others) == 1 else None
 
 
-def _judge(method: str, reference: str, pairs: list[tuple[RunScore, RunScore]]) -> Paired:
+def _judge(method: str, reference: str, pairs: list[tuple[RunScore, RunScore]]) -> PairedComparison:
     wins = ties = losses = 0
     logs = []
     for of_reference, of_method in pairs:
@@ -96,7 +96,7 @@ def _judge(method: str, reference: str, pairs: list[tuple[RunScore, RunScore]]) 
         losses += b > a + TIE_M
     ratio = float(np.exp(np.mean(logs))) if logs else float("nan")
     p, note = _signed_rank(np.array(logs))
-    return Paired(method, reference, len(logs), ratio, wins, ties, losses, p, note)
+    return PairedComparison(method, reference, len(logs), ratio, wins, ties, losses, p, note)
 
 
 def _errors(a: RunScore, b: RunScore) -> tuple[float, float] | None:

@@ -51,7 +51,7 @@ def test_exact_points_give_the_exact_place_and_factors_without_a_residual(seen: 
     )
     on_earth = placed.georeference.T_enu_world @ np.stack([k.T_world_lidar for k in KEYFRAMES])
     for fix in placed.fixes:
-        assert fix.is_held
+        assert fix.is_binding
         np.testing.assert_allclose(fix.seen(on_earth), fix.position, atol=2e-3)
     # Scan 21 is no keyframe: half of it hangs on the one before, half on the next.
     assert (placed.fixes[1].keyframe, placed.fixes[1].share) == (10, pytest.approx(0.5))

@@ -28,7 +28,7 @@ def test_a_run_s_own_table_is_read_with_its_verdicts_passed_over(tmp_path: Path)
     )
     pairs = read_named_pairs(written(tmp_path, text))
     assert [(p.first.scan, p.second.scan, p.verdict) for p in pairs] == [(0, 84, "forbidden"), (2, 88, "known")]
-    assert pairs[1].first.said == "table.csv, line 4"
+    assert pairs[1].first.source == "table.csv, line 4"
 
 
 def test_stamps_are_exact_and_places_optional(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_a_german_table_of_control_points(tmp_path: Path) -> None:
     assert (point.at.stamp_ns, point.epsg) == (12_500_000_000, 25832)
     np.testing.assert_array_equal(point.position, [457799.014, 5428861.26, 115.006])
     np.testing.assert_array_equal(point.sigma, [0.01, 0.01, 0.02])
-    np.testing.assert_array_equal(point.seen, [1.0, 2.0, -1.5])
+    np.testing.assert_array_equal(point.point_lidar, [1.0, 2.0, -1.5])
 
 
 @pytest.mark.parametrize("separator", [";", "\t", " "])

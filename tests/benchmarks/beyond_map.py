@@ -61,7 +61,7 @@ def one_seed(root: Path, seed: int, percent: float, deg: float) -> list[tuple[in
         assert outcome.evaluation is not None
         error = outcome.evaluation.ate["origin"].translation
         assert error is not None
-        found.append((sum(fix.is_held for fix in outcome.record.map_fixes), error.rmse))
+        found.append((sum(fix.is_binding for fix in outcome.record.map_fixes), error.rmse))
     print(seed, found, flush=True)
     return found
 

@@ -82,7 +82,7 @@ def one_seed(root: Path, scenario: str, seed: int, starts: int) -> dict[str, lis
     T_town_map, _, _ = umeyama(est[:, :3, 3], old_true[: len(est), :3, 3])
     truth = se3.inverse(T_town_map) @ new_true[: len(record_of.results)]
     away = np.linalg.norm(record_of.trajectory.positions - truth[:, :3, 3], axis=1)
-    held = sum(fix.is_held for fix in record_of.map_fixes) / len(away)
+    held = sum(fix.is_binding for fix in record_of.map_fixes) / len(away)
     found = _starts(map_run, located, truth, starts, seed)
     print(
         f"{scenario} {seed}: ATE {np.sqrt((away**2).mean()):.4f} m, held {held:.3f}, {len(found['start_m'])} starts",

@@ -86,7 +86,7 @@ def doubted(imu: ImuStream, notes: list[str]) -> ImuStream:
 
 def trusted(imu: ImuStream, notes: list[str]) -> ImuStream:
     """It is filled in and trusted as any other reading."""
-    return replace(with_hidden(imu, notes), hidden=None)
+    return replace(with_hidden(imu, notes), clipping_sigma=None)
 
 
 def without(**changes: Any) -> Callable[..., Any]:

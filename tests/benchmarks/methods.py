@@ -33,7 +33,7 @@ def judged(drive: Traced, method: str) -> tuple[float, int, str]:
     assert outcome.evaluation is not None
     ate = outcome.evaluation.ate["se3"].translation
     assert ate is not None
-    others = sum(r.poser(name) != name and not r.is_repeated for r in outcome.record.results)
+    others = sum(r.poser(name) != name and not r.repeats_pose for r in outcome.record.results)
     return ate.rmse, others, str(outcome.record.manifest["status"])
 
 

@@ -86,9 +86,9 @@ def test_no_weight_is_above_that_of_the_shortest_time() -> None:
     x, times = np.arange(1.0, 9.0), np.array([0.4, 0.5, 2, 4, 6, 8, 10, 12])
     law = fit_law("linear", ("x",), x, times)
     assert law is not None
-    assert law.fitted.min() < 0.9 * times.min()
+    assert law.law_times.min() < 0.9 * times.min()
     # By hand: the law is the fit under the weights that it gives.
-    weights = 1 / np.maximum(law.fitted, 0.4)
+    weights = 1 / np.maximum(law.law_times, 0.4)
     columns = np.stack([x, np.ones(8)], 1) * weights[:, None]
     by_hand = np.linalg.solve(columns.T @ columns, columns.T @ (times * weights))
     assert law.coefficients == pytest.approx(by_hand, rel=2e-3)
@@ -102,7 +102,7 @@ def test_band_is_that_of_an_independent_fit_by_scipy() -> None:
     times = (20 * SHARES + 3) * (1 + 0.03 * draw.standard_normal(len(SHARES)))
     law = fit_law("linear", ("x",), SHARES, times)
     assert law is not None
-    best, covariance = curve_fit(lambda x, a, b: a * x + b, SHARES, times, sigma=law.fitted)
+    best, covariance = curve_fit(lambda x, a, b: a * x + b, SHARES, times, sigma=law.law_times)
     assert law.coefficients == pytest.approx(best, rel=1e-4)
     margins = student.ppf(0.995, len(times) - 2) * np.sqrt(np.diag(covariance))
     assert law.margins == pytest.approx(margins, rel=1e-3)

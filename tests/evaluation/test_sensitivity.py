@@ -41,7 +41,7 @@ def test_run_is_lost_by_its_status_or_by_its_error() -> None:
     assert lost_above(rows) == pytest.approx(5.0)
     assert lost_above(rows_of([1], error=lambda v: 0.02)) == 2.2
     curve = curves_of(rows)[0]
-    assert list(curve.values[curve.is_lost]) == [5, 9, 10]
+    assert list(curve.values[curve.loses_most]) == [5, 9, 10]
     assert (curve.quantities["efficiency"][4] == 0).all()
     found = divergence(curve)
     assert (found.last_good, found.first_bad, found.alone) == (8, 9, (5,))

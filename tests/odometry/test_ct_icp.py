@@ -134,7 +134,7 @@ def test_points_lie_where_the_sensor_was_at_their_times() -> None:
 def test_the_motion_measured_by_an_imu_keeps_its_shape_as_the_ends_move() -> None:
     times = knots_over(SPAN)
     bow = se3.make(np.eye(3), np.column_stack([10 * times, times * (0.1 - times), 0 * times]))
-    sweep = ElasticSweep.of(MotionPrior(times, bow, is_felt=True))
+    sweep = ElasticSweep.of(MotionPrior(times, bow, has_imu_motion=True))
     np.testing.assert_allclose(sweep.poses, bow, atol=1e-12)
     assert np.abs(ElasticSweep.of(MotionPrior(times, bow)).poses - bow).max() > 2e-3
     shift = np.tile([0.3, -0.1, 0.2, 0.0, 0.0, 0.0], (2, 1))
@@ -184,7 +184,7 @@ def test_a_sweep_has_the_shape_of_the_imu_except_over_a_gap() -> None:
     tracker, felt, results = Tracker(create_odometry(config), motion=begin_inertial(sequence, config).motion), [], []
     assert isinstance(tracker.motion, InertialMotion)
     for loaded in read_ahead(sequence, tracker.odometry.prepare, 1):
-        felt.append(tracker.motion.sweep(loaded.stamp_ns, loaded.scan.span).is_felt)
+        felt.append(tracker.motion.sweep(loaded.stamp_ns, loaded.scan.span).has_imu_motion)
         results.append(tracker.track(loaded))
     assert felt == [k < 15 or k > 19 for k in range(COUNT)]
     assert all(result.status == "ok" for result in results)

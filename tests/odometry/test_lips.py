@@ -187,7 +187,7 @@ def test_a_sweep_with_readings_beyond_the_range_is_deskewed_again_about_its_midd
     prior = motion.sweep(last.stamp_ns, last.scan.span)
     found = prior.pose @ se3.make(np.eye(3), np.array([0.05, 0.0, 0.0]))
     assert motion.refine(prior, last.stamp_ns, found) is prior
-    motion.imu = replace(motion.imu, hidden=np.full((len(motion.imu), 6), 5.0))
+    motion.imu = replace(motion.imu, clipping_sigma=np.full((len(motion.imu), 6), 5.0))
     motion._increments = None
     prior = motion.sweep(last.stamp_ns, last.scan.span)
     refined = motion.refine(prior, last.stamp_ns, found)

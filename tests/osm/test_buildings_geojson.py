@@ -43,11 +43,15 @@ def test_everything_reads_back(tmp_path: Path) -> None:
     write_corrected(path, found())
     back, was = read_corrected(path), found()
     np.testing.assert_array_equal(back.origin, was.origin)
-    assert (back.mode, back.left, back.attribution) == (was.mode, was.left, was.attribution)
+    assert (back.mode, back.overlaps, back.attribution) == (was.mode, was.overlaps, was.attribution)
     np.testing.assert_allclose(back.shift, was.shift)
     np.testing.assert_allclose(back.new_walls, was.new_walls, atol=0.012)
     for one, other in zip(back.buildings, was.buildings, strict=True):
-        assert (one.status, one.used, one.rejected) == (other.status, other.used, other.rejected)
+        assert (one.status, one.used_matches, one.rejected_matches) == (
+            other.status,
+            other.used_matches,
+            other.rejected_matches,
+        )
         np.testing.assert_allclose(one.displacement, other.displacement, atol=1e-4)
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-5)
         assert one.confidence == pytest.approx(other.confidence, abs=1e-4)
@@ -67,14 +71,14 @@ def test_a_gis_sees_corrected_outlines_with_the_attribution(tmp_path: Path) -> N
     overlaps = {
         f["properties"]["@id"]: f["properties"]["overlaps"] for f in tree["features"] if "@id" in f["properties"]
     }
-    for i, j in found().left:
+    for i, j in found().overlaps:
         one, other = (found().buildings[k].building.osm_id for k in (i, j))
         assert other in overlaps[one], "each names the other"
         assert one in overlaps[other]
     extract = read_buildings(path, ORIGIN)[1]
     assert [b.osm_id for b in extract.buildings] == ["way/12", "way/-3", "relation/5"]
     np.testing.assert_allclose(
-        extract.buildings[0].footprints[0].outer, found().buildings[0].corrected.footprints[0].outer, atol=0.012
+        extract.buildings[0].footprints[0].outer, found().buildings[0].real_building.footprints[0].outer, atol=0.012
     )
     write_corrected(path, replace(found(), attribution=None))
     assert read_corrected(path).attribution is None

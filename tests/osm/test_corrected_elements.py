@@ -51,7 +51,7 @@ def places(data: OsmData, name: str) -> Building:
 
 
 def check_moved(before: OsmData, after: OsmData, name: str, displacement: tuple[float, float, float]) -> None:
-    expected = places(before, name).displaced(np.array(displacement))
+    expected = places(before, name).displace(np.array(displacement))
     for one, other in zip(places(after, name).footprints, expected.footprints, strict=True):
         for ring, wanted in zip(one.rings, other.rings, strict=True):
             np.testing.assert_allclose(ring, wanted, atol=0.015)

@@ -35,10 +35,10 @@ def scene(seed: int, shift: tuple[float, float] = (1.0, -0.6)) -> tuple[OsmMatch
     rng = np.random.default_rng(seed)
     real = [house(k, 16.0 * (k // 2), -14.0 - 9 * (k % 2) if k % 2 else 8.0, 9.0 + k % 3, 8.0) for k in range(10)]
     off = np.column_stack([shift + rng.uniform(-1, 1, (10, 2)), rng.uniform(-0.04, 0.04, 10)])
-    on_map = [b.moved(np.eye(2), -d[:2]).displaced(np.array([0, 0, -d[2]])) for b, d in zip(real, off, strict=True)]
+    on_map = [b.transform(np.eye(2), -d[:2]).displace(np.array([0, 0, -d[2]])) for b, d in zip(real, off, strict=True)]
     far, gone, new = house(10, 400, 400, 9, 9), house(11, 88, 8, 9, 9), house(12, 100, -16, 10, 9)
     hall = house(13, 70, 30, 50, 12)
-    on_map += [far.moved(np.eye(2), -np.array(shift)), gone.moved(np.eye(2), -np.array(shift)), hall]
+    on_map += [far.transform(np.eye(2), -np.array(shift)), gone.transform(np.eye(2), -np.array(shift)), hall]
     ground = [*real, new, hall]
     poses = np.column_stack([np.linspace(-5, 110, 30), np.zeros(30), rng.uniform(-0.3, 0.3, 30)])
     walls, _ = walls_of(ground)
@@ -83,15 +83,15 @@ def test_corrected_buildings_are_at_their_true_places(seed: int) -> None:
     two_sided = [k for k in range(10) if any(m.building == k and m.rank == 3 for m in matches.local)]
     assert len(two_sided) >= 8
     corners = [
-        np.linalg.norm(found.buildings[k].corrected.footprints[0].outer - real[k].footprints[0].outer, axis=1).max()
+        np.linalg.norm(found.buildings[k].real_building.footprints[0].outer - real[k].footprints[0].outer, axis=1).max()
         for k in two_sided
     ]
     assert np.median(corners) < 0.3
     assert np.linalg.norm(off[:10, :2], axis=1).mean() > 0.8
-    assert all(found.buildings[k].status == "seen" and found.buildings[k].used > 2 for k in two_sided)
+    assert all(found.buildings[k].status == "seen" and found.buildings[k].used_matches > 2 for k in two_sided)
     assert min(found.buildings[k].confidence for k in two_sided) > 0.5
     np.testing.assert_allclose(found.shift, [1.0, -0.6], atol=0.5)
-    assert found.left == ()
+    assert found.overlaps == ()
     assert found.attribution == "© OpenStreetMap contributors"
 
 
@@ -99,7 +99,7 @@ def test_absent_new_and_unobserved_buildings_are_distinguished() -> None:
     found, _, _, _ = solved(0)
     assert [c.status for c in found.buildings[10:12]] == ["unseen", "absent"]
     np.testing.assert_allclose(found.buildings[10].displacement[:2], found.shift, atol=1e-6)
-    assert found.buildings[10].used == found.buildings[11].used == 0
+    assert found.buildings[10].used_matches == found.buildings[11].used_matches == 0
     assert found.buildings[10].confidence < 0.3
     front = found.new_walls[np.abs(found.new_walls[:, :, 1] + 7).max(axis=1) < 0.4]
     assert len(front) == 1
@@ -127,9 +127,9 @@ def test_overlapping_neighbours_are_separated() -> None:
         matches.origin, (*matches.buildings, copy), matches.map_walls, matches.owners, matches.keyframes, matches.local
     )
     found = correct_buildings(more, poses, OsmConfig())
-    shapes = [Polygon(c.corrected.footprints[0].outer).buffer(-0.01) for c in found.buildings]
+    shapes = [Polygon(c.real_building.footprints[0].outer).buffer(-0.01) for c in found.buildings]
     assert not shapes[0].intersects(shapes[-1])
-    assert found.left == ()
+    assert found.overlaps == ()
 
 
 def test_without_matches_the_map_keeps_its_prior() -> None:

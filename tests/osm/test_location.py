@@ -145,7 +145,7 @@ def test_a_wrong_or_uncertain_first_match_does_not_move_the_run(
     monkeypatch.setattr(location, "match_keyframe", askew)
     store = driven(HOUSES, way)
     located = locate(extract_of(HOUSES), store, None, config())
-    assert located.accepted[0].keyframe == 0
+    assert located.accepted_matches[0].keyframe == 0
     laid = se2.of_se3(located.T_enu_odometry @ np.stack([k.T_world_lidar for k in store.keyframes])) - way
     assert np.abs(laid[:, :2]).max() < 0.3
     assert np.abs(np.degrees(laid[:, 2])).max() < 0.4
@@ -270,7 +270,7 @@ def test_each_building_is_matched_from_the_final_poses() -> None:
     none = np.zeros(2)
     solution = Solution(poses, np.zeros((0, 6, 6)), [], [], np.zeros(0, bool), doubts, none, none, 0.0, 1, 0.0)
     matches = finish(located, extract, poses, solution, config().osm)
-    assert len(matches.accepted) == len(located.priors) - 1
+    assert len(matches.accepted_matches) == len(located.priors) - 1
     second = [m.keyframe for m in located.matches if m.verdict == "accepted"][1]
     assert (matches.keyframes[second].verdict, matches.keyframes[second].reason) == ("rejected", doubts[1])
     for number, building in enumerate(matches.buildings):

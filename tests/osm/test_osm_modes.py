@@ -81,7 +81,7 @@ def test_the_change_file_holds_the_corrected_outlines(two_level: Path) -> None:
     outlines = {b.osm_id: b for b in buildings_of(edited, corrected.origin).buildings}
     assert set(outlines) == {c.building.osm_id for c in corrected.buildings}
     for c in corrected.buildings:
-        for one, other in zip(outlines[c.building.osm_id].footprints, c.corrected.footprints, strict=True):
+        for one, other in zip(outlines[c.building.osm_id].footprints, c.real_building.footprints, strict=True):
             # Neighbours may share a corner that they want some centimetres apart.
             assert np.linalg.norm(one.outer - other.outer, axis=1).max() < 0.07
 

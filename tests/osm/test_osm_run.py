@@ -67,7 +67,7 @@ def by_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("osm") / "file"
     outcome = lslam.run(SAMPLE, config(), out=out)
     assert outcome.record.osm is not None
-    assert len(outcome.record.osm.accepted) >= 10
+    assert len(outcome.record.osm.accepted_matches) >= 10
     return out
 
 

@@ -124,7 +124,7 @@ def test_a_run_matches_the_class_that_is_asked_for(matcher: str, plain_run: RunO
     assert folder is not None
     known = read_for_graph(folder, ["osm.labels=vegetation"])
     again = run(open_again(known), known.config, out=tmp_path / "again", earlier=known)
-    assert again.record.osm is None or not again.record.osm.accepted
+    assert again.record.osm is None or not again.record.osm.accepted_matches
     assert "the walls about the start do not locate it" in manifest(tmp_path / "again")
 
 
@@ -144,6 +144,6 @@ def test_geometry_tells_classes_where_there_are_no_labels(tmp_path: Path) -> Non
     settings = ("osm.labels=building", "osm.label_source=geometry")
     found = lslam.run(drive, on_map(*settings), out=tmp_path / "run")
     assert found.record.osm is not None
-    assert len(found.record.osm.accepted) >= 10
+    assert len(found.record.osm.accepted_matches) >= 10
     none = lslam.run(drive, on_map("osm.labels=car", "osm.label_source=geometry"), out=tmp_path / "cars")
-    assert none.record.osm is None or not none.record.osm.accepted
+    assert none.record.osm is None or not none.record.osm.accepted_matches

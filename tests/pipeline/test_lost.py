@@ -94,7 +94,7 @@ def test_poses_that_contradict_the_scans_degrade_the_run(
     outcome = ended(drive(scenario))
     assert outcome.record.manifest["status"] == "degraded"
     assert any(words in problem for problem in problems(outcome))
-    lost = np.flatnonzero([r.is_lost for r in outcome.record.results])
+    lost = np.flatnonzero([r.may_be_elsewhere for r in outcome.record.results])
     assert BEGIN - 5 <= lost[0] <= BEGIN + 10
     assert lost[-1] >= 70
     assert "may be lost" in summary(outcome.record, None)
@@ -120,7 +120,7 @@ def test_four_scans_out_of_order_are_recovered_or_reported(scenario: str) -> Non
     order[40:44] = [43, 42, 41, 40]
     outcome = ended(reordered(drive(scenario), order))
     assert outcome.record.manifest["status"] in ("degraded", "diverged")
-    assert any(r.is_lost for r in outcome.record.results[38:46])
+    assert any(r.may_be_elsewhere for r in outcome.record.results[38:46])
     assert any("out of order" in problem for problem in problems(outcome))
 
 
@@ -128,7 +128,7 @@ def test_scans_swapped_in_pairs_degrade_the_run() -> None:
     order = np.arange(60).reshape(-1, 2)[:, ::-1].ravel().tolist()
     outcome = ended(reordered(drive("street"), order))
     assert outcome.record.manifest["status"] in ("degraded", "diverged")
-    assert sum(r.is_lost for r in outcome.record.results) > 50
+    assert sum(r.may_be_elsewhere for r in outcome.record.results) > 50
 
 
 def test_stamps_that_jitter_are_told_as_the_fault_of_the_clock() -> None:
@@ -139,7 +139,7 @@ def test_stamps_that_jitter_are_told_as_the_fault_of_the_clock() -> None:
     outcome = ended(Holed(scans, None, whole.calibration))
     manifest = outcome.record.manifest
     assert manifest["status"] == "done"
-    assert not any(r.is_lost for r in outcome.record.results)
+    assert not any(r.may_be_elsewhere for r in outcome.record.results)
     assert [p for p in manifest["problems"] if "the stamps of" in p and "wrong by up to 80 ms" in p]
 
 
@@ -154,7 +154,7 @@ def test_the_settings_of_a_method_that_loses_its_way_do_not_blind_the_monitor(pr
     off = se3.relative(se3.relative(true[:-1], true[1:]), se3.relative(poses[:-1], poses[1:]))
     is_off = np.linalg.norm(off[:, :3, 3], axis=1) > 1
     assert is_off.sum() >= lost
-    assert all(r.is_lost for r, is_wrong in zip(outcome.record.results[1:], is_off, strict=True) if is_wrong)
+    assert all(r.may_be_elsewhere for r, is_wrong in zip(outcome.record.results[1:], is_off, strict=True) if is_wrong)
 
 
 def test_clouds_in_the_frame_of_a_world_are_reported() -> None:
@@ -176,7 +176,7 @@ def test_three_missing_seconds_while_moving_degrade_the_run(lidar: str) -> None:
     outcome = ended(Holed([replace(scan, index=k) for k, scan in enumerate(scans)], None, whole.calibration))
     assert outcome.record.manifest["status"] in ("degraded", "diverged")
     if outcome.record.manifest["status"] == "degraded":
-        assert any(r.is_lost for r in outcome.record.results[18:26])
+        assert any(r.may_be_elsewhere for r in outcome.record.results[18:26])
 
 
 @pytest.mark.parametrize(
@@ -208,7 +208,7 @@ def test_the_first_alerts_are_listed_and_the_others_counted(more: int) -> None:
     results = [ScanResult(100 + k, 100_000_000 * k, np.eye(4)) for k in range(count)]
     manifest = Manifest("run", drive("street"), cfg)
     marked = mark_lost(results, monitor.checks, manifest)
-    assert [k for k in range(count) if marked[k].is_lost] == [k for k in range(1, count) if (k - 1) % 30 >= 25]
+    assert [k for k in range(count) if marked[k].may_be_elsewhere] == [k for k in range(1, count) if (k - 1) % 30 >= 25]
     assert manifest.integrity == {"checks": 6 * stretches, "conclusive": 6 * stretches, "alerts": stretches}
     told = [problem.split(" may be")[0] for problem in manifest.problems[:MOST_SAID]]
     assert told == [f"scans {126 + 30 * k} to {130 + 30 * k}" for k in range(MOST_SAID)]
@@ -231,10 +231,10 @@ def test_final_poses_are_held_against_the_same_checks(ahead_m: float) -> None:
         T[0, 3] += ahead_m * np.clip((k - 45) / 5, 0, 1)
         final.append(ScanResult(200 + k, 100_000_000 * k, T))
     manifest = Manifest("run", drive("street"), config())
-    assert not any(r.is_lost for r in mark_lost(odometry, checks, manifest))
+    assert not any(r.may_be_elsewhere for r in mark_lost(odometry, checks, manifest))
     marked = mark_lost_finally(final, checks, manifest, "the pose graph")
     is_wrong = ahead_m > 1
-    assert [k for k in range(101) if marked[k].is_lost] == (list(range(46, 51)) if is_wrong else [])
+    assert [k for k in range(101) if marked[k].may_be_elsewhere] == (list(range(46, 51)) if is_wrong else [])
     assert manifest.integrity == {"checks": 20, "conclusive": 20, "alerts": 0, "final_alerts": int(is_wrong)}
     assert manifest.problems == ["after the pose graph, scans 246 to 250 may be lost: beside the scan 0.5 s before, it moved by "
                                  "-1.20 m ahead more than its pose says"] * is_wrong  # fmt: skip

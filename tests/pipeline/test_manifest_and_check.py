@@ -186,7 +186,10 @@ def test_what_works_on_a_graph_is_refused_where_a_map_holds_the_poses(setting: s
 def test_scans_are_counted_by_the_method_that_posed_them() -> None:
     manifest = Manifest("lslam run x", Stub(["gone"] * 4), Config())
     ok, policy, bridged, standing = results("ok", "ok", "bridged", "ok")
-    policy, standing = replace(policy, posed_by="start search"), replace(standing, is_stationary=True, is_repeated=True)
+    policy, standing = (
+        replace(policy, posed_by="start search"),
+        replace(standing, is_stationary=True, repeats_pose=True),
+    )
     manifest.judge([ok, policy, bridged, standing], 4, False)
     assert manifest.as_dict("done")["posed_by"] == {"icp": 1, "start search": 1, "motion prior": 1, "standing": 1}
 

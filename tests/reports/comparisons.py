@@ -15,9 +15,9 @@ from lslam.core.types.comparison import (
     Drawing,
     DrawnRun,
     Metric,
-    Paired,
+    PairedComparison,
     RunScore,
-    Spread,
+    SeedStatistics,
     SummaryRow,
 )
 
@@ -66,7 +66,7 @@ def drawing(folder: Path, methods: tuple[str, ...] = ("icp", "kiss-icp"), has_tr
     return Drawing("drive", 0, truth if has_truth else None, tuple(runs), "moved onto the ground truth")
 
 
-def row(sequence: str, method: str, values: dict[str, Spread], **more: Any) -> SummaryRow:
+def row(sequence: str, method: str, values: dict[str, SeedStatistics], **more: Any) -> SummaryRow:
     kept = {"runs": 2, "failed": 0, "note": "", "is_timed_alone": True, "degraded": 0} | more
     return SummaryRow(
         sequence, method, kept["runs"], kept["failed"], values, kept["note"], kept["is_timed_alone"], kept["degraded"]
@@ -85,12 +85,16 @@ def comparison(folder: Path, **changes: Any) -> Comparison:
         RunScore("dark", "kiss-icp", 0, folder / "d", "crashed", "killed & gone_by 100%"),
     ]
     two = {
-        "ate.se3": Spread(0.1, 0.02, 2),
-        "time.mean": Spread(12.0, 1.0, 2),
-        "factor": Spread(9.0, 0.1, 2),
-        "bridged": Spread(0.0, 0.0, 2),
+        "ate.se3": SeedStatistics(0.1, 0.02, 2),
+        "time.mean": SeedStatistics(12.0, 1.0, 2),
+        "factor": SeedStatistics(9.0, 0.1, 2),
+        "bridged": SeedStatistics(0.0, 0.0, 2),
     }
-    worse = two | {"ate.se3": Spread(0.3, 0.1, 2), "time.mean": Spread(40.0, 1.0, 2), "bridged": Spread(1.5, 0.1, 2)}
+    worse = two | {
+        "ate.se3": SeedStatistics(0.3, 0.1, 2),
+        "time.mean": SeedStatistics(40.0, 1.0, 2),
+        "bridged": SeedStatistics(1.5, 0.1, 2),
+    }
     none = float("nan")
     values: dict[str, Any] = {
         "command": "lslam compare drive dark --methods icp,kiss-icp",
@@ -101,10 +105,10 @@ def comparison(folder: Path, **changes: Any) -> Comparison:
         "rows": (
             row("drive", "icp", two),
             row("drive", "kiss-icp", worse, degraded=1),
-            row("dark", "icp", {"time.mean": Spread(12.0, none, 1)}, runs=1, note="no ground truth"),
+            row("dark", "icp", {"time.mean": SeedStatistics(12.0, none, 1)}, runs=1, note="no ground truth"),
             row("dark", "kiss-icp", {}, runs=1, failed=1),
         ),
-        "paired": (Paired("kiss-icp", "icp", 1, 3.0, 0, 0, 2, none, "n too small"),),
+        "paired": (PairedComparison("kiss-icp", "icp", 1, 3.0, 0, 0, 2, none, "n too small"),),
         "differences": (Difference("dark", "kiss-icp", "icp", 0, 1.5, 0.5),),
         "notes": ("others were using the machine",),
         "configs": {m: {"odometry": {"method": m}, "map": {"voxel": 0.2}} for m in ("icp", "kiss-icp")},

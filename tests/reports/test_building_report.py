@@ -111,7 +111,7 @@ def test_an_empty_map_draws_the_way() -> None:
     assert paths(holds.svg, "gt") == 1
     moves, verdicts = building_tables(found, nothing)
     assert moves.rows == verdicts.rows == ()
-    assert matches.accepted
+    assert matches.accepted_matches
 
 
 def test_a_corrected_drift_is_reported_with_its_sigma(make_record: Callable[..., RunRecord]) -> None:

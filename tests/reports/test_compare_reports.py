@@ -19,7 +19,7 @@ from test_html import parse
 from test_page_data import data_of, unpack
 
 from lslam.core.config.outputs import EvalConfig
-from lslam.core.types.comparison import Spread
+from lslam.core.types.comparison import SeedStatistics
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
 from lslam.reports.crops import Crop, choose_crops, crop_images
@@ -60,8 +60,8 @@ def test_the_best_of_several_methods_is_marked_per_sequence(tmp_path: Path) -> N
 
 
 def test_times_of_shared_machines_are_marked_and_never_best(tmp_path: Path) -> None:
-    slow = row("drive", "b", {"time.mean": Spread(2.0, 0.0, 1)}, is_timed_alone=False)
-    fast = row("drive", "a", {"time.mean": Spread(1.0, 0.0, 1)})
+    slow = row("drive", "b", {"time.mean": SeedStatistics(2.0, 0.0, 1)}, is_timed_alone=False)
+    fast = row("drive", "a", {"time.mean": SeedStatistics(1.0, 0.0, 1)})
     main = tables(comparison(tmp_path, rows=(fast, slow)))[0]
     assert [line[main.header.index("mean, ms")] for line in main.rows] == ["1.0", "~2.0"]
     assert not main.best
@@ -158,7 +158,7 @@ def test_the_page_nests_shows_everything_and_needs_nothing_else(tmp_path: Path) 
 
 def test_the_page_of_a_comparison_in_which_all_failed_says_so(tmp_path: Path) -> None:
     c = comparison(tmp_path)
-    c = replace(c, runs=c.failed, rows=c.rows[3:], sequences=("dark",), paired=(), differences=())
+    c = replace(c, runs=c.failed, rows=c.rows[3:], sequences=("dark",), pairs=(), differences=())
     parsed = parse(render_page(tmp_path, c, []))
     assert "No run on this sequence has a result" in parsed.text
 

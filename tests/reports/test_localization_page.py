@@ -61,7 +61,7 @@ def test_the_states_of_the_page_are_those_of_the_records(make_record: MakeRecord
     page = render_report(record, scored(record))
     data = data_of(page, "scans")
     words = [data["states"][code][0] for code in unpack(data["fixes"], "u1")]
-    expected = [STATES["doubted" if fix.is_doubted else fix.status][0] for fix in record.map_fixes]
+    expected = [STATES["doubted" if fix.is_doubtful else fix.status][0] for fix in record.map_fixes]
     assert words == expected
     assert Counter(words)["held by the map"] == 20
     assert ("30/60", "scans held by the map") in tiles(page)

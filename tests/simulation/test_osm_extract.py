@@ -194,7 +194,7 @@ def test_what_moves_a_drawn_building_back_moves_it_to_where_it_stands(seed: int)
     assert sum(abs(e[2]) > 0.001 for e in errors.values()) > 1
     for building in exact:
         if building.osm_id in errors:
-            back = on_map[building.osm_id].displaced(errors[building.osm_id])
+            back = on_map[building.osm_id].displace(errors[building.osm_id])
             for ring, wanted in zip(rings_of([back]), rings_of([building]), strict=True):
                 np.testing.assert_allclose(ring, wanted, atol=1e-9)
 

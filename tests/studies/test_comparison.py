@@ -111,7 +111,7 @@ def test_what_fails_is_a_row_with_its_reason_and_no_pair(made: Comparison) -> No
         ("broken", "icp", "failed"), ("broken", "kiss-icp", "failed"),
     ]  # fmt: skip
     assert all("none of 14 scans can be used" in r.reason and not r.values for r in made.failed)
-    assert made.paired[0].n == 1
+    assert made.pairs[0].n == 1
 
 
 def test_files_are_there_and_agree(made: Comparison, plan: Plan) -> None:
@@ -180,7 +180,7 @@ def test_with_and_without_the_imu_are_runs_and_pairs_of_their_own(
     assert [(r.method, r.status, r.values.get("imu_used")) for r in made.runs] == [
         ("icp", "done", None), ("icp+imu", "done", 1.0),
     ]  # fmt: skip
-    assert [(p.method, p.reference, p.n) for p in made.paired] == [("icp+imu", "icp", 1)]
+    assert [(p.method, p.reference, p.n) for p in made.pairs] == [("icp+imu", "icp", 1)]
     measured = (folder / "imu.csv").read_text().splitlines()
     still = [line.split(",")[0] + ",0" * 6 for line in measured[1:]]
     (folder / "imu.csv").write_text("\n".join([measured[0], *still]) + "\n")

@@ -152,7 +152,7 @@ def test_what_fails_is_a_row_with_its_reason(sweep: Sweep, tmp_path: Path) -> No
     """The first scan of the second run lies beyond the recording."""
     partly = elsewhere(sweep, tmp_path / "out", parameters={"input.start": [0, 99]}, beside=[])
     rows = run_sweep(partly, Local(1))
-    assert [(row.status, row.is_diverged) for row in rows] == [("done", False), ("failed", False)]
+    assert [(row.status, row.diverges) for row in rows] == [("done", False), ("failed", False)]
     assert "beyond the last scan" in rows[1].reason
     wholly = elsewhere(sweep, tmp_path / "none", parameters={"input.start": [98, 99]}, beside=[])
     with pytest.raises(RunFailedError, match=r"all 2 runs failed, the first one: .*--start 98 is beyond the last scan"):

@@ -151,7 +151,7 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False, with_lidar: bool = True
     for factor in _relative(graph, with_lidar):
         factors.add(factor)
     for fix in graph.fixes:
-        if fix.is_held:
+        if fix.is_binding:
             factors.add(position(fix))
     for up in graph.free_ups:
         model = gtsam.noiseModel.Isotropic.Sigma(2, up.sigma / np.sqrt(up.share))
@@ -172,7 +172,7 @@ def fixed_part(graph: PoseGraph, may_tilt: bool = False, with_lidar: bool = True
 
 def _relative(graph: PoseGraph, with_lidar: bool) -> list[Any]:
     """Odometry, held loop closures and the IMU between keyframes."""
-    by_lidar = [*graph.odometry, *(loop for loop in graph.loops if loop.is_held)] if with_lidar else []
+    by_lidar = [*graph.odometry, *(loop for loop in graph.loops if loop.is_binding)] if with_lidar else []
     imu = [] if graph.inertial is None else inertial_factors(graph.inertial, graph.world_up)
     return [*between_all(by_lidar), *imu]
 

@@ -24,7 +24,7 @@ def preintegrated(
 
     one = np.eye(3)
     params = gtsam.PreintegrationCombinedParams(gravity)
-    params.setAccelerometerCovariance((imu_noise.force**2 + step.hidden) * one)
+    params.setAccelerometerCovariance((imu_noise.force**2 + step.clipping) * one)
     params.setGyroscopeCovariance(step.rate_noise)
     params.setIntegrationCovariance(INTEGRATION * one)
     params.setBiasAccCovariance(imu_noise.accel_walk**2 * one)

@@ -42,13 +42,13 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
     check_graph(graph)
     graph = from_held(with_distances(graph), config)
     reasons = judge_loops(graph, config) if config.is_pairwise else [""] * len(graph.loops)
-    reasons = ["" if loop.is_held else reason for loop, reason in zip(graph.loops, reasons, strict=True)]
+    reasons = ["" if loop.is_binding else reason for loop, reason in zip(graph.loops, reasons, strict=True)]
     stages = [LoopStage.CONSISTENCY if reason else LoopStage.GRAPH for reason in reasons]
     accepted = [i for i, reason in enumerate(reasons) if not reason]
     is_as_given = graph.is_rigid or config.information == "identity"
     drift = 0.0 if is_as_given else max(drift_factor(graph, [graph.loops[i] for i in accepted], config), graph.walk)
-    accepted = [i for i in accepted if not graph.loops[i].is_held]
-    loops, fixes = [graph.loops[i] for i in accepted], [fix for fix in graph.fixes if not fix.is_held]
+    accepted = [i for i in accepted if not graph.loops[i].is_binding]
+    loops, fixes = [graph.loops[i] for i in accepted], [fix for fix in graph.fixes if not fix.is_binding]
     graph = replace(graph, odometry=with_drift(graph, drift, config))
     may_tilt = graph.is_anchored and len(graph.ups) > 0
     is_placed = graph.start_sigma is not None or not graph.is_anchored
@@ -92,7 +92,7 @@ def optimise(graph: PoseGraph, config: GraphConfig) -> Solution:
         )
     rest = len(loops) + len(fixes)
     fix_inliers = np.ones(len(graph.fixes), np.bool_)
-    fix_inliers[[not fix.is_held for fix in graph.fixes]] = solved.weights[len(loops) : rest] >= 0.5
+    fix_inliers[[not fix.is_binding for fix in graph.fixes]] = solved.weights[len(loops) : rest] >= 0.5
     shift, shift_sigma = _map_shift(graph, solved)
     return Solution(
         poses=poses,
@@ -115,7 +115,7 @@ def from_held(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
 
     What odometry may drift is no measure for the rest once a person has said how far it did.
     """
-    loops, fixes = [loop for loop in graph.loops if loop.is_held], [fix for fix in graph.fixes if fix.is_held]
+    loops, fixes = [loop for loop in graph.loops if loop.is_binding], [fix for fix in graph.fixes if fix.is_binding]
     if not (loops or fixes):
         return graph
     alone = replace(

@@ -20,7 +20,7 @@ class PositionFix:
 
     sigma : (3,) m; the arm is the antenna at the instant of the fix, relative to the keyframe by odometry
     instant : index of the correlated error in the graph's `fix_noise`, None for none
-    is_held : a control point: no outlier candidate of the graph
+    is_binding : a control point: no outlier candidate of the graph
     share, next_arm : of an instant on the way to the next keyframe, which has the point there (3,), and counts by `share`, 0..1
     """
 
@@ -29,7 +29,7 @@ class PositionFix:
     sigma: Floats
     arm: Floats
     instant: int | None = None
-    is_held: bool = False
+    is_binding: bool = False
     share: float = 0.0
     next_arm: Floats = field(default_factory=lambda: np.zeros(3))
 

@@ -137,8 +137,8 @@ class MapFollower(Stateful):
 
 def doubted(fixes: list[MapFix]) -> list[MapFix]:
     """The fixes of a run, marked where fewer points agree with the map than two scans of one place differ by."""
-    usual = float(np.median([fix.inlier_share for fix in fixes if fix.is_held] or [0.0]))
-    return [replace(f, is_doubted=f.is_held and f.inlier_share < UsualAgreement.LESS * usual) for f in fixes]
+    usual = float(np.median([fix.inlier_share for fix in fixes if fix.is_binding] or [0.0]))
+    return [replace(f, is_doubtful=f.is_binding and f.inlier_share < UsualAgreement.LESS * usual) for f in fixes]
 
 
 def se3_difference(T: Floats, other: Floats) -> Floats:

@@ -159,7 +159,7 @@ class Detector:
             check.reason,
             check.rmse,
             check.overlap,
-            None if closed is None else replace(closed, is_held=not check.reason),
+            None if closed is None else replace(closed, is_binding=not check.reason),
         )
 
     def _due_after(self, b: int, gated: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:

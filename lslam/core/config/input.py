@@ -16,7 +16,7 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
-    def changed(self, since: Section | None = None) -> list[str]:
+    def changed_keys(self, since: Section | None = None) -> list[str]:
         """Keys whose values differ from those of `since`, None: from the defaults, in the order of the section."""
         fields = type(self).model_fields
         before = {key: field.get_default() if since is None else getattr(since, key) for key, field in fields.items()}

@@ -114,7 +114,7 @@ class EvalConfig(Section):
 
     @field_validator("metrics", mode="before")
     @classmethod
-    def _listed(cls, words: Any) -> Any:
+    def _as_list(cls, words: Any) -> Any:
         """One word is a list of one."""
         return (words,) if isinstance(words, str) else words
 

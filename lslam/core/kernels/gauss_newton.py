@@ -166,7 +166,7 @@ def step_on_surfaces(
 
 
 @kernel
-def trimming_bound(away2: Floats, share: float, gate2: float) -> float:
+def trimming_distance2(away2: Floats, share: float, gate2: float) -> float:
     """Squared distance, m2, within which `share` of the matched points within `gate2` lie: that quantile of `away2` (S,).
 
     Unmatched points have a negative distance. Bisection needs no copy and no sort, and is the same for any order of points.

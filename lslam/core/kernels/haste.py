@@ -16,14 +16,14 @@ NEWEST_RELEASE = (0, 68)
 
 def hasten() -> None:
     """Leave that work out from now on, for all functions of this process."""
-    if not is_known():
+    if not fits_release():
         return
     for leave_out in (compare_set_flags, remember_signatures, emit_entry_points, find_lifetimes_late):
         with contextlib.suppress(AttributeError, ImportError):
             leave_out()
 
 
-def is_known() -> bool:
+def fits_release() -> bool:
     """Whether the release of numba is one that this was tried with."""
     release: tuple[int, int] = import_module("numba").version_info.short
     return release <= NEWEST_RELEASE
@@ -50,7 +50,7 @@ def remember_signatures() -> None:
     function, stack = _numba("core.types.functions").BaseFunction, _numba("core.targetconfig").ConfigStack
     resolve, flags = function.get_call_type, stack.top_or_none
 
-    def remembered(function_type: Any, context: Any, args: Any, kws: Any) -> Any:
+    def call_type(function_type: Any, context: Any, args: Any, kws: Any) -> Any:
         if kws or not all(a.is_precise() for a in args):
             return resolve(function_type, context, args, kws)
         known = function_type.__dict__.setdefault("_lslam_signatures", {})
@@ -59,7 +59,7 @@ def remember_signatures() -> None:
             known[key] = resolve(function_type, context, args, kws)
         return known[key]
 
-    function.get_call_type = remembered
+    function.get_call_type = call_type
 
 
 def emit_entry_points() -> None:
@@ -67,7 +67,7 @@ def emit_entry_points() -> None:
     context, make_function = _numba("core.cpu").CPUContext, _numba("_dynfunc").make_function
     make = context.get_executable
 
-    def made(target: Any, library: Any, fndesc: Any, env: Any) -> Any:
+    def make_entry(target: Any, library: Any, fndesc: Any, env: Any) -> Any:
         # Constants lie in the environment, whose address is that of machine code.
         if library._finalized or env.consts or _defines(library._final_module, fndesc.llvm_cpython_wrapper_name):
             return make(target, library, fndesc, env)
@@ -75,7 +75,7 @@ def emit_entry_points() -> None:
         library.finalize()
         return make_function(fndesc.lookup_module(), fndesc.qualname.split(".")[-1], "", 0, env, (library,))
 
-    context.get_executable = made
+    context.get_executable = make_entry
 
 
 def _defines(module: Any, name: str) -> bool:

@@ -89,7 +89,7 @@ def _share(dispatcher: Any) -> None:
     cache, held = dispatcher._cache, contextlib.ExitStack()
     save, name = cache.save_overload, dispatcher.py_func.__qualname__
 
-    def found(signature: Any, context: Any) -> Any:
+    def look_up(signature: Any, context: Any) -> Any:
         try:
             # numba's own would import the compiler's libraries first, a fifth of the time that one scan takes from the shell.
             rtsys.initialize(context)
@@ -102,13 +102,13 @@ def _share(dispatcher: Any) -> None:
             return None
 
     def load_or_wait(*args: Any) -> Any:
-        kept = found(*args)
+        kept = look_up(*args)
         if kept is None:
             _tell(name, False)
             held.close()  # numba's own lock is held here: of this process, no other thread compiles
             with contextlib.suppress(OSError, ImportError):  # where there are no locks, several compile
                 _wait_for(held, Path(cache.cache_path), name)
-            kept = found(*args)
+            kept = look_up(*args)
         if kept is not None:
             held.close()
             _tell(name, True)

@@ -39,7 +39,7 @@ class Footprint:
         """Ground covered, m2, holes subtracted."""
         return float(sum(_signed_area(ring) for ring in self.rings))
 
-    def moved(self, rotation: Floats, shift: Floats) -> Footprint:
+    def transform(self, rotation: Floats, shift: Floats) -> Footprint:
         """Every corner p at `rotation` (2, 2) p + `shift` (2,)."""
         return Footprint(self.outer @ rotation.T + shift, tuple(hole @ rotation.T + shift for hole in self.holes))
 
@@ -70,13 +70,13 @@ class Building:
         corners = np.concatenate([footprint.outer for footprint in self.footprints])
         return np.asarray((corners.min(0) + corners.max(0)) / 2)
 
-    def moved(self, rotation: Floats, shift: Floats) -> Building:
+    def transform(self, rotation: Floats, shift: Floats) -> Building:
         """Every corner p at `rotation` (2, 2) p + `shift` (2,)."""
-        return replace(self, footprints=tuple(footprint.moved(rotation, shift) for footprint in self.footprints))
+        return replace(self, footprints=tuple(footprint.transform(rotation, shift) for footprint in self.footprints))
 
-    def displaced(self, displacement: Floats) -> Building:
+    def displace(self, displacement: Floats) -> Building:
         """Turned by displacement[2], rad, about its middle, then shifted by displacement[:2], m."""
-        return self.moved(*about(self.middle, displacement))
+        return self.transform(*about(self.middle, displacement))
 
 
 def about(middle: Floats, displacement: Floats) -> tuple[Floats, Floats]:
@@ -210,7 +210,7 @@ class OsmMatches:
     attribution: str | None = None
 
     @property
-    def accepted(self) -> list[KeyframeMatch]:
+    def accepted_matches(self) -> list[KeyframeMatch]:
         """The matches that constrain the trajectory."""
         return [match for match in self.keyframes if match.is_accepted]
 
@@ -222,20 +222,20 @@ class BuildingCorrection:
     building : as on the map, m, map frame
     displacement : (3,) x, y (m), yaw (rad) about the building's `middle`, real minus map
     covariance : (3, 3) of it, m2 and rad2
-    used, rejected : matches with walls seen that hold it, and that were given up
+    used_matches, rejected_matches : with walls seen that hold it, and that were given up
     """
 
     building: Building
     displacement: Floats
     covariance: Floats
     status: BuildingStatus
-    used: int = 0
-    rejected: int = 0
+    used_matches: int = 0
+    rejected_matches: int = 0
 
     @property
-    def corrected(self) -> Building:
+    def real_building(self) -> Building:
         """The building where it really stands."""
-        return self.building.displaced(self.displacement)
+        return self.building.displace(self.displacement)
 
     @property
     def confidence(self) -> float:
@@ -251,7 +251,7 @@ class CorrectedMap:
     origin : (3,) lat, lon (deg), height (m) of the map frame, x east, y north
     mode : `osm.mode` they were corrected in; shift : (2,) m by which the map is off as a whole, real minus map
     new_walls : (S, 2, 2) m, map frame: walls seen where no building is
-    left : pairs of positions in `buildings` that overlap and could not be parted
+    overlaps : pairs of positions in `buildings` that overlap and could not be parted
     attribution : what outputs have to carry, None where nobody surveyed the map
     """
 
@@ -260,5 +260,5 @@ class CorrectedMap:
     mode: str
     shift: Floats = field(default_factory=lambda: np.zeros(2))
     new_walls: Floats = field(default_factory=lambda: np.zeros((0, 2, 2)))
-    left: tuple[tuple[int, int], ...] = ()
+    overlaps: tuple[tuple[int, int], ...] = ()
     attribution: str | None = None

@@ -78,7 +78,7 @@ class RunScore:
 
 
 @dataclass(frozen=True)
-class Spread:
+class SeedStatistics:
     """Mean over seeds, sample standard deviation (ddof 1; nan for one run), and the number of runs."""
 
     mean: float
@@ -94,14 +94,14 @@ class SummaryRow:
     method: str
     runs: int
     failed: int
-    values: dict[str, Spread]
+    values: dict[str, SeedStatistics]
     note: str
     is_timed_alone: bool
     degraded: int = 0
 
 
 @dataclass(frozen=True)
-class Paired:
+class PairedComparison:
     """A method against the reference over n pairs of one sequence and seed.
 
     ratio : geometric mean of its ATE over the reference's, of pairs in which both are usable; nan without any
@@ -166,9 +166,9 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All of it; the first of `methods` is the reference of `differences` and of `paired`.
+    """All of it; the first of `methods` is the reference of `differences` and of `pairs`.
 
-    paired : also each method with the IMU against itself without, when both were asked for
+    pairs : also each method with the IMU against itself without, when both were asked for
     configs : the resolved configuration of each method; tie : m
     beside : tables of what a thesis prints, beside these runs
     """
@@ -179,7 +179,7 @@ class Comparison:
     metrics: tuple[Metric, ...]
     runs: tuple[RunScore, ...]
     rows: tuple[SummaryRow, ...]
-    paired: tuple[Paired, ...]
+    pairs: tuple[PairedComparison, ...]
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
     configs: dict[str, dict[str, Any]]

@@ -39,7 +39,7 @@ class Constraint:
     """A measured pose of keyframe `b` relative to keyframe `a`.
 
     T_a_b : (4, 4); covariance : (6, 6) of t' = t + d[:3], R' = exp(d[3:]) R in the axes of keyframe a, m2 and rad2
-    is_held : a person vouches for it: no outlier candidate of the graph
+    is_binding : a person vouches for it: no outlier candidate of the graph
     """
 
     a: int
@@ -47,7 +47,7 @@ class Constraint:
     T_a_b: Floats
     covariance: Floats
     kind: ConstraintKind = "loop"
-    is_held: bool = False
+    is_binding: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,9 +98,9 @@ class LoopCandidate:
 
 @dataclass(frozen=True)
 class Instant:
-    """A scan by its number in the recording, or a stamp, ns; `said` : where it was said, for messages."""
+    """A scan by its number in the recording, or a stamp, ns; `source` : where it was said, for messages."""
 
-    said: str
+    source: str
     scan: int | None = None
     stamp_ns: int | None = None
 
@@ -124,7 +124,7 @@ class ControlPoint:
     """A surveyed position of the sensor, or of a point it saw, at an instant.
 
     position : (3,) in the coordinates `epsg`: easting, northing, height, m, or longitude, latitude, deg, height, m
-    sigma : (3,) m; seen : (3,) m, the point in the axes of the LiDAR; the sensor itself is the origin
+    sigma : (3,) m; point_lidar : (3,) m, the point in the axes of the LiDAR; the sensor itself is the origin
     height_epsg : of the heights, None for those of `epsg`
     """
 
@@ -132,7 +132,7 @@ class ControlPoint:
     position: Floats
     sigma: Floats
     epsg: int
-    seen: Floats = field(default_factory=lambda: np.zeros(3))
+    point_lidar: Floats = field(default_factory=lambda: np.zeros(3))
     height_epsg: int | None = None
 
 
@@ -149,14 +149,14 @@ class KnownPair:
     """Keyframes `a` and, newer, `b` that a person knows to show one place.
 
     place : (3,) m, roughly, of b in the axes of a; within : m, how far it may lie from there, None for the configuration's
-    said : where it was said
+    source : where it was said
     """
 
     a: int
     b: int
     place: Floats
     within: float | None = None
-    said: str = ""
+    source: str = ""
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class MapFix:
     overlap : share of the source points that find the map; inlier_share : of those, within the kernel
     innovation : correction of what odometry carried here, m and rad
     reason : why it is not held, empty where it is
-    is_doubted : held, but by fewer of its points than elsewhere in the run: something there has changed
+    is_doubtful : held, but by fewer of its points than elsewhere in the run: something there has changed
     """
 
     T_map_lidar: Floats
@@ -201,9 +201,9 @@ class MapFix:
     inlier_share: float = 0.0
     innovation: tuple[float, float] = (0.0, 0.0)
     reason: str = ""
-    is_doubted: bool = False
+    is_doubtful: bool = False
 
     @property
-    def is_held(self) -> bool:
+    def is_binding(self) -> bool:
         """Whether the map holds the scan."""
         return self.status == "held"

@@ -16,13 +16,13 @@ class ImuStream:
     """Samples of one IMU in its own frame.
 
     stamps_ns : (M,) int64; accel : (M, 3) specific force, m/s2, +g up at rest; gyro : (M, 3) rad/s
-    hidden : (M, 6) one sigma of what readings at the end of the range lack, of accel and gyro; None where none do
+    clipping_sigma : (M, 6) one sigma of what readings at the end of the range lack, of accel and gyro; None where none do
     """
 
     stamps_ns: Longs
     accel: Floats
     gyro: Floats
-    hidden: Floats | None = None
+    clipping_sigma: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -183,7 +183,7 @@ class InertialStep:
 
     seconds : (N,) that each reading lasts; accel, rates : (N, 3) m/s2 and rad/s, biases left in
     rate_noise : (3, 3) (rad/s)2 per Hz
-    hidden : (m/s2)2 per Hz of force that the range of the IMU cut off
+    clipping : (m/s2)2 per Hz of force that the range of the IMU cut off
     T_world_imu : (4, 4) registered, and its covariance (6, 6), t' = t + d[:3], R' = exp(d[3:]) R in world axes; None where
         registration failed
     """
@@ -194,7 +194,7 @@ class InertialStep:
     rate_noise: Floats
     T_world_imu: Floats | None = None
     covariance: Floats | None = None
-    hidden: float = 0.0
+    clipping: float = 0.0
 
 
 @dataclass(frozen=True)

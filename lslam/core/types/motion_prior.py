@@ -20,7 +20,7 @@ class MotionPrior:
     covariance : (6, 6) of the pose at the stamp, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2; None where
         the motion model has none
     link : what joins the scan to the one before in a smoother; None where the motion model is for none
-    is_felt : an IMU measured the motion within the sweep
+    has_imu_motion : an IMU measured the motion within the sweep
     change : (6, 6) covariance of the motion from begin to end, world axes, which later scans told as well; None elsewhere
     """
 
@@ -28,7 +28,7 @@ class MotionPrior:
     poses: Floats
     covariance: Floats | None = None
     link: SweepLink | None = None
-    is_felt: bool = False
+    has_imu_motion: bool = False
     change: Floats | None = None
 
     @classmethod
@@ -48,7 +48,7 @@ class MotionPrior:
     @property
     def is_bent(self) -> bool:
         """Whether the motion within the sweep is more than a line through both ends."""
-        return self.is_felt or self.change is not None
+        return self.has_imu_motion or self.change is not None
 
     @property
     def times_ns(self) -> Longs:

@@ -146,7 +146,7 @@ class RunRecord:
     real_time_limit : seconds one scan may take: skip_frames / rate
     pose_time : where in a sweep the stamps of scans lie, to which poses belong: scan_start, scan_middle or scan_end
     world : where the coordinates of trajectory and map begin and whether z is up, in words
-    unscored : why a known ground truth gave no score, empty where it did
+    no_score_reason : why a known ground truth gave no score, empty where it did
     odometry : the trajectory before the pose graph, in its own world, None when there was no back end
     T_final_odometry : (4, 4) from that world into the trajectory's
     inertial : the IMU between keyframes, when a tightly coupled method has it in the graph
@@ -180,7 +180,7 @@ class RunRecord:
     world: str = "LiDAR at the first scan, not levelled"
     pose_time: str = "scan_start"
     problems: list[str] = field(default_factory=list)
-    unscored: str = ""
+    no_score_reason: str = ""
     odometry: Trajectory | None = None
     T_final_odometry: Floats = field(default_factory=lambda: np.eye(4))
     turns: list[Turn] = field(default_factory=list)

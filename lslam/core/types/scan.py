@@ -37,14 +37,14 @@ class Span(NamedTuple):
         return self.end_s - self.begin_s
 
     @property
-    def passed(self) -> float:
+    def stamp_share(self) -> float:
         """Share of the sweep, 0 to 1, that is over at the stamp."""
         return -self.begin_s / self.seconds if self.seconds > 0 else 0.0
 
     @property
     def instant(self) -> str:
         """Where in the sweep the stamp lies: scan_start, scan_middle or scan_end, whichever is nearest."""
-        return "scan_start" if self.passed < 0.25 else "scan_middle" if self.passed < 0.75 else "scan_end"
+        return "scan_start" if self.stamp_share < 0.25 else "scan_middle" if self.stamp_share < 0.75 else "scan_end"
 
 
 @dataclass(frozen=True)

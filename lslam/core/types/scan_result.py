@@ -84,26 +84,26 @@ class MotionCheck:
     """One comparison of a claimed motion with the scans at its ends; m and rad, axes of the sensor at its begin.
 
     first, last : positions of the scans in the run; seconds : between them
-    claimed, found : (4, 4) poses of the last scan seen from the first
+    claimed_motion, found_motion : (4, 4) poses of the last scan seen from the first
     sigma : (6,) standard deviation of what was found, about a metre along directions that the scans do not hold
     agreement : share of the points that lie on surfaces of the first scan as found; claimed_agreement : as claimed
     usual : what the agreement lately was; is_after_break : whether scans are missing or failed just before the last
     rival : (4, 4) another motion that explains the last scan about as well as the one found
-    emptied : share of the directions that held points since the poses stand, and hold none now
+    emptied_share : share of the directions that held points since the poses stand, and hold none now
     """
 
     first: int
     last: int
     seconds: float
-    claimed: Floats
-    found: Floats
+    claimed_motion: Floats
+    found_motion: Floats
     sigma: Floats
     agreement: float
     claimed_agreement: float
     usual: float
     is_after_break: bool = False
     rival: Floats | None = None
-    emptied: float = 0.0
+    emptied_share: float = 0.0
 
     @property
     def is_conclusive(self) -> bool:
@@ -118,7 +118,7 @@ class MotionCheck:
     @property
     def apart(self) -> Floats:
         """(6,) by how much the scans say the motion was more than claimed."""
-        return motion_apart(self.claimed, self.found)
+        return motion_apart(self.claimed_motion, self.found_motion)
 
 
 def motion_apart(a: Floats, b: Floats) -> Floats:
@@ -146,12 +146,12 @@ class ScanResult:
         that a pose graph may get beside; None elsewhere
     map_age : how many scans ago that local map was taken, on the mean; 1 from scan to scan
     is_stationary : the sensor had not moved since the scan before
-    is_repeated : for that reason the scan was not registered and has the pose of the one before
+    repeats_pose : for that reason the scan was not registered and has the pose of the one before
     posed_by : what within a method found the pose in its place, as a recovery policy or all points in place of features;
         empty: the method itself
     segment : number of the local map it was registered on; frame : of the coordinates that its pose is in, 0 for those of the
         trajectory
-    is_lost : the scans round it say that it may be elsewhere, which a problem of the run says in words
+    may_be_elsewhere : the scans round it say that it may be elsewhere, which a problem of the run says in words
     degenerate : (K, 6) unit twists along which the scan says nothing and the motion prior was kept
     prior_error : (translation m, rotation rad) between motion prior and result
     prior_norm : 2-norm of inv(prior) pose - I, of the prior before the scan was looked at (Girolimetto, equation 5.1)
@@ -177,11 +177,11 @@ class ScanResult:
     rmse: float = 0.0
     overlap: float = 0.0
     is_stationary: bool = False
-    is_repeated: bool = False
+    repeats_pose: bool = False
     posed_by: str = ""
     segment: int = 0
     frame: int = 0
-    is_lost: bool = False
+    may_be_elsewhere: bool = False
     degenerate: Floats = field(default_factory=lambda: np.zeros((0, 6)))
     prior_error: tuple[float, float] = (0.0, 0.0)
     prior_norm: float = 0.0
@@ -197,19 +197,19 @@ class ScanResult:
             return self
         return replace(self, T_world_lidar=self.T_world_lidar @ self.stamp_offset, stamp_offset=None)
 
-    def moved(self, T: Floats) -> ScanResult:
+    def in_world(self, T: Floats) -> ScanResult:
         """The result in the world that `T` (4, 4) leads to: pose, covariances and degenerate directions."""
         R = T[:3, :3]
 
-        def turned(covariance: Floats | None) -> Floats | None:
+        def rotate(covariance: Floats | None) -> Floats | None:
             return None if covariance is None else noise.rotate(covariance, R)
 
         return replace(
             self,
             T_world_lidar=se3.normalise(T @ self.T_world_lidar),
-            covariance=turned(self.covariance),
-            points_covariance=turned(self.points_covariance),
-            registration_covariance=turned(self.registration_covariance),
+            covariance=rotate(self.covariance),
+            points_covariance=rotate(self.points_covariance),
+            registration_covariance=rotate(self.registration_covariance),
             degenerate=self.degenerate @ np.kron(np.eye(2), R).T,
         )
 
@@ -222,6 +222,6 @@ class ScanResult:
 
     def poser(self, method: str) -> str:
         """What posed the scan: the `method`, its fallback, the motion prior, or the scan before where it repeats that pose."""
-        if self.is_repeated:
+        if self.repeats_pose:
             return STATIONARY
         return (self.posed_by or method) if self.status == "ok" else MOTION_PRIOR

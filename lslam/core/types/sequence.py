@@ -41,7 +41,7 @@ class Calibration:
         own = {"T_cam0_lidar": self.T_cam0_lidar, "T_lidar_imu": self.T_lidar_imu, "T_lidar_gnss": self.T_lidar_gnss}
         return {**own, **{f"T_lidar_{frame}": T for frame, T in self.frames.items()}}
 
-    def known(self) -> dict[str, Floats]:
+    def poses_in_lidar(self) -> dict[str, Floats]:
         """(4, 4) poses in the LiDAR of all that the recording places, by frame."""
         T_cam0_lidar = self.T_cam0_lidar
         own = {
@@ -54,7 +54,7 @@ class Calibration:
 
     def T_lidar(self, frame: str) -> Floats:
         """(4, 4) pose of `frame` in the LiDAR. Raises InputError naming the frames that are known."""
-        known = self.known()
+        known = self.poses_in_lidar()
         if frame not in known:
             raise InputError(
                 f"nothing says where frame {frame} sits (known: {', '.join(sorted(known))}): state it below [frames] in "

@@ -12,11 +12,11 @@ class Stateful:
     """An object whose attributes named in `STATE` are all that changes while it works.
 
     `state` refers to the live object: it is to be written before the object goes on. `restore` is for an object made by the
-    same arguments. Attributes named in `CLEARED` are worked out anew after it, and None until then.
+    same arguments. Attributes named in `TRANSIENT` are worked out anew after it, and None until then.
     """
 
     STATE: ClassVar[tuple[str, ...]] = ()
-    CLEARED: ClassVar[tuple[str, ...]] = ()
+    TRANSIENT: ClassVar[tuple[str, ...]] = ()
 
     def state(self) -> State:
         """What `restore` needs to go on from here."""
@@ -30,7 +30,7 @@ class Stateful:
                 part.restore(state[name])
             else:
                 setattr(self, name, state[name])
-        for name in self.CLEARED:
+        for name in self.TRANSIENT:
             setattr(self, name, None)
 
 

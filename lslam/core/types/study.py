@@ -78,7 +78,7 @@ class StudyRow:
         return self.status in USABLE
 
     @property
-    def is_diverged(self) -> bool:
+    def diverges(self) -> bool:
         """Whether the method lost the motion; a run that failed otherwise says nothing about its parameters."""
         return self.status == "diverged"
 
@@ -112,7 +112,7 @@ class Curve:
     quantities : translation (m), angular (deg), time_per_scan (ms, of registration), total_time (s), fallback (% of the scans
         that the method did not pose), efficiency (equation 5.2 of Girolimetto), total_efficiency (5.3); nan where a run
         has no such number or is not usable
-    stages : ms per scan by name; lost : runs that diverged, by their status or by their error; ran : runs there are
+    stages : ms per scan by name; losses : runs that diverged, by their status or by their error; ran : runs there are
     is_timed_alone : no run shared the machine with another
     """
 
@@ -124,7 +124,7 @@ class Curve:
     seeds: tuple[int, ...]
     quantities: dict[str, Floats]
     stages: dict[str, Floats]
-    lost: Bools
+    losses: Bools
     ran: Bools
     at: tuple[tuple[str, Value], ...] = ()
     words: tuple[str, ...] = ()
@@ -151,14 +151,14 @@ class Curve:
         )
 
     @property
-    def scored(self) -> Bools:
+    def with_score(self) -> Bools:
         """(V, S) runs that say whether their values work: with an error, or lost. One without ground truth does not."""
-        return np.asarray(self.lost | np.isfinite(self.quantities["translation"]))
+        return np.asarray(self.losses | np.isfinite(self.quantities["translation"]))
 
     @property
-    def is_lost(self) -> Bools:
+    def loses_most(self) -> Bools:
         """(V,) values at which more than half of the runs that say so were lost."""
-        return np.asarray(2 * self.lost.sum(1) > self.scored.sum(1))
+        return np.asarray(2 * self.losses.sum(1) > self.with_score.sum(1))
 
     def of_seed(self, index: int) -> Curve:
         """The same curve of one of its seeds alone."""
@@ -168,7 +168,7 @@ class Curve:
             seeds=self.seeds[one],
             quantities={name: table[:, one] for name, table in self.quantities.items()},
             stages={name: table[:, one] for name, table in self.stages.items()},
-            lost=self.lost[:, one],
+            losses=self.losses[:, one],
             ran=self.ran[:, one],
         )
 
@@ -219,7 +219,7 @@ class Law:
     linear: a x + b; inverse: a / x; product: a y / x
     names : of x and, for a product, y; coefficients : (P,), margins : (P,) half width of their confidence intervals
     covariance : (P, P); freedom : degrees of freedom; level : of margins and bands, 0..1
-    points : (N, K) where it was fitted, observed and fitted : (N,) s; r2 : of those
+    points : (N, K) where it was fitted, times and law_times : (N,) s; r2 : of those
     scatter : (N,) s, standard deviation of the runs behind each observation, nan where there is one
     """
 
@@ -231,15 +231,15 @@ class Law:
     freedom: int
     level: float
     points: Floats
-    observed: Floats
-    fitted: Floats
+    times: Floats
+    law_times: Floats
     r2: float
     scatter: Floats
 
     @property
     def residuals(self) -> Floats:
         """(N,) relative to the law."""
-        return (self.observed - self.fitted) / self.fitted
+        return (self.times - self.law_times) / self.law_times
 
     @property
     def text(self) -> str:
@@ -278,13 +278,13 @@ class FindingVerdict:
 
     text: str
     outcome: Outcome
-    measured: str
+    numbers: str
     source: str = ""
 
     @property
     def sentence(self) -> str:
         """For people."""
-        return f"{self.outcome}: {self.text.rstrip('.')}; here {self.measured}"
+        return f"{self.outcome}: {self.text.rstrip('.')}; here {self.numbers}"
 
 
 @dataclass(frozen=True)

@@ -331,7 +331,9 @@ def find_extrinsics(
         if T_lidar_gnss is None:
             voice.notes.append(f"extrinsics: {links.why_not(lidar, gnss.frame)}: the place of the antenna is unknown")
     own = replace(found, T_lidar_imu=T_lidar_imu, T_lidar_gnss=T_lidar_gnss, frames={})
-    return replace(own, frames={name: T for name, T in found.frames.items() if name not in own.known()}), is_assumed
+    return replace(
+        own, frames={name: T for name, T in found.frames.items() if name not in own.poses_in_lidar()}
+    ), is_assumed
 
 
 def truth_topics(bag: Bag) -> list[BagTopic]:

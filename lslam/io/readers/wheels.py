@@ -58,7 +58,7 @@ def read_wheels(
     if frame:
         T: Floats | None = sequence.calibration.T_lidar(frame)
     else:
-        T = sequence.calibration.known().get(own)
+        T = sequence.calibration.poses_in_lidar().get(own)
         if T is None:
             notes.append(
                 f"wheels: nothing says where {own or 'their frame'} sits: it is estimated; wheels.frame names one that is known"

@@ -220,7 +220,7 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     errors = motion.prior_errors()
     norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
     steady = [r.imu.steady_norm for r in results[1:] if r.status == "ok" and r.imu.steady_norm is not None]
-    iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.is_repeated]
+    iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.repeats_pose]
     return {
         "used": not motion.refusal,
         "decisions": part.notes,

@@ -144,7 +144,7 @@ def between_middles(result: ScanResult, middle: tuple[int, Floats], following: T
     speed within a sweep that changes its direction is as large as a step.
     """
     (begin_ns, begin), (end_ns, end), after = middle, following.middle, following.result
-    is_placed = all(r.status == "ok" and not r.is_repeated and r.segment == after.segment for r in (result, after))
+    is_placed = all(r.status == "ok" and not r.repeats_pose and r.segment == after.segment for r in (result, after))
     # No farther from the next middle than a sweep is long: where scans are missing, its own is nearer.
     if not is_placed or not 0 < end_ns - result.stamp_ns <= 2 * (result.stamp_ns - begin_ns):
         return result

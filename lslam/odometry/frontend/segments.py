@@ -37,7 +37,7 @@ class Tracked:
         """In the world that `T` (4, 4) leads to."""
         instant_ns, middle = self.middle
         sweep = replace(self.sweep, poses=T @ self.sweep.poses)
-        return replace(self, result=self.result.moved(T), sweep=sweep, middle=(instant_ns, T @ middle))
+        return replace(self, result=self.result.in_world(T), sweep=sweep, middle=(instant_ns, T @ middle))
 
     def at(self, pose: Floats) -> Tracked:
         """With the scan at another pose (4, 4)."""

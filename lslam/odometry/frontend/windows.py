@@ -299,7 +299,7 @@ class WindowTracker(Stateful):
 
     def _middles(self) -> list[tuple[int, Floats]]:
         """Instants and poses of the middles of registered sweeps, up to the end of the window."""
-        now = [t.middle for t in self._decided if t.result.status == "ok" and not t.result.is_repeated]
+        now = [t.middle for t in self._decided if t.result.status == "ok" and not t.result.repeats_pose]
         return [*self._before, *now]
 
     def _course(self) -> Course:

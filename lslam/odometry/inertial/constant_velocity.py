@@ -102,7 +102,7 @@ class ConstantVelocity(Stateful, MotionModel):
     # m/s2, twice gravity: a faster change is a registration error, unless the next step confirms it.
     MAX_ACCELERATION = 20.0
     STATE: ClassVar[tuple[str, ...]] = ("_instant_ns", "_pose", "_twist", "_step_s", "_velocity")
-    CLEARED: ClassVar[tuple[str, ...]] = ("_predicted",)
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("_predicted",)
 
     def __init__(self, pose: Floats | None = None) -> None:
         self._instant_ns: int | None = None

@@ -53,7 +53,7 @@ class InertialMotion(Stateful):
         "_instant_ns",
         "_pose",
     )
-    CLEARED: ClassVar[tuple[str, ...]] = ("_taught", "_increments", "_expected")
+    TRANSIENT: ClassVar[tuple[str, ...]] = ("_taught", "_increments", "_expected")
 
     def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
         self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
@@ -270,7 +270,7 @@ class InertialMotion(Stateful):
         k = int(np.searchsorted(instants, anchor_ns))
         step = estimate.over(self.imu, np.concatenate([instants[:k], [anchor_ns], instants[k:]]))
         poses = step.poses(k, anchor @ self.T_lidar_imu, estimate.velocity, estimate.gravity, self.T_imu_lidar)
-        return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), is_felt=True)
+        return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), has_imu_motion=True)
 
     def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""

@@ -146,7 +146,7 @@ def _ordered(imu: ImuStream, notes: list[str]) -> ImuStream:
     good = finite & ahead
     if good.sum() < 2:
         raise ImuRefusedError(f"it has {int(good.sum())} usable samples")
-    hidden = None if imu.hidden is None else imu.hidden[good]
+    hidden = None if imu.clipping_sigma is None else imu.clipping_sigma[good]
     return ImuStream(imu.stamps_ns[good], imu.accel[good], imu.gyro[good], hidden)
 
 

@@ -123,8 +123,8 @@ def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:
 
 def _hidden(imu: ImuStream, begin_ns: int, end_ns: int) -> Floats | None:
     """(6,) the mean of what the samples between two instants lack; of one cut as a whole, so it does not average out."""
-    if imu.hidden is None:
+    if imu.clipping_sigma is None:
         return None
     i, j = np.searchsorted(imu.stamps_ns, [begin_ns, end_ns])
-    within = imu.hidden[max(i - 1, 0) : j + 1]
+    within = imu.clipping_sigma[max(i - 1, 0) : j + 1]
     return np.asarray(within.mean(axis=0)) if within.any() else None

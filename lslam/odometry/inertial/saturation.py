@@ -32,7 +32,7 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
     Over a cut the reading goes on with the slopes it has at the edges and flattens towards its top, yet not beyond
     `HIDDEN_RANGE_SHARE` of the range; its sigma is what was added, and more the farther the edges are.
     """
-    if imu.hidden is not None:
+    if imu.clipping_sigma is not None:
         # Filled before: what it was filled with is no range.
         return imu
     seconds = (imu.stamps_ns - imu.stamps_ns[0]) * 1e-9 if len(imu) else np.zeros(0)
@@ -54,7 +54,7 @@ def with_hidden(imu: ImuStream, notes: list[str]) -> ImuStream:
         f"IMU: of {len(imu)} samples {' and '.join(words)}, the end of the range: what is beyond is filled in smoothly, and "
         "trusted the less"
     )
-    return replace(imu, accel=parts[0], gyro=parts[1], hidden=np.hstack(hidden))
+    return replace(imu, accel=parts[0], gyro=parts[1], clipping_sigma=np.hstack(hidden))
 
 
 def _cuts(values: Floats, least: float) -> Bools:

@@ -45,7 +45,7 @@ class SmootherMotion(InertialMotion):
 
     HAS_DEVICE: ClassVar[bool] = False
     STATE: ClassVar[tuple[str, ...]] = (*InertialMotion.STATE, "_is_begun", "smoother")
-    CLEARED: ClassVar[tuple[str, ...]] = (*InertialMotion.CLEARED, "_added")
+    TRANSIENT: ClassVar[tuple[str, ...]] = (*InertialMotion.TRANSIENT, "_added")
 
     def __init__(
         self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, smoother: InertialSmoother
@@ -148,7 +148,9 @@ class SmootherMotion(InertialMotion):
         middles = np.cumsum(step.seconds) - 0.5 * step.seconds
         turning = np.gradient(rates, middles, axis=0) if len(rates) > 1 else np.zeros_like(rates)
         forces = step.accel + np.cross(turning, lever) + np.cross(rates, np.cross(rates, lever))
-        return InertialStep(step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T, hidden=step.hidden)
+        return InertialStep(
+            step.seconds, forces @ R.T, step.rates @ R.T, R @ step.rate_noise @ R.T, clipping=step.clipping
+        )
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """As of any IMU; the smoother begins again."""

@@ -80,7 +80,7 @@ class WheelMotion(ConstantVelocity):
         "_agreed_ns",
         "_was_bridged",
     )
-    CLEARED: ClassVar[tuple[str, ...]] = (*ConstantVelocity.CLEARED, "_reckoned", "_learnt")
+    TRANSIENT: ClassVar[tuple[str, ...]] = (*ConstantVelocity.TRANSIENT, "_reckoned", "_learnt")
 
     def __init__(self, wheels: WheelStream, pose: Floats | None = None) -> None:
         super().__init__(pose)

@@ -114,7 +114,9 @@ def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
 def _ambiguous(checks: list[MotionCheck]) -> list[Alert]:
     """Where standing and moving explain the scans about equally well: a group of surfaces moves, or the sensor."""
     conclusive = [check for check in checks if check.is_conclusive]
-    is_open = [check.rival is not None and _is_rest(check.rival) != _is_rest(check.found) for check in conclusive]
+    is_open = [
+        check.rival is not None and _is_rest(check.rival) != _is_rest(check.found_motion) for check in conclusive
+    ]
     return [
         Alert(
             conclusive[begin].first + 1,
@@ -138,12 +140,16 @@ def _open(checks: list[MotionCheck]) -> list[Alert]:
         if reference is None or min(reference.seconds, check.seconds) <= 0:
             continue
         longer = check.seconds / reference.seconds
-        more = (check.claimed - se3.exp(longer * se3.log(reference.claimed)))[:3, 3]
+        more = (check.claimed_motion - se3.exp(longer * se3.log(reference.claimed_motion)))[:3, 3]
         axis = int(np.argmax(np.abs(more)))
         # What a shorter pair does not tell grows with the time; so does the change of speed of a sensor that was on its way.
         is_next = bool(spans) and spans[-1][1] == check.first
         if not is_next:
-            pairs = 1.0 if _is_rest(reference.claimed) else (check.last - reference.last) / (check.last - check.first)
+            pairs = (
+                1.0
+                if _is_rest(reference.claimed_motion)
+                else (check.last - reference.last) / (check.last - check.first)
+            )
         if abs(more[axis]) <= LARGE[axis] * max(longer, pairs, 1.0):
             continue
         if is_next:
@@ -174,10 +180,10 @@ def _foreign(checks: list[MotionCheck]) -> list[Alert]:
         Alert(
             checks[begin].first + 1,
             checks[end - 1].last,
-            f"the poses stand, yet {100 * max(check.emptied for check in checks[begin:end]):.0f} % of the directions in which "
-            "there were points are empty: the clouds are not in the frame of the sensor, perhaps in that of a world",
+            f"the poses stand, yet {100 * max(check.emptied_share for check in checks[begin:end]):.0f} % of the directions in "
+            "which there were points are empty: the clouds are not in the frame of the sensor, perhaps in that of a world",
         )
-        for begin, end in _runs(np.array([check.emptied > EMPTIED_SHARE for check in checks], np.float64))
+        for begin, end in _runs(np.array([check.emptied_share > EMPTIED_SHARE for check in checks], np.float64))
         if end - begin >= IN_A_ROW
     ]
 

@@ -255,7 +255,8 @@ def building_layers(folder: Path, projection: Projection) -> list[GeoLayer]:
     about = f"{found.attribution}; corrected by lslam" if found.attribution else "corrected by lslam"
     held = found.buildings
     polygons = [
-        [[_close_ring(ring, there) for ring in footprint.rings] for footprint in c.corrected.footprints] for c in held
+        [[_close_ring(ring, there) for ring in footprint.rings] for footprint in c.real_building.footprints]
+        for c in held
     ]
     columns: dict[str, Any] = {
         "osm_id": [c.building.osm_id for c in held],

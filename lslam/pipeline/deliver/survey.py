@@ -200,7 +200,7 @@ def _checked(survey: Survey, projection: Projection, path: Path, used: SurveyedP
     points, results = read_control_points(path), results_of(run)
     require_instants([point.at for point in points], np.array([r.index for r in results]), run.trajectory.stamps_ns)
     found = control_residuals(points, results, projection.georeference, projection.georeference.geoid)
-    names, stamps = [point.at.said for point in points], [one.stamp_ns for one in found]
+    names, stamps = [point.at.source for point in points], [one.stamp_ns for one in found]
     places, residuals = np.stack([one.place for one in found]), np.stack([one.residual for one in found])
     checked = _points("kept out", names, stamps, places, residuals, projection)
     for name, place in zip(names, checked.places, strict=True):

@@ -106,7 +106,7 @@ class Corrections:
         if path := self._before(POINTS, config.graph.control):
             for point in read_control_points(path):
                 values = dict(zip("xyz", point.position.tolist(), strict=True))
-                seen = dict(zip(("lidar_x", "lidar_y", "lidar_z"), point.seen.tolist(), strict=True))
+                seen = dict(zip(("lidar_x", "lidar_y", "lidar_z"), point.point_lidar.tolist(), strict=True))
                 crs, sigmas = crs_name(point.epsg, point.height_epsg), point.sigma.tolist()
                 spread = {"sigma": sigmas[0], "sigma_z": sigmas[2] if sigmas[2] != sigmas[0] else None}
                 points.append(Point(scan=self._scan(point.at), crs=crs, **values, **spread, **seen))

@@ -30,10 +30,10 @@ def run_away() -> PoseGraph:
     return replace(graph, poses=np.stack(chain), odometry=steps)
 
 
-def loop(a: int, b: int, off: float = 0.0, is_held: bool = False) -> Constraint:
+def loop(a: int, b: int, off: float = 0.0, is_binding: bool = False) -> Constraint:
     T = measured(se3.relative(REAL[a], REAL[b]), LOOP_SIGMAS, RNG)
     T[0, 3] += off
-    return Constraint(a, b, T, np.diag(LOOP_SIGMAS**2), is_held=is_held)
+    return Constraint(a, b, T, np.diag(LOOP_SIGMAS**2), is_binding=is_binding)
 
 
 def test_a_held_loop_lets_right_loops_in_that_odometry_excludes_and_keeps_wrong_ones_out() -> None:
@@ -41,7 +41,7 @@ def test_a_held_loop_lets_right_loops_in_that_odometry_excludes_and_keeps_wrong_
     others = [loop(20, 100), loop(21, 101), loop(40, 120), loop(41, 121), loop(60, 140, off=12.0)]
     alone = optimise(replace(graph, loops=others), GraphConfig())
     assert all(alone.loop_reasons[:4])
-    helped = optimise(replace(graph, loops=[loop(0, 159, is_held=True), *others]), GraphConfig())
+    helped = optimise(replace(graph, loops=[loop(0, 159, is_binding=True), *others]), GraphConfig())
     assert helped.loop_reasons[:5] == [""] * 5
     assert helped.loop_reasons[5]
     assert ate(helped.poses, REAL) < 0.1 * ate(alone.poses, REAL)
@@ -52,7 +52,7 @@ def test_a_held_loop_is_never_rejected_however_wrong() -> None:
     wrong = loop(10, 90, off=30.0)
     free = optimise(replace(graph, loops=[*graph.loops, wrong]), GraphConfig())
     assert free.loop_reasons[-1]
-    held = optimise(replace(graph, loops=[*graph.loops, replace(wrong, is_held=True)]), GraphConfig())
+    held = optimise(replace(graph, loops=[*graph.loops, replace(wrong, is_binding=True)]), GraphConfig())
     assert held.loop_reasons[-1] == ""
     moved = se3.relative(held.poses[10], held.poses[90])
     assert np.linalg.norm(moved[:3, 3] - wrong.T_a_b[:3, 3]) < 1.0
@@ -67,7 +67,7 @@ def test_control_points_anchor_a_run_and_hold_an_instant_between_two_keyframes()
         between = REAL[k] @ se3.exp(share * se3.log(se3.relative(REAL[k], REAL[k + 1])))
         at = se3.apply(between, ahead[None])[0]
         arms = [se3.apply(se3.inverse(REAL[j]), at[None])[0] for j in (k, k + 1)]
-        fixes.append(PositionFix(k, at, np.full(3, 0.01), arms[0], is_held=True, share=share, next_arm=arms[1]))
+        fixes.append(PositionFix(k, at, np.full(3, 0.01), arms[0], is_binding=True, share=share, next_arm=arms[1]))
     out = optimise(replace(graph, fixes=fixes, is_anchored=False, tilt_sigma=0.2), GraphConfig())
     assert out.fix_inliers.all()
     off = np.array([fix.seen(out.poses) - fix.position for fix in fixes])
@@ -79,7 +79,7 @@ def test_the_factor_between_keyframes_has_the_derivative_of_its_error() -> None:
     import gtsam
 
     fix = PositionFix(
-        0, np.array([3.0, -2.0, 1.0]), np.array([0.1, 0.2, 0.4]), np.array([1.0, 0.5, -0.2]), is_held=True, share=0.3,
+        0, np.array([3.0, -2.0, 1.0]), np.array([0.1, 0.2, 0.4]), np.array([1.0, 0.5, -0.2]), is_binding=True, share=0.3,
         next_arm=np.array([-0.7, 0.4, 0.3]),
     )  # fmt: skip
     factor = factors.position(fix)

@@ -49,7 +49,7 @@ def errors(world: Revisited, prior_map: PriorMap, fixes: list[MapFix]) -> np.nda
 
 def test_the_map_holds_every_scan_to_centimetres(world: Revisited) -> None:
     prior_map, fixes = followed(world, world.points)
-    assert all(fix.is_held for fix in fixes), [fix.reason for fix in fixes if not fix.is_held]
+    assert all(fix.is_binding for fix in fixes), [fix.reason for fix in fixes if not fix.is_binding]
     assert errors(world, prior_map, fixes).max() < 0.03
 
 
@@ -64,10 +64,10 @@ def test_odometry_carries_beyond_the_end_of_the_map_and_comes_back(world: Revisi
     near = np.linalg.norm(ahead[:, :2], axis=1) < 22.0
     prior_map, fixes = followed(world, world.points[~near])
     away = errors(world, prior_map, fixes)
-    carried = [k for k, fix in enumerate(fixes) if not fix.is_held]
+    carried = [k for k, fix in enumerate(fixes) if not fix.is_binding]
     assert carried, "the hole is passed"
-    assert fixes[0].is_held
-    assert fixes[-1].is_held
+    assert fixes[0].is_binding
+    assert fixes[-1].is_binding
     assert away.max() < 0.1
     assert all(fixes[k].reason for k in carried)
     size = [float(np.trace(fix.covariance[:3, :3])) for fix in fixes]
@@ -83,8 +83,8 @@ def test_a_street_that_was_rebuilt_is_flagged_and_does_not_drag(world: Revisited
     changed[is_moved] -= 1.2 * out[is_moved]
     prior_map, fixes = followed(world, changed)
     marked = doubted(fixes)
-    assert sum(fix.is_doubted for fix in marked[25:36]) > 5
-    assert not any(fix.is_doubted for fix in marked[45:])
+    assert sum(fix.is_doubtful for fix in marked[25:36]) > 5
+    assert not any(fix.is_doubtful for fix in marked[45:])
     assert errors(world, prior_map, fixes).max() < 0.1
 
 

@@ -18,12 +18,12 @@ from lslam.core.types.scan import Scan, Span
 def test_the_stamp_lies_at_the_start_the_middle_or_the_end_whichever_is_nearest(passed: float, instant: str) -> None:
     span = Span(-0.1 * passed, 0.1 * (1 - passed))
     assert span.seconds == pytest.approx(0.1)
-    assert span.passed == pytest.approx(passed)
+    assert span.stamp_share == pytest.approx(passed)
     assert span.instant == instant
 
 
 def test_a_scan_of_one_instant_takes_no_time_and_starts_at_its_stamp() -> None:
-    assert (Span().seconds, Span().passed, Span().instant) == (0.0, 0.0, "scan_start")
+    assert (Span().seconds, Span().stamp_share, Span().instant) == (0.0, 0.0, "scan_start")
     points = np.zeros((2, 3), np.float32)
     assert Scan(points, 0, 0).span == Scan(points[:0], 0, 0, None, np.zeros(0, np.float32)).span == Span()
 

@@ -103,7 +103,7 @@ def test_refining_estimates_the_velocity_from_the_middle_of_the_sweep(span: Span
     motion = ConstantVelocity()
     poses = drive(motion, TWIST, 4, span)
     right = motion.sweep(4 * TENTH, span)
-    middle = poses[4] @ se3.exp((0.5 - span.passed) * TWIST)
+    middle = poses[4] @ se3.exp((0.5 - span.stamp_share) * TWIST)
     slow = middle @ se3.exp(np.linspace(-0.4, 0.4, len(right.times))[:, None] * TWIST)
     prior = MotionPrior(right.times, slow)
     better = motion.refine(prior, 4 * TENTH, prior.pose)

@@ -37,14 +37,14 @@ def test_saturated_readings_are_filled_in_within_their_sigma(peak_deg: float) ->
     whole, read = turning(peak_deg)
     notes: list[str] = []
     filled = with_hidden(read, notes)
-    assert filled.hidden is not None
+    assert filled.clipping_sigma is not None
     cut = np.abs(read.gyro[:, 1]) >= LIMIT
-    np.testing.assert_array_equal(filled.hidden[:, 4] > 0, cut)
+    np.testing.assert_array_equal(filled.clipping_sigma[:, 4] > 0, cut)
     np.testing.assert_array_equal(filled.gyro[~cut], read.gyro[~cut])
     np.testing.assert_array_equal(filled.accel, read.accel)
     before, after = (np.sqrt(np.mean((s.gyro[cut, 1] - whole.gyro[cut, 1]) ** 2)) for s in (read, filled))
     assert after < 0.5 * before
-    assert np.mean(np.abs(filled.gyro[cut, 1] - whole.gyro[cut, 1]) < 2 * filled.hidden[cut, 4]) > 0.9
+    assert np.mean(np.abs(filled.gyro[cut, 1] - whole.gyro[cut, 1]) < 2 * filled.clipping_sigma[cut, 4]) > 0.9
     assert len(notes) == 1
     assert f"{int(cut.sum())} at the 4.363 rad/s of its gyroscope" in notes[0]
 
@@ -68,9 +68,9 @@ def test_both_ends_of_an_asymmetric_range_are_filled_in() -> None:
     whole, _ = turning(360.0)
     read = replace(whole, gyro=of_16_bits(whole.gyro))
     filled = with_hidden(read, [])
-    assert filled.hidden is not None
+    assert filled.clipping_sigma is not None
     upper, lower = read.gyro[:, 1] >= LIMIT - BIT, read.gyro[:, 1] <= -LIMIT
-    np.testing.assert_array_equal(filled.hidden[:, 4] > 0, upper | lower)
+    np.testing.assert_array_equal(filled.clipping_sigma[:, 4] > 0, upper | lower)
     means = [float(np.mean(s.gyro[:, 1])) for s in (whole, read, filled)]
     assert abs(means[2] - means[0]) < abs(means[1] - means[0]), "one half alone turns the heading"
 
@@ -82,8 +82,8 @@ def test_every_axis_has_its_own_range() -> None:
     rates[7::50, 2] = 2 * LIMIT
     read = replace(turning(360.0)[0], gyro=of_16_bits(rates, (1.0, 0.99, 1.0)))
     filled = with_hidden(read, [])
-    assert filled.hidden is not None
-    np.testing.assert_array_equal(filled.hidden[:, 3:] > 0, (rates >= LIMIT - BIT) | (rates <= -LIMIT))
+    assert filled.clipping_sigma is not None
+    np.testing.assert_array_equal(filled.clipping_sigma[:, 3:] > 0, (rates >= LIMIT - BIT) | (rates <= -LIMIT))
 
 
 def resting(coarse: float) -> Floats:
@@ -98,9 +98,9 @@ def resting(coarse: float) -> Floats:
 def test_an_axis_at_rest_and_one_of_nothing_are_at_no_end(coarse: float) -> None:
     whole, _ = turning(360.0)
     filled = with_hidden(replace(whole, gyro=resting(coarse)), [])
-    assert filled.hidden is not None
-    assert filled.hidden[:, 3].any()
-    assert not filled.hidden[:, 4:].any()
+    assert filled.clipping_sigma is not None
+    assert filled.clipping_sigma[:, 3].any()
+    assert not filled.clipping_sigma[:, 4:].any()
     alone = replace(whole, gyro=resting(coarse) * np.array([0.0, 1.0, 1.0]))
     assert with_hidden(alone, []) is alone
 
@@ -110,9 +110,9 @@ def test_a_steady_turn_is_no_end_where_another_axis_reads_more() -> None:
     gyro = read.gyro.copy()
     gyro[:, 2] = np.clip(np.arange(600) * BIT * 100, 0.0, 0.7 * LIMIT)
     filled = with_hidden(replace(whole, gyro=gyro), [])
-    assert filled.hidden is not None
-    assert filled.hidden[:, 4].any()
-    assert not filled.hidden[:, 5].any()
+    assert filled.clipping_sigma is not None
+    assert filled.clipping_sigma[:, 4].any()
+    assert not filled.clipping_sigma[:, 5].any()
 
 
 def test_the_smooth_top_of_a_coarse_reading_is_no_end_of_the_range() -> None:
@@ -130,9 +130,9 @@ def test_filled_in_readings_do_not_define_a_range() -> None:
     _, read = turning(400.0)
     once = clean(read, 0, int(5e9))
     again = clean(once.imu, 0, int(5e9))
-    assert once.imu.hidden is not None
-    assert again.imu.hidden is not None
-    np.testing.assert_array_equal(again.imu.hidden, once.imu.hidden)
+    assert once.imu.clipping_sigma is not None
+    assert again.imu.clipping_sigma is not None
+    np.testing.assert_array_equal(again.imu.clipping_sigma, once.imu.clipping_sigma)
     np.testing.assert_array_equal(again.imu.gyro, once.imu.gyro)
 
 
@@ -150,8 +150,8 @@ def test_only_a_step_over_saturated_readings_has_a_larger_covariance() -> None:
         P = state.propagated(estimate.over(stream, np.array(span))).covariance
         sigmas.append([np.sqrt(np.diag(P[part, part])) for part in (PLACE, TURN, SPEED)])
     np.testing.assert_array_equal(sigmas[0], sigmas[1])
-    assert filled.hidden is not None
-    hidden = filled.hidden[cut - 1 : cut + 11, 4].mean()
+    assert filled.clipping_sigma is not None
+    hidden = filled.clipping_sigma[cut - 1 : cut + 11, 4].mean()
     assert sigmas[3][1][1] == pytest.approx(np.hypot(sigmas[2][1][1], 0.1 * hidden), rel=0.05)
     assert sigmas[3][2][0] > 2 * sigmas[2][2][0], "a force that is turned wrongly leads astray"
 
@@ -199,7 +199,7 @@ def test_saturation_adds_its_sigma_to_velocity_and_rotation() -> None:
     stamps, none = np.arange(11, dtype=np.int64) * 10_000_000, np.zeros(3)
     accel = np.tile([0.0, 0.0, GRAVITY], (11, 1))
     seen = ImuStream(stamps, accel, np.zeros((11, 3)))
-    blind = replace(seen, hidden=np.tile([0.0, 3.0, 0.0, 0.0, 0.0, 0.5], (11, 1)))
+    blind = replace(seen, clipping_sigma=np.tile([0.0, 3.0, 0.0, 0.0, 0.0, 0.5], (11, 1)))
     estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
     steps = [estimate.over(stream, stamps[[0, -1]]) for stream in (seen, blind)]
     speeds = [estimate.propagated(step, np.eye(3)).covariance[:3, :3] for step in steps]

@@ -21,7 +21,7 @@ def checks_of(ahead: list[float], **more: float) -> list[MotionCheck]:
     """Checks every five scans that find the sensor so many m farther ahead than claimed, a metre in half a second."""
     one = MotionCheck(0, 5, 0.5, shifted(1.0), shifted(1.0), SURE, agreement=0.8, claimed_agreement=0.8, usual=0.8)
     return [
-        replace(one, first=5 * k, last=5 * k + 5, found=shifted(1.0 + off), **more)  # type: ignore[arg-type]
+        replace(one, first=5 * k, last=5 * k + 5, found_motion=shifted(1.0 + off), **more)  # type: ignore[arg-type]
         for k, off in enumerate(ahead)
     ]
 
@@ -64,7 +64,7 @@ def test_inconclusive_checks_neither_raise_nor_split_an_alert() -> None:
 
 def test_axes_that_are_inconsistent_together_make_one_alert_that_names_both() -> None:
     turned = shifted(1.3) @ se3.make(so3.exp(np.array([0, 0, np.deg2rad(1.0)])), np.zeros(3))
-    checks = [replace(check, found=turned) for check in checks_of([0.0] * 6)]
+    checks = [replace(check, found_motion=turned) for check in checks_of([0.0] * 6)]
     (alert,) = alerts(checks, np.zeros((31, 3)), 100_000_000 * np.arange(31, dtype=np.int64))
     assert (alert.first, alert.last) == (1, 30)
     assert alert.why == (
@@ -95,7 +95,10 @@ def test_poses_that_begin_to_move_where_the_scans_leave_it_open_raise_an_alert()
     sideways[1, 3] = -1.2
 
     def along(*claimed: Floats) -> list[MotionCheck]:
-        parts = [replace(c, claimed=T, found=T, sigma=across) for c, T in zip(checks[3:], claimed, strict=False)]
+        parts = [
+            replace(c, claimed_motion=T, found_motion=T, sigma=across)
+            for c, T in zip(checks[3:], claimed, strict=False)
+        ]
         return [*checks[:3], *parts, *checks[3 + len(parts) :]]
 
     assert spans(along(on, on, on)) == []
@@ -105,19 +108,19 @@ def test_poses_that_begin_to_move_where_the_scans_leave_it_open_raise_an_alert()
     # What was on its way may go half a metre faster in each pair; what stood, or moves so at once, may not.
     faster = [shifted(1.4), shifted(1.8)]
     assert spans(along(*faster)) == []
-    still = [replace(c, claimed=shifted(0.0), found=shifted(0.0)) for c in checks[:3]]
+    still = [replace(c, claimed_motion=shifted(0.0), found_motion=shifted(0.0)) for c in checks[:3]]
     assert spans([*still, *along(shifted(0.4), shifted(0.8))[3:]]) == [(21, 25)]
     # The same said by scans that tell it raises none; nor does what a pair of a fifth of the time would not tell.
     told = along(sideways, sideways)
     assert spans([*told[:3], *(replace(c, sigma=SURE) for c in told[3:5]), *told[5:]]) == []
-    brief = replace(checks[2], seconds=0.1, claimed=shifted(0.2), found=shifted(0.2))
+    brief = replace(checks[2], seconds=0.1, claimed_motion=shifted(0.2), found_motion=shifted(0.2))
     assert spans([*checks[:2], brief, *told[3:5], *checks[5:]]) == []
 
 
 def test_directions_that_empty_while_the_poses_stand_raise_an_alert() -> None:
     checks = checks_of([0.0] * 8)
-    assert spans([replace(check, emptied=0.1) for check in checks]) == []
-    assert spans([replace(check, emptied=0.4 if k > 3 else 0.0) for k, check in enumerate(checks)]) == [(21, 40)]
+    assert spans([replace(check, emptied_share=0.1) for check in checks]) == []
+    assert spans([replace(check, emptied_share=0.4 if k > 3 else 0.0) for k, check in enumerate(checks)]) == [(21, 40)]
 
 
 def test_poses_that_jump_raise_an_alert_without_any_check() -> None:

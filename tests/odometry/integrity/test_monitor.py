@@ -100,7 +100,7 @@ def test_scans_that_lie_far_apart_are_compared_within_reach_and_not_from_the_cla
     assert [(check.first, check.last) for check in monitor.checks] == [(0, 1), (1, 3), (3, 5)]
     for check in monitor.checks:
         moved = se3.relative(true[4 * check.first], true[4 * check.last])
-        np.testing.assert_allclose(check.found[:3, 3], moved[:3, 3], atol=0.1)
+        np.testing.assert_allclose(check.found_motion[:3, 3], moved[:3, 3], atol=0.1)
         assert check.is_conclusive
         assert check.agreement > 2 * check.claimed_agreement
 
@@ -149,7 +149,7 @@ def test_a_truck_that_drives_off_leaves_standing_and_moving_open() -> None:
     assert len(late) == 4
     for check in late:
         assert check.rival is not None
-        assert abs(check.found[0, 3] - check.claimed[0, 3]) < 0.02
+        assert abs(check.found_motion[0, 3] - check.claimed_motion[0, 3]) < 0.02
         assert abs(check.rival[0, 3]) < 0.02
     stamps_ns = 100_000_000 * np.arange(count, dtype=np.int64)
     (alert,) = alerts(monitor.checks, np.column_stack([-ahead, np.zeros(count), np.zeros(count)]), stamps_ns)
