@@ -51,7 +51,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for study in studies:
             for result in swept(study, seeds, args.runs or Path(scratch)):
-                rows += [[study, v.text, v.outcome, v.measured] for v in result.verdicts]
+                rows += [[study, v.text, v.outcome, v.numbers] for v in result.verdicts]
     scenes = {place.scenario for study in studies for place in find_study(study).sequences}
     caption = (
         f"Girolimetto's presets on the simulated flight `{', '.join(sorted(scenes))}`, {tables.seeds_named(seeds)}. A "
