@@ -181,9 +181,9 @@ def test_a_recording_that_begins_without_features_begins_with_the_first_scan_tha
 
 @pytest.mark.parametrize("method", ["loam-odom", "loam", "floam"])
 def test_few_features_are_helped_by_less_planar_points(method: str) -> None:
-    """One region with two edges and one planar point per ring: too few to decide a pose; the scan says who stood in."""
+    """One region with one edge and one planar point per ring: too few to decide a pose; the scan says who stood in."""
     scans, truth = street()
-    results = Driver(method, regions=1, max_planar_points=1).drive(scans[:20])
+    results = Driver(method, regions=1, max_edge_points=1, max_planar_points=1).drive(scans[:20])
     assert all(r.status == "ok" for r in results)
     assert all(r.posed_by == LessPlanar.name for r in results[1:])
     assert ate(poses_of(results), truth[:20]) < GATES[method]
@@ -254,7 +254,7 @@ def test_the_motion_within_a_sweep_is_taken_out(method: str) -> None:
 def test_options_act_as_they_are_named() -> None:
     scan = street()[0][10]
     default = Driver("loam").loam.prepare(scan)
-    more = Driver("loam", regions=12, max_planar_points=8).loam.prepare(scan)
+    more = Driver("loam", max_edge_points=4, max_planar_points=8).loam.prepare(scan)
     assert len(more.edges) > len(default.edges)
     assert len(more.planes) > 1.5 * len(default.planes)
     coarse = Driver("loam", grid_step=1.5).loam.prepare(scan)

@@ -48,7 +48,7 @@ def test_a_run_saves_its_feature_map(method: str, tmp_path: Path) -> None:
 
 
 def test_stand_ins_are_counted(tmp_path: Path) -> None:
-    few = ["loam.regions=1", "loam.max_planar_points=1"]
+    few = ["loam.regions=1", "loam.max_edge_points=1", "loam.max_planar_points=1"]
     config = load_config(
         None,
         ["odometry.method=floam", "map.write=false", "report.html=false", "recovery.fallback=all-points", *few],
