@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
-from lslam.core.geometry import normal_equations as window_equations
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio2 import FastLio2
 from lslam.odometry.icp import registration_of
 from lslam.odometry.inertial.initialise import InertialStart
+from lslam.odometry.inertial.window import warm_up_solver
 from lslam.odometry.inertial.window_motion import WindowMotion
 from lslam.registration.optimiser import normal_equations
 from lslam.registration.preprocessing.prepare import PreparedPoints
@@ -94,7 +94,7 @@ class LioMapping(FastLio2):
     def warm_up(self) -> None:
         """As of `icp`, and a small window, which the motion model solves."""
         super().warm_up()
-        window_equations.warm_up()
+        warm_up_solver()
 
     def restart(self) -> None:
         """An empty map, and no scan that waits for it."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from lslam.core.config.config import Config
 from lslam.core.errors import UsageError
-from lslam.core.geometry import noise, normal_equations, se3
+from lslam.core.geometry import noise, se3
 from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import SweepLink
@@ -20,6 +20,7 @@ from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
 from lslam.odometry.inertial.linked_motion import LinkedMotion
+from lslam.odometry.inertial.window import warm_up_solver
 from lslam.odometry.plane_factors import SHARED, sighting_residuals
 from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
 from lslam.odometry.plane_window import PlaneWindow, associate
@@ -116,7 +117,7 @@ class Lips(Traits, Stateful):
     def warm_up(self) -> None:
         """Extract the planes of a small room, and solve a small window."""
         self._extractor.extract(small_room())
-        normal_equations.warm_up()
+        warm_up_solver()
 
     def _predicted(self, link: SweepLink) -> PlaneWindow:
         """The window with one more state where the IMU leads, or its first."""

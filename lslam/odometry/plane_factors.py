@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lslam.core.geometry import se3, so3
-from lslam.core.geometry.normal_equations import Normal
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry import closest_point
+from lslam.odometry.inertial.window import Normal
 
 # An update: gravity and the gyroscope's axes, which all states share; each state; each plane.
 SHARED, STATE_SIZE, PLANE_SIZE = 12, 15, 3

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lslam.core.geometry import se3
-from lslam.core.geometry.normal_equations import Normal
 from lslam.core.kernels import linalg
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
 from lslam.odometry import closest_point
+from lslam.odometry.inertial.window import Normal
 from lslam.odometry.plane_factors import (
     ORDER,
     PLANE_SIZE,

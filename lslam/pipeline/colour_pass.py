@@ -13,7 +13,7 @@ import numpy as np
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import portable, se3
-from lslam.core.geometry.continuous_motion import ContinuousMotion
+from lslam.core.geometry.se3 import ContinuousMotion
 from lslam.core.stopping import asking
 from lslam.core.types.arrays import Floats
 from lslam.core.types.camera import Camera, cameras_of

@@ -16,7 +16,6 @@ import lslam
 from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry import se3
-from lslam.core.geometry.normal_equations import Normal
 from lslam.core.kernels import linalg
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.motion_prior import MotionPrior
@@ -30,6 +29,7 @@ from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.constant_velocity import middle_of
 from lslam.odometry.inertial.linked_motion import LinkedMotion
+from lslam.odometry.inertial.window import Normal
 from lslam.odometry.lips import Lips
 from lslam.odometry.scan_outcome import fault
 from lslam.simulation.scenarios import simulate

@@ -7,6 +7,7 @@ T' = exp(xi) T, so a covariance of xi is expressed in the parent frame.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from lslam.core.geometry import portable, so3
 
 Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
 
 
 def make(R: NDArray[Any], t: NDArray[Any]) -> Floats:
@@ -180,3 +182,38 @@ def umeyama(source: NDArray[Any], target: NDArray[Any], with_scale: bool = False
     variance = float(((a - mean_a) ** 2).sum() / len(a))
     scale = float(np.trace(np.diag(d) @ s)) / variance if with_scale and variance > 0 else 1.0
     return make(R, mean_b - scale * R @ mean_a), scale, determined
+
+
+class ContinuousMotion:
+    """Motion through poses by cubic splines, in rotation those of Kang and Park (1999).
+
+    A straight line between two poses would cut the swing of a hand: at 2 Hz and 10 scans a second by a fifth.
+
+    stretches : stamps (N,), ns, increasing, and poses (N, 4, 4), N >= 2, of each; shorter ones are left out. Nothing is known
+        between two of them
+    """
+
+    def __init__(self, stretches: Iterable[tuple[Stamps, Floats]]) -> None:
+        from scipy.interpolate import CubicSpline
+        from scipy.spatial.transform import Rotation, RotationSpline
+
+        self._parts = []
+        for stamps, poses in stretches:
+            if len(stamps) < 2:
+                continue
+            seconds = 1e-9 * (stamps - stamps[0])
+            turning = RotationSpline(seconds, Rotation.from_matrix(poses[:, :3, :3]))
+            self._parts.append((stamps, CubicSpline(seconds, poses[:, :3, 3]), turning))
+
+    def at(self, stamps_ns: Stamps) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+        """Poses (K, 4, 4) and turning rates (K,), rad/s, at `stamps_ns` (K,), and whether a stretch covers the instant."""
+        poses, rates = np.tile(np.eye(4), (len(stamps_ns), 1, 1)), np.zeros(len(stamps_ns))
+        within = np.zeros(len(stamps_ns), np.bool_)
+        for stamps, path, turning in self._parts:
+            inside = (stamps_ns >= stamps[0]) & (stamps_ns <= stamps[-1])
+            if inside.any():
+                seconds = 1e-9 * (stamps_ns[inside] - stamps[0])
+                poses[inside] = make(turning(seconds).as_matrix(), path(seconds))
+                rates[inside] = np.linalg.norm(turning(seconds, 1), axis=1)
+            within |= inside
+        return poses, rates, within

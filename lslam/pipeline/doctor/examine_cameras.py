@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lslam.core.config import Config
 from lslam.core.errors import InputError
 from lslam.core.geometry import portable, se3
-from lslam.core.geometry.continuous_motion import ContinuousMotion
+from lslam.core.geometry.se3 import ContinuousMotion
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.camera import Camera, Image, cameras_of
 from lslam.core.types.motion_prior import MotionPrior

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lslam.core.geometry import se3, so3
-from lslam.core.geometry.continuous_motion import ContinuousMotion
+from lslam.core.geometry.se3 import ContinuousMotion
 from lslam.core.types.camera import Camera, Lens
 from lslam.core.types.scan import Scan
 from lslam.pipeline.doctor import Finding

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lslam.core.geometry.normal_equations import Normal
 from lslam.core.kernels import linalg
+from lslam.odometry.inertial.window import Normal
 
 
 def test_marginalising_a_linear_problem_leaves_its_solution_and_covariance() -> None:
