@@ -30,7 +30,7 @@ from lslam.simulation.scenarios import SimulatedDrive
 if TYPE_CHECKING:
     from made_once import MadeOnce
 
-pytest_plugins = ["made_once", "perturbed_scans", "shared_starts", "tiers"]
+pytest_plugins = ["made_once", "perturbed_scans", "shared_odometry", "shared_starts", "tiers"]
 compile_once()
 
 # How long an example takes is the machine's affair.
@@ -108,11 +108,13 @@ TOWNS, SCANS, STARTS = Towns(), TracedScans(), SoughtStarts()
 
 
 @pytest.fixture(scope="module", autouse=True)
-def shared_towns(request: pytest.FixtureRequest) -> Iterator[None]:
+def shared_towns(request: pytest.FixtureRequest, made_once: MadeOnce) -> Iterator[None]:
     """Towns are built once, and a drive traces its scans once, for all tests but those of the simulator.
 
     A module's own `SHARES_TOWNS` says otherwise: what measures memory must not hold the scans that others may ask for.
     """
+    TOWNS.folder = made_once.folder / "towns"
+    TOWNS.folder.mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         if getattr(request.module, "SHARES_TOWNS", request.path.parent.name != "simulation"):
             patch.setattr("lslam.simulation.built_scenario._city", TOWNS.city)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from shared_towns import HELD, Towns, TracedScans
@@ -30,6 +32,27 @@ def test_a_shared_town_is_the_one_that_is_built_anew(monkeypatch: pytest.MonkeyP
     held = simulate("block", seed=1, count=5)
     assert held.scene is simulate("block", seed=1, count=2, lidar="vlp16").scene
     assert held.city is not simulate("block", seed=0).city
+
+
+def test_a_town_that_another_worker_built_is_read_from_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shared_towns.KEPT_S", 0.0)
+
+    def scan(towns: Towns) -> bytes:
+        monkeypatch.setattr(built_scenario, "_city", towns.city)
+        monkeypatch.setattr(scenarios, "RayScene", towns.scene)
+        return simulate("block", count=2).scan(1).points.tobytes()
+
+    first, second = Towns(tmp_path), Towns(tmp_path)
+    built = scan(first)
+    assert len(list(tmp_path.iterdir())) == 1
+
+    def build_anew(*_: object) -> None:
+        raise AssertionError("it lies in its file")
+
+    monkeypatch.setattr(second, "_build", build_anew)
+    assert scan(second) == built
 
 
 def test_a_scan_that_is_kept_is_the_one_of_its_drive() -> None:

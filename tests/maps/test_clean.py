@@ -22,7 +22,6 @@ from lslam.simulation.scenarios import simulate
 @pytest.mark.parametrize(
     ("scenario", "sensor", "count"),
     [
-        ("motorway", None, 30),
         ("walk", None, 30),
         ("motorway", "os1-32", 55),
         ("walk", "vlp16", 50),

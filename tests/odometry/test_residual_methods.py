@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from drives import ate, coasting, drive, nees_per_dof, poses_of, standing
@@ -18,6 +20,7 @@ GATES: dict[Residual, tuple[float, float]] = {
 }  # fmt: skip
 
 
+@cache
 def results_of(residual: Residual, scenario: tuple[str, int, int, str]) -> tuple[list[RegistrationResult], float]:
     d = drive(*scenario[:3], lidar=scenario[3])
     registration = Registration(RegistrationConfig(residual=residual))

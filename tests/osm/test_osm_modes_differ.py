@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shared_odometry import SharedOdometry
 from wrong_maps import MODES, OFF, SHIFT, Found, on
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.core.types.scan_result import MotionCheck, ScanResult
-from lslam.core.types.trajectory import Keyframe
-from lslam.odometry.frontend.keyframing import Keyframing
-from lslam.odometry.frontend.register_scans import estimate
-from lslam.odometry.integrity.monitor import IntegrityMonitor
+from lslam.core.config import Config
+from lslam.core.types.arrays import Floats
+from lslam.io.formats.osm_buildings import BuildingExtract
+from lslam.osm import hold
+from lslam.osm.location import Located, locate
 from lslam.pipeline import odometry_pass
 
 # Half as many keyframes: what is common to the map shows as well; of single houses each needs all that saw it.
@@ -23,30 +24,29 @@ SPARSE = ("keyframes.distance=4",)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def shared_odometry() -> Iterator[None]:
-    """Runs of the same scans whose configurations differ in the section `osm` alone share the results of odometry."""
-    held: dict[str, tuple[list[ScanResult], KeyframeStore, list[Keyframe], list[MotionCheck]]] = {}
+def shared_steps(held_odometry: SharedOdometry) -> Iterator[None]:
+    """Runs that differ in the mode alone have the same odometry, and match its keyframes with the map in the same way.
 
-    def once(*given: Any, keyframing: Keyframing, monitor: IntegrityMonitor, **more: Any) -> list[ScanResult]:
-        sequence = given[0]
-        scans = hash((sequence.stamps_ns.tobytes(), sequence.scan(0).points.tobytes()))
-        key = f"{scans} {keyframing._config.model_dump_json(exclude={'osm'})}"
+    Not so in mode `rigid` unless the start is held, as it is in all of these runs.
+    """
+    held: dict[tuple[str, bytes], Located] = {}
+
+    def once(
+        extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config,
+        placed: Floats | None, odometry: Floats | None = None, clocks: Any = None,
+    ) -> Located:  # fmt: skip
+        assert up is None
+        assert placed is None
+        assert config.osm.hold_start
+        poses = np.stack([k.T_world_lidar for k in store.keyframes]) if odometry is None else odometry
+        key = config.model_dump_json(exclude={"osm": {"mode"}}), poses.tobytes()
         if key not in held:
-            results = estimate(*given, keyframing=keyframing, monitor=monitor, **more)
-            keyframing.settle()
-            held[key] = list(results), keyframing.store, list(keyframing.store.keyframes), list(monitor.checks)
-            return results
-        results, store, keyframes, checks = held[key]
-        monitor.checks.extend(checks)
-        for keyframe in keyframes:
-            keyframing.store.add(keyframe, store.points(keyframe.number))
-        keyframing.settle()
-        for result in results:
-            more["on_scan"](result)
-        return list(results)
+            held[key] = locate(extract, store, up, config, placed, odometry, clocks)
+        return held[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(odometry_pass, "estimate", once)
+        patch.setattr(odometry_pass, "estimate", held_odometry.estimate)
+        patch.setattr(hold, "locate", once)
         yield
 
 

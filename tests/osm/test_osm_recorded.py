@@ -18,6 +18,7 @@ from lslam.io.readers import open_sequence
 PLACE, POINT = np.array([59.348268650, 18.073204280, 0.0]), np.array([64.3932532565158, 66.4832330946657, 38.514])
 
 
+@pytest.mark.usefixtures("shared_odometry")
 @pytest.mark.parametrize("wrong", [(2.5, -1.7, 10.0), (-2.0, 2.2, -10.0), (-0.4, 3.0, -10.0), (-2.5, -1.5, 0.0)])
 def test_from_a_start_3_m_and_10_deg_off_it_ends_where_it_was(
     wrong: tuple[float, float, float], recordings: Callable[[str], Path]
@@ -27,7 +28,8 @@ def test_from_a_start_3_m_and_10_deg_off_it_ends_where_it_was(
     A pose of the ground truth belongs to the end of its sweep, one of the run to the start, where the sweep before ended.
     """
     folder = recordings("mcd_kth_day_06") / "mcd_kth_day_06"
-    sequence = open_sequence(folder)
+    # What a run finds out by itself: tests/pipeline/test_point_times.py.
+    sequence = open_sequence(folder, point_times="columns")
     truth = sequence.ground_truth
     assert truth is not None
     real = truth.poses.copy()

@@ -38,6 +38,7 @@ def drive(request: pytest.FixtureRequest) -> Sequence:
     return simulate("small-eight", seed=request.param, lidar="vlp16", count=60)
 
 
+@pytest.mark.usefixtures("shared_odometry")
 def test_drift_is_undone_without_a_loop(drive: Sequence) -> None:
     assert drive.ground_truth is not None
     truth = drive.ground_truth.poses
@@ -51,6 +52,7 @@ def test_drift_is_undone_without_a_loop(drive: Sequence) -> None:
     assert f"60 scans: planes of the points kept out {facts['thickness_mm']} mm thick" in summary(after, None)
 
 
+@pytest.mark.usefixtures("shared_odometry")
 def test_poses_that_no_plane_contradicts_do_not_get_worse(drive: Sequence) -> None:
     assert drive.ground_truth is not None
     truth = drive.ground_truth.poses
@@ -60,6 +62,7 @@ def test_poses_that_no_plane_contradicts_do_not_get_worse(drive: Sequence) -> No
     assert ate(after.trajectory.poses, truth) < 1.02 * ate(before.trajectory.poses, truth) + 1e-4
 
 
+@pytest.mark.usefixtures("shared_odometry")
 @pytest.mark.parametrize("seed", [33, 34])
 def test_fixes_hold_the_place_while_planes_undo_the_drift(seed: int) -> None:
     """Odometry drifts by 4 %, fixes err by a centimetre: planes alone would leave it farther off than it was."""
@@ -78,6 +81,7 @@ def test_fixes_hold_the_place_while_planes_undo_the_drift(seed: int) -> None:
     assert errors[1] < 0.85 * errors[0]
 
 
+@pytest.mark.usefixtures("shared_odometry")
 def test_without_points_in_range_the_run_says_so(drive: Sequence) -> None:
     beyond = ("map.range_min=500", "map.range_max=600", "map.occupancy_range=600")
     before, after = (made(drive, *beyond, f"graph.refine={refine}").record for refine in ("false", "true"))

@@ -64,12 +64,15 @@ def in_degrees(stub: Stub) -> Stub:
     return replace(stub, imu=replace(stub.imu, gyro=np.rad2deg(stub.imu.gyro)))
 
 
-@pytest.mark.parametrize("method", ["icp", "fast-lio2"])
+# Units and samples that are no numbers are set right before any method has them.
 @pytest.mark.parametrize(
-    ("fault", "sentence"),
+    ("fault", "sentence", "method"),
     [
-        (silent, "gaps of the IMU"), (not_finite, "samples are not finite"), (late, "IMU stamps moved by -2"),
-        (turned, "beside that of the scans: correct T_lidar_imu"), (in_g, "is in g, converted"),
+        (silent, "gaps of the IMU", "icp"), (silent, "gaps of the IMU", "fast-lio2"),
+        (late, "IMU stamps moved by -2", "icp"), (late, "IMU stamps moved by -2", "fast-lio2"),
+        (turned, "beside that of the scans: correct T_lidar_imu", "icp"),
+        (turned, "beside that of the scans: correct T_lidar_imu", "fast-lio2"),
+        (not_finite, "samples are not finite", "icp"), (in_g, "is in g, converted", "fast-lio2"),
     ],
 )  # fmt: skip
 def test_a_fault_is_reported_and_the_run_is_followed(fault: Callable[[Stub], Stub], sentence: str, method: str) -> None:
