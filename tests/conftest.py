@@ -24,7 +24,7 @@ from sought_starts import SoughtStarts
 
 from lslam.core.errors import InputError
 from lslam.core.extras import importing_open3d
-from lslam.registration.start_search import best_by_non_ground
+from lslam.registration.policies import best_by_non_ground
 from lslam.simulation.scenarios import SimulatedDrive
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def shared_starts(request: pytest.FixtureRequest, made_once: MadeOnce) -> Iterat
     STARTS.folder.mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         if request.path.parent.name != "registration":
-            patch.setattr("lslam.registration.start_search.best_by_non_ground", STARTS.best_by_non_ground)
+            patch.setattr("lslam.registration.policies.best_by_non_ground", STARTS.best_by_non_ground)
         yield
 
 
@@ -138,7 +138,7 @@ def shared_starts(request: pytest.FixtureRequest, made_once: MadeOnce) -> Iterat
 def starts_sought_anew(shared_starts: None) -> Iterator[None]:
     """Nothing of an earlier run is taken: for the repetition that must give the same bytes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lslam.registration.start_search.best_by_non_ground", best_by_non_ground)
+        patch.setattr("lslam.registration.policies.best_by_non_ground", best_by_non_ground)
         yield
 
 

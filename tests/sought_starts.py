@@ -9,8 +9,8 @@ from pathlib import Path
 from threading import get_ident
 
 from lslam.registration.attempt import Attempt
+from lslam.registration.policies import best_by_non_ground
 from lslam.registration.result import RegistrationResult
-from lslam.registration.start_search import best_by_non_ground
 from lslam.registration.voxel_target import VoxelTarget
 
 
@@ -25,20 +25,20 @@ class SoughtStarts:
         self.folder = Path()
 
     def best_by_non_ground(
-        self, attempt: Attempt, result: RegistrationResult, *, is_lost: bool = False
+        self, attempt: Attempt, result: RegistrationResult, *, may_be_anywhere: bool = False
     ) -> RegistrationResult:
         """As the function of this name; the result itself where that found nothing better."""
         target = attempt.target
         if type(target) is not VoxelTarget:
-            return best_by_non_ground(attempt, result, is_lost=is_lost)
+            return best_by_non_ground(attempt, result, may_be_anywhere=may_be_anywhere)
         given = (
             attempt.config, target.config, target.preprocess, target.state(), attempt.history.state(), attempt.points,
-            attempt.T_prior, attempt.is_near, result, is_lost,
+            attempt.T_prior, attempt.is_near, result, may_be_anywhere,
         )  # fmt: skip
         key = hashlib.sha256(pickle.dumps(given)).hexdigest()
         path = self.folder / key
         if not path.exists():
-            found = best_by_non_ground(attempt, result, is_lost=is_lost)
+            found = best_by_non_ground(attempt, result, may_be_anywhere=may_be_anywhere)
             part = path.with_suffix(f".{os.getpid()}-{get_ident()}")
             part.write_bytes(pickle.dumps(None if found is result else found))
             part.replace(path)

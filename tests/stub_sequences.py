@@ -19,8 +19,8 @@ from lslam.core.types.sequence import Calibration, Sequence, StatedTimes
 from lslam.core.types.trajectory import Trajectory
 from lslam.io.readers import open_sequence
 from lslam.odometry.base import Traits
-from lslam.odometry.frontend.segments import Tracked
-from lslam.odometry.frontend.tracker import Loaded
+from lslam.odometry.frontend.segments import TrackedScan
+from lslam.odometry.frontend.tracker import ScanInput
 from lslam.odometry.frontend.windows import WindowTracker
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data"
@@ -66,7 +66,7 @@ class Stub:
         return entry
 
 
-def decided_by(windows: WindowTracker, loaded: Iterable[Loaded | None]) -> Iterator[list[Tracked]]:
+def decided_by(windows: WindowTracker, loaded: Iterable[ScanInput | None]) -> Iterator[list[TrackedScan]]:
     """The scans that are decided with each of the next ones, None at the end of the recording."""
     for one in loaded:
         windows.open(one)

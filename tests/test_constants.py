@@ -28,8 +28,8 @@ def test_what_was_halved_and_doubled_is_on_a_scans_path() -> None:
 
 
 def test_a_share_is_changed_by_what_it_lacks_and_a_cosine_by_its_angle() -> None:
-    assert eval(constants.changed("FORGETTING_FACTOR", "registration/robust.py", "0.8", 0.5)) == 0.9
-    assert eval(constants.changed("MUCH_RATIO", "registration/start_search.py", "1.1", 2.0)) == 1.2000000000000002
+    assert eval(constants.changed("FORGETTING_FACTOR", "registration/history.py", "0.8", 0.5)) == 0.9
+    assert eval(constants.changed("MUCH_RATIO", "registration/policies.py", "1.1", 2.0)) == 1.2000000000000002
     source = "A, B = 1.5, 3\n\n\nclass C:\n    D = (2, 4)\n"
     for name, half in {"A": "A, B = (0.5 * (1.5)), 3", "B": "A, B = 1.5, 2", "C.D": "    D = (1, 2)"}.items():
         assert half in constants.edited(source, constants.Number("x/y.py", name, "points"), 0.5).splitlines()

@@ -24,8 +24,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Keyframe
-from lslam.registration.preprocessing.ground import GROUND_TOLERANCE_M, Z, levelling, up_of
-from lslam.registration.preprocessing.up import NEAR_Z
+from lslam.registration.preprocessing.ground import GROUND_TOLERANCE_M, NEAR_Z, Z, levelling, up_of
 
 log = logging.getLogger("lslam")
 

@@ -15,7 +15,7 @@ from lslam.cli.console import progress, setup_logging, show
 from lslam.cli.one_run import arguments_of, read_truth
 from lslam.core.errors import UsageError
 from lslam.core.machine import rarely_collecting
-from lslam.registration.residuals import RESIDUALS, residual_named
+from lslam.registration.residuals import RESIDUALS, find_residual
 
 if TYPE_CHECKING:
     from lslam.core.config import Config
@@ -187,7 +187,7 @@ def _flags(given: dict[str, Any]) -> dict[str, Any]:
     if given["method"] is not None:
         require_method(given["method"])
     if given["residual"] is not None:
-        residual_named(given["residual"])
+        find_residual(given["residual"])
     flags = {
         "odometry.method": given["method"],
         "eval.metrics": json.dumps(options.metrics_of(given["metrics"])) if given["metrics"] else None,

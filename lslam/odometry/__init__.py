@@ -30,7 +30,7 @@ METHODS = {
         "tightly coupled with the IMU: edges, planes and prior in one iterated Kalman filter (Xu 2021); needs an IMU",
     ),
     "fast-lio2": (
-        "lslam.odometry.fast_lio2",
+        "lslam.odometry.fast_lio",
         "tightly coupled with the IMU: points and prior in one iterated Kalman filter (Xu 2022); needs an IMU",
     ),
     "lio-sam": (
@@ -53,7 +53,7 @@ METHODS = {
     "loam-odom": ("lslam.odometry.loam", "edges and planar points, scan to scan: LOAM without its map"),
     "loam": ("lslam.odometry.loam", "LOAM: scan to scan, then refined on the feature map at every scan"),
     "floam": ("lslam.odometry.loam", "F-LOAM: motion prior, then scan to feature map in one stage"),
-    "lego-loam": ("lslam.odometry.lego_loam", "LeGO-LOAM: ground, clusters, two steps scan to scan, then feature map"),
+    "lego-loam": ("lslam.odometry.loam", "LeGO-LOAM: ground, clusters, two steps scan to scan, then feature map"),
     "loam-livox": (
         "lslam.odometry.loam_livox",
         "LOAM for Livox and other patterns without rings: by pieces of the sweep to the feature map (Lin 2020)",

@@ -1,16 +1,21 @@
-"""What every odometry method offers the front end."""
+"""What every odometry method offers the front end, and how one does that registers on a map of earlier scans."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from dataclasses import replace
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanEquations, ScanResult
-from lslam.core.types.state import State
+from lslam.core.types.state import State, Stateful
+from lslam.odometry.scan_outcome import to_scan_result
+from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.preprocessing.features import Features
+from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
 
 
@@ -97,7 +102,7 @@ class Deskewing(Method, Protocol):
 
 
 @runtime_checkable
-class Windowed(Deskewing, Protocol):
+class WindowMethod(Deskewing, Protocol):
     """A method whose scans stay open while a motion model estimates their poses together."""
 
     def equations(self, stamp_ns: int, result: RegistrationResult) -> tuple[ScanEquations, ...]:
@@ -127,3 +132,45 @@ class Resumable(Method, Protocol):
     def restore(self, state: State) -> None:
         """Go on where `state` was taken, in an object made by the same configuration."""
         ...
+
+
+class MapMethod(Traits, Stateful):
+    """Adapter from scans and motion priors to `Registration`.
+
+    is_scan_to_scan : whether the map is of the last scan alone
+    """
+
+    is_searching = True
+    STATE: ClassVar[tuple[str, ...]] = ("registration", "_uncertainty")
+
+    def __init__(self, registration: Registration, *, is_scan_to_scan: bool) -> None:
+        self.registration, self._is_scan_to_scan = registration, is_scan_to_scan
+        self._uncertainty = self._fresh_uncertainty()
+
+    @property
+    def map_age(self) -> float:
+        """Mean age, in scans, of the points of the map."""
+        return self._uncertainty.map_age
+
+    def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
+        """Enter the scan into the map where its result puts it."""
+        began = time.perf_counter()
+        result = self.insert(scan.stamp_ns, prior, result)
+        record = to_scan_result(scan, result, *self._uncertainty.covariances(result, scan.stamp_ns, prior))
+        return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
+
+    def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
+        """Enter a scan that was registered from `prior` into the map; the result says whether the sensor is at rest."""
+        return self.registration.update(result)
+
+    def information_of(self, prior: MotionPrior) -> Floats | None:
+        """(6, 6) information of the prior for the normal equations; None, since it is the initial guess only."""
+        return None
+
+    def restart(self) -> None:
+        """An empty map."""
+        self.registration = self.registration.fresh()
+        self._uncertainty = self._fresh_uncertainty()
+
+    def _fresh_uncertainty(self) -> PoseUncertainty:
+        return PoseUncertainty(is_scan_to_scan=self._is_scan_to_scan)

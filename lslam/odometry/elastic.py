@@ -1,6 +1,9 @@
 """Elastic registration: the poses at the begin and at the end of a sweep in one estimate (CT-ICP).
 
-Dellenbach et al. 2022, sections III-A to III-C.
+Dellenbach et al. 2022, sections III-A to III-C. A sweep is held to the last one by location consistency and constant velocity,
+each as surely as it lately held. A spinning sensor sees every direction at the same share of each sweep. A map that was begun
+with wrong motion within the sweep is skewed from direction to direction, and all sweeps registered on it agree with that error:
+it is one more unknown.
 """
 
 from __future__ import annotations
@@ -11,20 +14,118 @@ from itertools import pairwise
 
 import numpy as np
 
-from lslam.core.geometry import so3
+from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.odometry.elastic_constraints import ElasticConstraints, ElasticSweep
+from lslam.registration.alignment import voxel_terms
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import STEP_M, STEP_RAD, Correspondences, Term
+from lslam.registration.optimiser import STEP_M, STEP_RAD, Annealing, Correspondences, Term, pose_change
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, subset
-from lslam.registration.residuals import residual_named
+from lslam.registration.residuals import find_residual
 from lslam.registration.result import LEAST_MATCHED, RegistrationResult
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import voxel_terms
+
+
+@dataclass(frozen=True)
+class ElasticSweep:
+    """Poses (4, 4) at the begin and the end of a sweep, translation linear and rotation along the geodesic between them.
+
+    times : (K,) s from the stamp; bend : (K, 4, 4) by which the motion departs from that, in the sensor's axes at each time:
+    what an IMU felt; None: nothing
+    """
+
+    begin: Floats
+    end: Floats
+    times: Floats
+    bend: Floats | None = None
+
+    @classmethod
+    def of(cls, prior: MotionPrior) -> ElasticSweep:
+        """Through both ends of the prior, with its bend where that was felt."""
+        straight = cls(prior.poses[0], prior.poses[-1], prior.times)
+        if not prior.is_bent:
+            return straight
+        return cls(straight.begin, straight.end, prior.times, se3.relative(straight.poses, prior.poses))
+
+    @property
+    def shares(self) -> Floats:
+        """(K,) of the sweep, 0 to 1."""
+        return np.asarray((self.times - self.times[0]) / (self.times[-1] - self.times[0]))
+
+    @property
+    def poses(self) -> Floats:
+        """(K, 4, 4) T_world_lidar at `times`."""
+        shares = self.shares[:, None]
+        turn = so3.log(self.begin[:3, :3].T @ self.end[:3, :3])
+        t = (1.0 - shares) * self.begin[:3, 3] + shares * self.end[:3, 3]
+        straight = se3.make(self.begin[:3, :3] @ so3.exp(shares * turn), t)
+        return straight if self.bend is None else straight @ self.bend
+
+    @property
+    def prior(self) -> MotionPrior:
+        """The same as a motion over the sweep."""
+        return MotionPrior(self.times, self.poses)
+
+    def move(self, d: Floats) -> ElasticSweep:
+        """Both ends by d (2, 6): t' = t + d[:3], R' = exp(d[3:]) R."""
+        begin, end = (
+            se3.make(so3.exp(step[3:]) @ pose[:3, :3], pose[:3, 3] + step[:3])
+            for step, pose in zip(d, (self.begin, self.end), strict=True)
+        )
+        return ElasticSweep(se3.normalise(begin), se3.normalise(end), self.times, self.bend)
+
+
+# m and rad, what registration cannot tell from none of the map's skew, the mean of many scans.
+LEAST_SKEW = 1e-4
+NOTHING: Floats = np.zeros((6, 6))
+
+
+@dataclass(frozen=True)
+class ElasticConstraints:
+    """What is known of a sweep before its points are looked at; information (6, 6) in world axes.
+
+    expected, location : where it begins, and of that; velocity : of the motion within it being that since the middle of the
+        last one; since : the sweep's part of the time since then
+    skew, skew_information : (6,) motion from begin to end that the sweeps lack which the map was made of, and of that
+    """
+
+    expected: ElasticSweep
+    location: Floats
+    velocity: Floats
+    since: float
+    skew: Floats
+    skew_information: Floats
+
+    @classmethod
+    def of_course(cls, prior: MotionPrior) -> ElasticConstraints:
+        """Of a sweep whose motion later scans told as well: the map that they made has no skew."""
+        assert prior.change is not None
+        fixed = np.eye(6) / LEAST_SKEW**2
+        return cls(ElasticSweep.of(prior), NOTHING, inverse(prior.change), 0.0, np.zeros(6), fixed)
+
+    def add_to(self, A: Floats, b: Floats, sweep: ElasticSweep) -> None:
+        """Add all to the normal equations (18, 18), (18,) of begin, end and skew, in place.
+
+        Location consistency and constant velocity: Dellenbach et al. 2022, section III-B.
+        """
+        begin, end = pose_change(sweep.begin, self.expected.begin), pose_change(sweep.end, self.expected.end)
+        # The middle is half of both ends.
+        steady = (-1.0 - self.since / 2, 1.0 - self.since / 2, 0.0)
+        for W, signs in (
+            (self.location, (1.0, 0.0, 0.0)),
+            (self.velocity, steady),
+            (self.skew_information, (0.0, 0.0, 1.0)),
+        ):
+            b += np.kron(signs, W @ (signs[0] * begin + signs[1] * end - signs[2] * self.skew))
+            A += np.kron(np.outer(signs, signs), W)
+
+
+def inverse(covariance: Floats) -> Floats:
+    """The information of a covariance, or the other way round."""
+    return np.asarray(np.linalg.inv(covariance), np.float64)
+
 
 # Parts of a sweep whose points are linearised together. Within an eighth, what a point tells of begin and end differs from
 # the mean of its part by 1/28 rms: of the information 2 % are lost, and nothing is biased.
@@ -56,7 +157,7 @@ class SweepPoints:
         bounds = np.linspace(0, len(order), SWEEP_PARTS + 1).round().astype(int)
         self.parts = [slice(a, b) for a, b in pairwise(bounds.tolist())]
         self.matches = [Correspondences(part.stop - part.start) for part in self.parts]
-        kind = residual_named("plane")
+        kind = find_residual("plane")
         self._terms: list[list[Term]] = [
             voxel_terms(kind, (self._moved[part], self.points.scatter[part]), levels, matches, sigma, blob_weight)
             for part, matches in zip(self.parts, self.matches, strict=True)
@@ -116,7 +217,7 @@ def register_elastic(
             break
         move, turn = (float(np.linalg.norm(d[:, part], axis=1).max()) for part in (slice(0, 3), slice(3, 6)))
         d *= min(1.0, 2.0 * max(scale, 0.5) / max(move, 1e-12))
-        sweep = sweep.moved(d)
+        sweep = sweep.move(d)
         converged = scale <= annealing.end and move < STEP_M and turn < STEP_RAD
         scale = max(scale * annealing.decay, annealing.end)
     at_stamp = np.hstack([(1.0 - passed) * np.eye(6), passed * np.eye(6)])
@@ -158,20 +259,20 @@ def _of_ends_and_skew(H: Floats, g: Floats, shares: Floats) -> tuple[Floats, Flo
     return A, np.einsum("ka,ki->ai", weights, g).ravel()
 
 
-def _scaled(lever: float) -> Floats:
+def _scale(lever: float) -> Floats:
     return np.array([1.0, 1.0, 1.0, 1.0 / lever, 1.0 / lever, 1.0 / lever])
 
 
-def _weak(H: Floats, lever: float, needed: float) -> Floats:
+def _weak(H: Floats, lever: float, least: float) -> Floats:
     """(K, 6) directions of the sweep as a whole of which H (6, 6) tells less than `needed`, rotations scaled by `lever`."""
-    scale = _scaled(lever)
+    scale = _scale(lever)
     values, vectors = np.linalg.eigh(H * np.outer(scale, scale))
-    return np.ascontiguousarray(vectors.T[values <= needed])
+    return np.ascontiguousarray(vectors.T[values <= least])
 
 
 def _step(A: Floats, b: Floats, lever: float, least: float) -> Floats:
     """-inv(A) b in the directions of both ends that more than `least` holds."""
-    scale = np.tile(_scaled(lever), 3)
+    scale = np.tile(_scale(lever), 3)
     values, vectors = np.linalg.eigh(A * np.outer(scale, scale))
     along = vectors.T @ (scale * b)
     followed = values > max(least, 1e-12 * float(values[-1]))

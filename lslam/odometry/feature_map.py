@@ -69,15 +69,15 @@ class FeatureScan:
         return build(part.points, part.rings, R, t, self.size)
 
     @cached_property
-    def _searched(self) -> dict[tuple[str, int], Matches]:
+    def _matches(self) -> dict[tuple[str, int], Matches]:
         return {}
 
-    def searched(self, kind: str, count: int) -> Matches:
+    def matches_of(self, kind: str, count: int) -> Matches:
         """Matches of so many edges or planar points, as the last alignment with this scan left them.
 
         They save a search wherever a point lies near where one was before, whichever alignment it belongs to.
         """
-        return self._searched.setdefault((kind, count), no_counterparts(count))
+        return self._matches.setdefault((kind, count), no_counterparts(count))
 
 
 def no_counterparts(count: int) -> Matches:
@@ -95,7 +95,7 @@ def feature_scan(features: Features, T_world_lidar: Floats, grid_step: float = 0
     return FeatureScan(features, T_world_lidar, surface_size(MATCH_REACH_M, grid_step))
 
 
-def settled(features: Features) -> Features:
+def to_arrays(features: Features) -> Features:
     """The features as plain arrays, which checkpoints can hold: no part of them waits to be deskewed."""
     return features.each(lambda part: FeaturePoints(part.points, part.rings, part.times))
 
@@ -133,22 +133,14 @@ class FeatureMap(Stateful):
 
     Parameters
     ----------
-    size : m, edge of a voxel of edges
-    plane_size : m, edge of the smallest voxel of planar points; as `size` when absent
+    size : m, edge of a voxel of edges; plane_size : m, edge of the smallest voxel of planar points
     reach : m, voxels farther than this from the sensor are given back
     """
 
     STATE = ("planes", "edges")
 
-    def __init__(
-        self,
-        size: float,
-        *,
-        plane_size: float | None = None,
-        reach: float = 150.0,
-        capacity: int = 1 << 16,
-    ) -> None:
-        self.planes = LocalMap(plane_size or size, reach=reach)
+    def __init__(self, size: float, plane_size: float, reach: float, capacity: int = 1 << 16) -> None:
+        self.planes = LocalMap(plane_size, reach=reach)
         self.edges = GaussianMap(size, reach=reach, capacity=capacity // 4)
         self._lines = _lines_for(self.edges)
 
@@ -167,7 +159,7 @@ class FeatureMap(Stateful):
         """Add the less sharp edges and the less planar points of a scan."""
         self.edges.insert(features.less_edges.points.astype(np.float32), T_world_lidar)
         flat = features.less_planes.points.astype(np.float32)
-        self.planes.insert(flat, thinned(features)[0], T_world_lidar)
+        self.planes.insert(flat, thin_planes(features)[0], T_world_lidar)
 
     def clear(self) -> None:
         """Forget all points."""
@@ -189,7 +181,7 @@ class FeatureKeyframes(LastKeyframes):
         target.insert(cloud, T_world_lidar)
 
 
-def thinned(features: Features) -> tuple[Floats, Floats]:
+def thin_planes(features: Features) -> tuple[Floats, Floats]:
     """Centroids (S, 3) of the less planar points and the scatter (S, 6) behind each."""
     points, _, scatter, _ = voxel.centroids(features.less_planes.points.astype(np.float32), NO_TIMES, WIDE_GRID)
     return points.astype(np.float64), scatter.astype(np.float64)

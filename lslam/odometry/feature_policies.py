@@ -1,4 +1,4 @@
-"""Recovery policies of features: where these are few, degenerate, or contradicted by all points of the scan."""
+"""Recovery policies of features: where these are few, degenerate, or contradicted by `icp` on all points of the scan."""
 
 from __future__ import annotations
 
@@ -6,12 +6,97 @@ from dataclasses import replace
 
 import numpy as np
 
-from lslam.core.config.odometry import RecoveryConfig
-from lslam.odometry.feature_solver import remap_solution
-from lslam.odometry.feature_target import MIN_FEATURES
+from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
+from lslam.core.types.arrays import Floats
+from lslam.core.types.state import Stateful
+from lslam.odometry.feature_solver import MIN_FEATURES, remap_solution
 from lslam.registration.attempt import RECOVER_M, Attempt, Policy
-from lslam.registration.policies import policies_of
+from lslam.registration.history import History
+from lslam.registration.policies import best_by_non_ground, policies_of
+from lslam.registration.preprocessing.prepare import prepare_points
+from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
+
+# In `pose_source`.
+ALL_POINTS = "all-points"
+# Well constrained scans in a row, two seconds at 10 Hz, after which the map of all points is dropped.
+CONSTRAINED_SCANS = 20
+
+
+class AllPoints(Stateful):
+    """A map of all points, kept while it is needed.
+
+    voxel_size : m, of that map
+    """
+
+    STATE = ("_icp", "_fed")
+
+    def __init__(self, config: RegistrationConfig, voxel_size: float) -> None:
+        plain = {
+            "residual": None,
+            "target": "map",
+            "inlier_distance": None,
+            "inlier_ratio": 1.0,
+            "voxel_size": voxel_size,
+        }
+        self._config = config.model_copy(update=plain)
+        # `icp` by default settings, updated from the first poorly constrained scan on.
+        self._icp = Registration(self._config)
+        self._fed = CONSTRAINED_SCANS
+
+    def locate(self, attempt: Attempt) -> RegistrationResult:
+        """The scan's points registered by `icp` on those of the scans that were registered last."""
+        icp = self._of_recent(attempt.history)
+        return icp.locate(prepare_points(attempt.points.cloud, icp.preprocess), attempt.T_prior)
+
+    def confirm(self, attempt: Attempt, T_start: Floats, result: RegistrationResult) -> RegistrationResult:
+        """The result, unless many more non-ground points are inliers elsewhere: few rings slide along a road."""
+        icp = self._of_recent(attempt.history)
+        points = prepare_points(attempt.points.cloud, icp.preprocess)
+        better = best_by_non_ground(icp.attempt(points, T_start), result)
+        return result if better is result else attempt.credit(better, ALL_POINTS)
+
+    def instead(
+        self, attempt: Attempt, by_features: RegistrationResult, own: RegistrationResult | None
+    ) -> RegistrationResult:
+        """The pose by `icp` on a map of all points, unless it fails; directions degenerate by features stay flagged.
+
+        Few rings at speed leave so few features that one outlier misleads them by metres.
+        own : the result of `locate`, if there is one already
+        """
+        if self._fed >= CONSTRAINED_SCANS:
+            self._icp = self._of_recent(attempt.history)
+        self._fed = 0
+        if own is None:
+            points = prepare_points(attempt.points.cloud, self._icp.preprocess)
+            own = self._icp.locate(points, attempt.T_prior)
+        if not own.ok:
+            return by_features
+        degenerate = own.degenerate if len(own.degenerate) else by_features.degenerate
+        return replace(
+            own, degenerate=degenerate, pose_source=ALL_POINTS, feature_result=by_features, points=None, detail=own
+        )
+
+    def enter(self, result: RegistrationResult) -> None:
+        """While it is needed, enter a scan into the map, and adapt `icp` by its own result of the scan, if there is one."""
+        if self._fed >= CONSTRAINED_SCANS:
+            return
+        self._fed += 1
+        own = result.detail if result.feature_result is not None else None
+        if own is None:
+            points = prepare_points(result.points.cloud, self._icp.preprocess)
+            own, is_rejected = RegistrationResult(result.T_world_lidar, points=points), True
+        else:
+            is_rejected = result.is_rejected
+        self._icp.update(replace(own, T_world_lidar=result.T_world_lidar, is_rejected=is_rejected))
+
+    def _of_recent(self, history: History) -> Registration:
+        """`icp` with all points of the scans that were registered last in its map."""
+        icp = Registration(self._config)
+        for points, T_world_lidar in history.recent:
+            icp.update(RegistrationResult(T_world_lidar, points=prepare_points(points, icp.preprocess)))
+        return icp
+
 
 # Planar points of one normal that constrain a direction well enough, as many as LOAM asks for a plane.
 ENOUGH_POINTS = 5
@@ -70,13 +155,13 @@ class AllPointsInstead:
         if c.start_reach > 0 and (attempt.is_young or is_far):
             with attempt.clock.stage("start" if attempt.history.starting else "recover"):
                 result = points.confirm(attempt, attempt.T_prior if start is None else start.T_world_lidar, result)
-        if attempt.target.map is not None and not is_well_constrained(result, c.sigma):
+        if attempt.target.map is not None and not holds_position(result, c.sigma):
             with attempt.clock.stage("all-points"):
                 result = points.instead(attempt, result, start)
         return result
 
 
-def is_well_constrained(result: RegistrationResult, sigma: float) -> bool:
+def holds_position(result: RegistrationResult, sigma: float) -> bool:
     """Whether the position's largest variance is below that of `ENOUGH_POINTS` points of one normal, of `sigma`, m."""
     if not result.ok or result.covariance is None:
         return False

@@ -16,16 +16,16 @@ from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_map import MIN_LINE_POINTS, FeatureMap, FeatureScan
 from lslam.odometry.kernels.feature_residuals import linearise_edges, linearise_planes
 from lslam.odometry.kernels.lines import linearise_lines
-from lslam.registration.alignment import upright_directions
+from lslam.registration.alignment import prior_term, upright_directions, voxel_terms
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
-from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise, slots_of
+from lslam.registration.optimiser import EVERYWHERE, Annealing, Correspondences, Limits, Term, optimise, slots_of
 from lslam.registration.preprocessing.features import Features
 from lslam.registration.residuals import PLANE
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import prior_term, voxel_terms
 
 NONE: Floats = np.zeros((0, 3))
+# Fewer inliers, ten per degree of freedom, are insignificant.
+MIN_FEATURES = 60
 # Scan-to-scan errors persist as velocity, without a map to correct them: the threshold of degeneracy is twice as high there.
 # Higher ones would call sparse scans degenerate in every direction.
 TIMES_ON_SCAN = 2.0
@@ -46,45 +46,46 @@ class FeatureNoise:
     least: float = 1.0
 
 
-def solve_on_scan(
-    target: FeatureScan,
-    edges: Floats,
-    planes: Floats,
-    T_prior: Floats,
-    annealing: Annealing,
-    noise: FeatureNoise,
-    *,
-    one_to_many: bool = True,
-    allowed: Floats | None = None,
-) -> RegistrationResult:
-    """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with an earlier scan, starting at `T_prior` (4, 4).
+@dataclass(frozen=True)
+class ScanMatching:
+    """An earlier scan, and how features are aligned with it.
 
-    `allowed` (6, 6) projects the steps; the result's degenerate directions are those that it allows.
+    one_to_many : whether a feature is matched with several of the earlier scan, a line or a plane through them
     """
 
-    def settings(sigma: float) -> tuple[float, float, float, bool]:
-        return float(target.size), float(target.reach), float(sigma) ** 2, bool(one_to_many)
+    target: FeatureScan
+    annealing: Annealing
+    noise: FeatureNoise
+    one_to_many: bool = True
 
-    terms = [
-        Term(linearise_edges, (edges,), target.edges, settings(noise.edge), target.searched("edges", len(edges))),
-        Term(
-            linearise_planes,
-            (planes,),
-            (*target.planes, target.normals),
-            settings(noise.plane),
-            target.searched("planes", len(planes)),
-        ),
-    ]
-    limits = Limits(
-        noise.weak_share,
-        TIMES_ON_SCAN * noise.least / noise.plane**2,
-        by_surfaces=True,
-        allowed=EVERYWHERE if allowed is None else np.ascontiguousarray(allowed),
-    )
-    return optimise(terms, T_prior, annealing, limits, Correspondences(len(edges) + len(planes)))
+    def align(
+        self, edges: Floats, planes: Floats, T_prior: Floats, directions: Floats = EVERYWHERE
+    ) -> RegistrationResult:
+        """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the earlier scan, starting at `T_prior` (4, 4).
+
+        `directions` (6, 6) projects the steps; the result's degenerate directions are among them.
+        """
+        target, noise = self.target, self.noise
+        terms = [
+            Term(linearise, (points,), surfaces, self._settings(sigma), target.matches_of(kind, len(points)))
+            for kind, linearise, points, surfaces, sigma in (
+                ("edges", linearise_edges, edges, target.edges, noise.edge),
+                ("planes", linearise_planes, planes, (*target.planes, target.normals), noise.plane),
+            )
+        ]
+        limits = Limits(
+            noise.weak_share,
+            TIMES_ON_SCAN * noise.least / noise.plane**2,
+            by_surfaces=True,
+            directions=np.ascontiguousarray(directions),
+        )
+        return optimise(terms, T_prior, self.annealing, limits, Correspondences(len(edges) + len(planes)))
+
+    def _settings(self, sigma: float) -> tuple[float, float, float, bool]:
+        return float(self.target.size), float(self.target.reach), float(sigma) ** 2, bool(self.one_to_many)
 
 
-def map_problem(
+def solve_on_map(
     target: FeatureMap,
     edges: Floats,
     planes: Floats,
@@ -96,13 +97,13 @@ def map_problem(
     levels: Sequence[GaussianMap] | None = None,
     inlier_ratio: float = 1.0,
     information: Floats | None = None,
-) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:
-    """The arguments of `optimise` that align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map.
+) -> RegistrationResult:
+    """Align edges (E, 3) and planar points (P, 3), LiDAR frame, with the feature map, starting at `T_prior` (4, 4).
 
-    T_prior : (4, 4) start; information : (6, 6) of it as a prior beside the features; None: it is only a start
     scatter : (P, 6) m2, of the points behind each planar point when that is a centroid
     levels : of the map's planes, the finest first, each for the points without a plane in those before; None takes all
     inlier_ratio : share of the correspondences, the nearest, that have a say from the second step on
+    information : (6, 6) of the start as a prior beside the features; None: it is only a start
     """
     if scatter is None:
         scatter = np.zeros((len(planes), 6))
@@ -117,49 +118,31 @@ def map_problem(
     on_planes = voxel_terms(PLANE, (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
     prior = [] if information is None else [prior_term(T_prior, information)]
-    return [on_lines, *on_planes, *prior], T_prior, annealing, limits, matches, np.inf, inlier_ratio
+    return optimise([on_lines, *on_planes, *prior], T_prior, annealing, limits, matches, inlier_ratio=inlier_ratio)
 
 
-def remap_solution(result: RegistrationResult, T_expected: Floats) -> RegistrationResult:
-    """Solution remapping (Zhang, Kaess and Singh 2016): the result at the expected pose (4, 4) along degenerate directions.
+def remap_solution(result: RegistrationResult, T_prior: Floats) -> RegistrationResult:
+    """Solution remapping (Zhang, Kaess and Singh 2016): the result at the prior (4, 4) along degenerate directions.
 
     Remapping the last step alone does not suffice: earlier ones with a wider kernel moved along such directions by outliers.
     """
     R, arm = result.T_world_lidar[:3, :3], result.lever_arm
-    moved = np.concatenate([result.T_world_lidar[:3, 3] - T_expected[:3, 3], arm * so3.log(R @ T_expected[:3, :3].T)])
+    moved = np.concatenate([result.T_world_lidar[:3, 3] - T_prior[:3, 3], arm * so3.log(R @ T_prior[:3, :3].T)])
     false = result.degenerate.T @ (result.degenerate @ moved)
     pose = se3.make(so3.exp(-false[3:] / arm) @ R, result.T_world_lidar[:3, 3] - false[:3])
     return replace(result, T_world_lidar=se3.normalise(pose))
 
 
-ScanStep = Callable[[FeatureScan, Features, Floats, Annealing, FeatureNoise, bool, StageClock], RegistrationResult]
+ScanStep = Callable[[ScanMatching, Features, Floats, StageClock], RegistrationResult]
 
 
-def joint_step(
-    target: FeatureScan,
-    features: Features,
-    T_prior: Floats,
-    annealing: Annealing,
-    noise: FeatureNoise,
-    one_to_many: bool,
-    clock: StageClock,
-) -> RegistrationResult:
+def joint_step(matching: ScanMatching, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
     """Edges and planar points together, stage `scan`."""
     with clock.stage("scan"):
-        return solve_on_scan(
-            target, features.edges.points, features.planes.points, T_prior, annealing, noise, one_to_many=one_to_many
-        )
+        return matching.align(features.edges.points, features.planes.points, T_prior)
 
 
-def two_steps(
-    target: FeatureScan,
-    features: Features,
-    T_prior: Floats,
-    annealing: Annealing,
-    noise: FeatureNoise,
-    one_to_many: bool,
-    clock: StageClock,
-) -> RegistrationResult:
+def two_steps(matching: ScanMatching, features: Features, T_prior: Floats, clock: StageClock) -> RegistrationResult:
     """z, roll and pitch from planar points, stage `ground`; then x, y and yaw from edges, stage `edges`.
 
     LeGO-LOAM (Shan and Englot 2018), section IV-D. Axes are the sensor's at the prior. The covariance joins the two:
@@ -167,21 +150,10 @@ def two_steps(
     """
     upright = upright_directions(T_prior)
     with clock.stage("ground"):
-        ground = solve_on_scan(
-            target, NONE, features.planes.points, T_prior, annealing, noise, one_to_many=one_to_many, allowed=upright
-        )
+        ground = matching.align(NONE, features.planes.points, T_prior, upright)
     with clock.stage("edges"):
         level = np.eye(6) - upright
-        edges = solve_on_scan(
-            target,
-            features.edges.points,
-            NONE,
-            ground.T_world_lidar,
-            annealing,
-            noise,
-            one_to_many=one_to_many,
-            allowed=level,
-        )
+        edges = matching.align(features.edges.points, NONE, ground.T_world_lidar, level)
     if ground.covariance is None or edges.covariance is None:
         covariance = None
     else:

@@ -7,39 +7,43 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.config.odometry import LoamConfig, RegistrationConfig
+from lslam.core.config.config import Config
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
-from lslam.odometry.all_points import AllPoints
 from lslam.odometry.feature_map import (
     FeatureKeyframes,
     FeatureMap,
     FeatureScan,
     feature_scan,
-    settled,
     surface_size,
-    thinned,
+    thin_planes,
+    to_arrays,
 )
-from lslam.odometry.feature_solver import NONE, FeatureNoise, ScanStep, map_problem, remap_solution
+from lslam.odometry.feature_policies import AllPoints
+from lslam.odometry.feature_solver import (
+    MIN_FEATURES,
+    NONE,
+    FeatureNoise,
+    ScanMatching,
+    ScanStep,
+    remap_solution,
+    solve_on_map,
+)
 from lslam.registration.attempt import Attempt, Target
-from lslam.registration.history import History
-from lslam.registration.optimiser import optimise
-from lslam.registration.preprocessing.features import Features
-from lslam.registration.preprocessing.ground import Z
-from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import (
+from lslam.registration.history import History, is_more
+from lslam.registration.optimiser import (
     COARSE_DECAY,
     COARSE_KERNEL_M,
     KERNEL_DECAY,
     KERNEL_MIN_M,
     START_ITERATIONS,
     Annealing,
-    is_more,
 )
-from lslam.registration.start_search import MUCH_RATIO, START_STEP_M, start_offsets
+from lslam.registration.policies import MUCH_RATIO, START_STEP_M, start_offsets
+from lslam.registration.preprocessing.features import Features
+from lslam.registration.preprocessing.ground import up_of
+from lslam.registration.result import RegistrationResult
 
-# Fewer inliers, ten per degree of freedom, are insignificant.
-MIN_FEATURES = 60
 # m; of an edge across itself: it lies anywhere between two beams, and silhouettes move.
 EDGE_SIGMA_M = 0.15
 
@@ -63,47 +67,23 @@ class LoamVariant:
 
 
 class FeatureTarget(Target):
-    """The last scan's features and the feature map.
-
-    reach : m, how far from the sensor the map is kept
-    up : (3,) unit vector, up in the LiDAR frame
-    with_start_search : whether the second scan is sought within `start_reach`
-    with_all_points : whether `icp` on all points is kept beside it
-    """
+    """The last scan's features and the feature map; `icp` on all points beside them, where the configuration falls back on it."""
 
     source = "features"
     times_steps = 1
     STATE = ("map", "scan", "all_points", "_keyframes")
 
-    def __init__(
-        self,
-        config: RegistrationConfig,
-        loam: LoamConfig,
-        variant: LoamVariant,
-        reach: float = 120.0,
-        *,
-        up: Floats = Z,
-        with_start_search: bool = True,
-        with_all_points: bool = False,
-    ) -> None:
-        self.config, self.loam, self.variant, self._reach = config, loam, variant, reach
+    def __init__(self, config: Config, variant: LoamVariant) -> None:
+        self.config, self.loam, self.variant, self._whole = config.registration, config.loam, variant, config
         self.map = self._new_map(1 << 16) if variant.with_map else None
         self.scan: FeatureScan | None = None
-        self.all_points = AllPoints(config, self._plane_size(config.voxel_size)) if with_all_points else None
+        size = self._plane_size(self.config.voxel_size)
+        self.all_points = AllPoints(self.config, size) if config.recovery.fallback == "all-points" else None
         self._keyframes = None if variant.keyframes is None else FeatureKeyframes(*variant.keyframes)
-        self._with_start_search, self._up = with_start_search, up
 
     def fresh(self) -> FeatureTarget:
         """An empty one of the same settings."""
-        return FeatureTarget(
-            self.config,
-            self.loam,
-            self.variant,
-            self._reach,
-            up=self._up,
-            with_start_search=self._with_start_search,
-            with_all_points=self.all_points is not None,
-        )
+        return FeatureTarget(self._whole, self.variant)
 
     def __len__(self) -> int:
         return 0 if self.scan is None else len(self.scan.features.less_planes) + len(self.scan.features.less_edges)
@@ -146,15 +126,16 @@ class FeatureTarget(Target):
             annealing = replace(annealing, start=c.kernel_max)
         result = RegistrationResult(T_start, ok=False)
         if self.variant.scan_step is not None:
-            one_to_many = self.loam.matching == "one-to-many"
-            result = self.variant.scan_step(self.scan, features, T_start, annealing, noise, one_to_many, attempt.clock)
-            result = attempt.judge(result)
+            matching = ScanMatching(self.scan, annealing, noise, self.loam.matching == "one-to-many")
+            result = attempt.judge(self.variant.scan_step(matching, features, T_start, attempt.clock))
             iterations = result.iterations
         if self.map is not None:
             start = result.T_world_lidar if result.ok else T_start
             with attempt.clock.stage("map"):
-                points, scatter = thinned(features) if self.variant.with_less_planes else (features.planes.points, None)
-                problem = map_problem(
+                points, scatter = (
+                    thin_planes(features) if self.variant.with_less_planes else (features.planes.points, None)
+                )
+                result = solve_on_map(
                     self.map,
                     features.edges.points,
                     points,
@@ -165,7 +146,6 @@ class FeatureTarget(Target):
                     inlier_ratio=self.variant.inlier_ratio,
                     information=information,
                 )
-                result = optimise(*problem)
             result = replace(result, iterations=iterations + result.iterations)
         is_remapped = attempt.is_near and len(result.degenerate) > 0
         return remap_solution(result, attempt.T_prior) if is_remapped else result
@@ -179,15 +159,14 @@ class FeatureTarget(Target):
     def on_planes(self, attempt: Attempt, T_start: Floats) -> RegistrationResult:
         """Edges, and centroids of the less planar points, on fine and coarse planes, judged."""
         c, noise = self.config, self.noise(attempt.history)
-        points, scatter = thinned(attempt.points)
+        points, scatter = thin_planes(attempt.points)
         annealing = Annealing(c.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, START_ITERATIONS)
         edges = attempt.points.edges.points
-        problem = map_problem(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter)
-        return attempt.judge(optimise(*problem))
+        return attempt.judge(solve_on_map(self._planes(), edges, points, T_start, annealing, noise, scatter=scatter))
 
     def enter(self, result: RegistrationResult) -> None:
         """Into the feature map, and as what the next scan is registered on."""
-        features, T_world_lidar = settled(result.points), result.T_world_lidar
+        features, T_world_lidar = to_arrays(result.points), result.T_world_lidar
         if self.map is not None and self._keyframes is not None:
             self._keyframes.enter(self.map, features, T_world_lidar)
         elif self.map is not None:
@@ -205,28 +184,26 @@ class FeatureTarget(Target):
         c, history, T_prior = self.config, attempt.history, attempt.T_prior
         if self.all_points is not None and attempt.is_young:
             return self.all_points.locate(attempt)
-        points, scatter = thinned(attempt.points)
+        points, scatter = thin_planes(attempt.points)
         target, noise = self._planes(), self.noise(history)
 
         def on_coarse(start: Floats, width: float) -> RegistrationResult:
             slow = Annealing(width, KERNEL_MIN_M, COARSE_DECAY, START_ITERATIONS)
             levels = target.planes.coarser[:1]
-            problem = map_problem(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels)
-            return attempt.judge(optimise(*problem))
+            return attempt.judge(solve_on_map(target, NONE, points, start, slow, noise, scatter=scatter, levels=levels))
 
         def edges_at(result: RegistrationResult) -> int:
             """How many of the less sharp edges lie on edges of the map; -1 where the registration failed."""
             once = Annealing(c.kernel_max / 2, c.kernel_max / 2, 0.5, 1)
             edges = attempt.points.less_edges.points
-            problem = map_problem(target, edges, NONE, result.T_world_lidar, once, noise)
-            return optimise(*problem).inliers if result.ok else -1
+            return solve_on_map(target, edges, NONE, result.T_world_lidar, once, noise).inliers if result.ok else -1
 
         result = on_coarse(T_prior, COARSE_KERNEL_M)
-        if history.inserted > 1 or not self._with_start_search:
+        if history.inserted > 1 or not self._whole.recovery.start_search:
             return result
         # Planes slide along a road; edges repeat nowhere at once. Few of them decide nothing: two sigma of what is counted.
-        offsets = [se3.make(np.eye(3), offset) for offset in start_offsets(c.start_reach, START_STEP_M, self._up)]
-        trials = [on_coarse(T_prior @ T, 2 * START_STEP_M) for T in offsets]
+        offsets = start_offsets(c.start_reach, START_STEP_M, up_of(self._whole.preprocess))
+        trials = [on_coarse(T_prior @ se3.make(np.eye(3), offset), 2 * START_STEP_M) for offset in offsets]
         agree = [edges_at(one) for one in trials]
         most, usual = max(agree, default=0), max(edges_at(result), 0)
         is_clear = most > MUCH_RATIO * usual and is_more(most, usual)
@@ -243,12 +220,7 @@ class FeatureTarget(Target):
 
     def _new_map(self, capacity: int) -> FeatureMap:
         size = self.loam.feature_map_voxel
-        return FeatureMap(
-            size,
-            plane_size=self._plane_size(size),
-            reach=self._reach,
-            capacity=capacity,
-        )
+        return FeatureMap(size, self._plane_size(size), 1.2 * self._whole.preprocess.range_max, capacity)
 
     def _plane_size(self, size: float) -> float:
         return surface_size(size, self.loam.grid_step)

@@ -67,7 +67,7 @@ class GivenMotion(Stateful, MotionModel):
         return self.sweep(stamp_ns, span)
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """Nothing to learn."""
 

@@ -12,18 +12,15 @@ from lslam.core.errors import UsageError
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
-from lslam.odometry.elastic import SweepPoints, register_elastic
-from lslam.odometry.elastic_constraints import ElasticConstraints
-from lslam.odometry.keyframe_submap import KeyframeSubmap
-from lslam.odometry.map_method import MapMethod
-from lslam.registration.local_map import make_map_scans
+from lslam.odometry.base import MapMethod
+from lslam.odometry.elastic import ElasticConstraints, SweepPoints, register_elastic
+from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.preprocessing.deskew import deskew
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import KERNEL_DECAY, KERNEL_MIN_M, Annealing
-from lslam.registration.voxel_target import MIN_SOURCE_POINTS, VoxelTarget
+from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
 def create(config: Config) -> Icp:
@@ -51,8 +48,7 @@ def registration_of(
     recovery : None: as configured
     """
     c = config.registration.model_copy(update={"residual": residual, **keys})
-    target = VoxelTarget(c, config.preprocess, KeyframeSubmap.of if c.target == "submap" else make_map_scans)
-    return Registration(c, config.preprocess, recovery or config.recovery, target)
+    return Registration(c, config.preprocess, recovery or config.recovery)
 
 
 class Icp(MapMethod):
@@ -99,7 +95,7 @@ class Icp(MapMethod):
         if not target.kind.needs_covariance:
             return points
         if self._surfaces is None or self._surfaces[0] is not prepared:
-            self._surfaces = prepared, target.covered(points).covariance
+            self._surfaces = prepared, target.with_covariance(points).covariance
         return replace(points, covariance=self._surfaces[1])
 
     def is_elastic(self, prepared: PreparedPoints, prior: MotionPrior) -> bool:

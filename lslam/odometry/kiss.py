@@ -89,7 +89,7 @@ class Kiss(Traits):
         pose = se3.normalise(pose) if np.isfinite(pose).all() else pose
         return ScanResult(scan.index, scan.stamp_ns, pose, source_points=len(source), stages={"register": took})
 
-    def _at_stamp(self, pose: Floats, delta: Floats, passed: float) -> Floats:
+    def _at_stamp(self, pose: Floats, delta: Floats, share: float) -> Floats:
         """Pose at the scan's stamp, when the share `passed` of its sweep is over, in the world of the first scan's stamp.
 
         `pose` is kiss-icp's newest, `delta` its motion since the one before: the start of a scan is the end of the one
@@ -101,7 +101,7 @@ class Kiss(Traits):
             return pose
         if self._registered == 2:
             self._step = se3.log(delta)
-            self._T_world_kiss = se3.exp((0.5 - passed) * self._step)
+            self._T_world_kiss = se3.exp((0.5 - share) * self._step)
         before = self._T_world_kiss @ pose @ se3.inverse(delta)
-        since = (0.5 + passed) * self._step if self._registered <= 3 else passed * se3.log(delta)
+        since = (0.5 + share) * self._step if self._registered <= 3 else share * se3.log(delta)
         return np.asarray(before @ se3.exp(since))

@@ -9,16 +9,15 @@ from lslam.core.config.odometry import rest_alone
 from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanEquations
-from lslam.odometry.fast_lio2 import FastLio2
+from lslam.odometry.fast_lio import FastLio2
 from lslam.odometry.icp import registration_of
+from lslam.odometry.inertial.filter import warm_up_solver
 from lslam.odometry.inertial.initialise import InertialStart
-from lslam.odometry.inertial.window import warm_up_solver
-from lslam.odometry.inertial.window_motion import WindowMotion
-from lslam.registration.optimiser import normal_equations
+from lslam.odometry.inertial.window import WindowMotion
+from lslam.registration.optimiser import KERNEL_MIN_M, normal_equations
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import KERNEL_MIN_M
 
 
 def create(config: Config) -> LioMapping:
@@ -70,8 +69,8 @@ class LioMapping(FastLio2):
     def _at(self, stamp_ns: int, points: PreparedPoints, T: Floats) -> ScanEquations:
         """As registration weighs the points where it ends."""
         target, width = self.registration.target, KERNEL_MIN_M
-        terms, _, _, _, matches, *_ = target.problem(points, T, width, 1)
-        return ScanEquations(stamp_ns, T, *normal_equations(terms, T, width, matches))
+        problem = target.problem(points, T, width, 1)
+        return ScanEquations(stamp_ns, T, *normal_equations(problem.terms, T, width, problem.matches))
 
     def insert(self, stamp_ns: int, prior: MotionPrior, result: RegistrationResult) -> RegistrationResult:
         """Keep the scan for the map; while that is young, or the window silent, it enters at once."""

@@ -16,12 +16,12 @@ from lslam.core.config.odometry import rest_alone
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
+from lslam.odometry.base import MapMethod
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
 from lslam.odometry.loam import Loam
-from lslam.odometry.map_method import MapMethod
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.result import RegistrationResult
 
@@ -62,12 +62,12 @@ class SmoothedUncertainty(PoseUncertainty):
 
     def alone(self, record: ScanResult, result: RegistrationResult, stamp_ns: int, prior: MotionPrior) -> ScanResult:
         """The record with `points_covariance`, that of the local map; `result` is the smoother's."""
-        entered = result.moved(result.T_world_lidar, result.detail) if result.is_accepted else result
+        entered = result.with_pose(result.T_world_lidar, result.detail) if result.is_accepted else result
         whole, own = self.points.covariances(entered, stamp_ns, prior)
         return record if whole is None or own is None else replace(record, points_covariance=whole - own)
 
 
-class Smoothed(MapMethod):
+class SmootherMethod(MapMethod):
     """Scans enter the map where the smoother puts them."""
 
     _uncertainty: SmoothedUncertainty
@@ -85,13 +85,13 @@ class Smoothed(MapMethod):
         return SmoothedUncertainty()
 
 
-class LioSam(Smoothed, Loam):
+class LioSam(SmootherMethod, Loam):
     """Edges and planar points on the feature map of the newest keyframes."""
 
     deskew = "features, by the newest state of the smoother"
 
 
-class LioSamOfPoints(Smoothed, Icp):
+class LioSamOfPoints(SmootherMethod, Icp):
     """All points on the local map of the newest keyframes."""
 
     deskew = "by the newest state of the smoother"

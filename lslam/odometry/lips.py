@@ -19,12 +19,12 @@ from lslam.core.types.scan import LEVER_M, Scan
 from lslam.core.types.scan_result import ScanResult, StageClock
 from lslam.core.types.state import Stateful
 from lslam.odometry.base import Traits
+from lslam.odometry.inertial.filter import warm_up_solver
 from lslam.odometry.inertial.linked_motion import LinkedMotion
-from lslam.odometry.inertial.window import warm_up_solver
 from lslam.odometry.plane_factors import SHARED, sighting_residuals
-from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, turned
+from lslam.odometry.plane_segmentation import PlaneExtractor, Planes, boxes_in
 from lslam.odometry.plane_window import PlaneWindow, associate
-from lslam.odometry.scan_outcome import recorded
+from lslam.odometry.scan_outcome import to_scan_result
 from lslam.registration.acceptance import correction
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
@@ -74,12 +74,12 @@ class Lips(Traits, Stateful):
         with clock.stage("planes"):
             planes = self._extractor.extract(centred)
         with clock.stage("register"):
-            predicted = self._predicted(link)
+            predicted = self._predict(link)
             matches = associate(predicted, planes, predicted.joint_covariance())
             reason = _refusal(predicted, planes, matches)
             window, steps = predicted, 0
             if not reason:
-                solution, steps = _with(predicted, planes, matches).solved()
+                solution, steps = _with(predicted, planes, matches).solve()
                 reason = (
                     "the window of planes and IMU has no solution: the IMU carries the scan" if solution is None else ""
                 )
@@ -105,9 +105,9 @@ class Lips(Traits, Stateful):
         window, predicted, covariance = result.detail
         if not result.is_accepted:
             none = np.zeros((0, 3))
-            window = replace(predicted, landmarks=predicted.landmarks.seen(np.zeros(0, np.int64), none, none))
-        self.window = window.marginalised()
-        record = recorded(scan, result, None if result.is_rejected else covariance, result.covariance)
+            window = replace(predicted, landmarks=predicted.landmarks.observe(np.zeros(0, np.int64), none, none))
+        self.window = window.marginalise()
+        record = to_scan_result(scan, result, None if result.is_rejected else covariance, result.covariance)
         return replace(record, stages={**result.stages, "update": time.perf_counter() - began})
 
     def restart(self) -> None:
@@ -119,11 +119,11 @@ class Lips(Traits, Stateful):
         self._extractor.extract(small_room())
         warm_up_solver()
 
-    def _predicted(self, link: SweepLink) -> PlaneWindow:
+    def _predict(self, link: SweepLink) -> PlaneWindow:
         """The window with one more state where the IMU leads, or its first."""
         if self.window is None or link.step is None:
             return PlaneWindow.begin(link.state, se3.inverse(link.T_lidar_imu))
-        return self.window.extended(link.step)
+        return self.window.extend(link.step)
 
     def _result(self, link: SweepLink, window: PlaneWindow, planes: Planes, matches: Longs) -> RegistrationResult:
         """The newest pose with its covariance on the planes; the detail is that in the world."""
@@ -150,10 +150,10 @@ class Lips(Traits, Stateful):
         """(D, 6) twists of the LiDAR along which the known planes of the scan say next to nothing."""
         if window.values.states == 1:
             return np.zeros((0, 6))  # the first scan begins the world
-        is_of_known_planes = (window.seen.states == window.values.states - 1) & np.isin(
-            window.seen.planes, matches[matches >= 0]
+        is_of_known_planes = (window.sightings.states == window.values.states - 1) & np.isin(
+            window.sightings.planes, matches[matches >= 0]
         )
-        sightings = window.seen.only(is_of_known_planes)
+        sightings = window.sightings.only(is_of_known_planes)
         _, J, _ = sighting_residuals(window.values, sightings, window.landmarks.anchors, window.T_imu_lidar)
         J[:, :, 3:] /= LEVER_M
         values, vectors = np.linalg.eigh(np.einsum("kia,kij,kjb->ab", J, sightings.information, J))
@@ -175,7 +175,7 @@ def _refusal(window: PlaneWindow, planes: Planes, matches: Longs) -> str:
 def _with(window: PlaneWindow, planes: Planes, matches: Longs) -> PlaneWindow:
     """The window whose newest state saw the planes, known ones and new ones."""
     information: Floats = np.asarray(np.linalg.inv(planes.covariance), np.float64)
-    lows, highs = turned(planes, window.T_world_lidar)
+    lows, highs = boxes_in(planes, window.T_world_lidar)
     old, new = matches >= 0, matches < 0
     window = window.with_sightings(matches[old], planes.cp[old], information[old], lows[old], highs[old])
     return window.with_planes(planes.cp[new], information[new], lows[new], highs[new])

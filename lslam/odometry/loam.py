@@ -1,4 +1,4 @@
-"""Methods `loam-odom`, `loam` and `floam`: edges and planar points, scan to scan, on the feature map, or both."""
+"""Methods `loam-odom`, `loam`, `floam` and `lego-loam`: edges and planar points, scan to scan, on the feature map, or both."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
+from lslam.odometry.base import MapMethod
 from lslam.odometry.feature_policies import feature_policies
-from lslam.odometry.feature_solver import joint_step
+from lslam.odometry.feature_solver import joint_step, two_steps
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
-from lslam.odometry.map_method import MapMethod
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features
-from lslam.registration.preprocessing.ground import up_of
+from lslam.registration.preprocessing.features import FeaturePoints, Features, extract_features, lego_features
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
 
@@ -26,12 +25,14 @@ VARIANTS = {
     "loam-odom": LoamVariant(joint_step, with_map=False),
     "loam": LoamVariant(joint_step, with_map=True),
     "floam": LoamVariant(None, with_map=True),
+    "lego-loam": LoamVariant(two_steps, with_map=True, with_less_planes=True),
 }
 
 
 def create(config: Config) -> Loam:
     """The variant that `odometry.method` names."""
-    return Loam(config, VARIANTS[config.odometry.method])
+    method = config.odometry.method
+    return (LegoLoam if method == "lego-loam" else Loam)(config, VARIANTS[method])
 
 
 class Loam(MapMethod):
@@ -42,20 +43,11 @@ class Loam(MapMethod):
 
     def __init__(self, config: Config, variant: LoamVariant) -> None:
         self.config, self.variant = config, variant
-        c, reach = config.registration, 1.2 * config.preprocess.range_max
-        target = FeatureTarget(
-            c,
-            config.loam,
-            variant,
-            reach,
-            up=up_of(config.preprocess),
-            with_start_search=config.recovery.start_search,
-            with_all_points=config.recovery.fallback == "all-points",
-        )
         # From scan to scan no spot is remembered, on which the sensor could have come to rest.
         switches = {} if variant.with_map else {"at_rest": False}
         policies = feature_policies(config.recovery.model_copy(update=switches))
-        registration = Registration(c, config.preprocess, target=target, policies=policies)
+        target = FeatureTarget(config, variant)
+        registration = Registration(config.registration, config.preprocess, target=target, policies=policies)
         super().__init__(registration, is_scan_to_scan=not variant.with_map)
 
     def prepare(self, scan: Scan) -> Features:
@@ -64,9 +56,9 @@ class Loam(MapMethod):
 
     def features_of(self, prepared: Features, motion: MotionPrior) -> Features:
         """The features as seen from the pose at the stamp, the sensor having moved as `motion` says."""
-        return deskewed(prepared, motion) if self.is_swept(prepared, motion) else prepared
+        return deskew_features(prepared, motion) if self.has_sweep(prepared, motion) else prepared
 
-    def is_swept(self, prepared: Features, motion: MotionPrior) -> bool:
+    def has_sweep(self, prepared: Features, motion: MotionPrior) -> bool:
         """Whether there is a motion within the sweep to take out, and times to do so by."""
         return self.config.preprocess.deskew and prepared.planes.times is not None and len(motion.times) > 1
 
@@ -90,20 +82,34 @@ class Loam(MapMethod):
             trial.update(scan, prior, trial.register(scan, prepared, prior))
 
 
+class LegoLoam(Loam):
+    """LOAM on what the segmentation of the range image leaves: ground and clusters first, then scan to scan in two steps.
+
+    Shan and Englot 2018, "LeGO-LOAM: Lightweight and ground-optimized lidar odometry and mapping on variable terrain". Edges
+    come from clusters off the ground, planar points from the ground; z, roll and pitch are found from these, then x, y and yaw
+    from those. Its mapping takes the less planar points of ground and clusters, as the paper's does.
+    """
+
+    def prepare(self, scan: Scan) -> Features:
+        """Edges off the ground, planar points on it, clutter left out. Raises InputError for a scan without usable rings."""
+        features, _ = lego_features(scan, self.config.loam, self.config.preprocess)
+        return features
+
+
 # What is registered, and what is entered into the map where that went well: deskewed together, once either is asked for.
 _TOGETHER = (("edges", "planes"), ("less_edges", "less_planes", "neither"))
 
 
-def deskewed(features: Features, prior: MotionPrior) -> Features:
+def deskew_features(features: Features, prior: MotionPrior) -> Features:
     """The features as seen from the pose at the stamp, each when it is asked for: a scan that is registered twice enters once."""
     parts: dict[str, FeaturePoints] = {}
     for names in _TOGETHER:
-        swept = _Swept([getattr(features, name) for name in names], prior)
-        parts.update({name: _SweptPart(swept, k) for k, name in enumerate(names)})
+        group = _SweepFeatures([getattr(features, name) for name in names], prior)
+        parts.update({name: _SweepPart(group, k) for k, name in enumerate(names)})
     return Features(**parts, labels=features.labels)
 
 
-class _Swept:
+class _SweepFeatures:
     """Parts of a scan's features, and the motion that displaces them."""
 
     def __init__(self, parts: list[FeaturePoints], prior: MotionPrior) -> None:
@@ -118,15 +124,15 @@ class _Swept:
         return np.split(moved, np.cumsum([len(part) for part in self.parts])[:-1])
 
 
-class _SweptPart(FeaturePoints):
+class _SweepPart(FeaturePoints):
     """One of the parts."""
 
-    _swept: _Swept
+    _group: _SweepFeatures
     _k: int
 
-    def __init__(self, swept: _Swept, k: int) -> None:
-        own = swept.parts[k]
-        self.__dict__.update(rings=own.rings, times=own.times, _swept=swept, _k=k)
+    def __init__(self, group: _SweepFeatures, k: int) -> None:
+        own = group.parts[k]
+        self.__dict__.update(rings=own.rings, times=own.times, _group=group, _k=k)
 
     def __len__(self) -> int:
         return len(self.rings)
@@ -134,7 +140,7 @@ class _SweptPart(FeaturePoints):
     @cached_property
     def points(self) -> Floats:
         """(M, 3) m, as seen from the pose at the stamp."""
-        return self._swept.points[self._k]
+        return self._group.points[self._k]
 
 
 def _room() -> Scan:

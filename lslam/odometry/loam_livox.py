@@ -13,8 +13,8 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
 from lslam.odometry.feature_target import LoamVariant
-from lslam.odometry.loam import Loam, deskewed
-from lslam.registration.acceptance import correction, failed
+from lslam.odometry.loam import Loam, deskew_features
+from lslam.registration.acceptance import correction, failure
 from lslam.registration.preprocessing.features import FeaturePoints, Features
 from lslam.registration.preprocessing.petals import petal_features
 from lslam.registration.result import RegistrationResult
@@ -52,11 +52,11 @@ class LoamLivox(Loam):
     def register(self, scan: Scan, prepared: Features, prior: MotionPrior, is_near: bool = False) -> RegistrationResult:
         """Piece after piece; at once where the sweep takes no time."""
         count = self.config.loam.pieces
-        if is_near or count < 2 or len(self.registration.target) == 0 or not self.is_swept(prepared, prior):
+        if is_near or count < 2 or len(self.registration.target) == 0 or not self.has_sweep(prepared, prior):
             return super().register(scan, prepared, prior, is_near)
         clock = StageClock()
         with clock.stage("deskew"):
-            features = deskewed(prepared, prior)
+            features = deskew_features(prepared, prior)
         borders = np.linspace(*scan.span, count + 1)
         middles = (borders[:-1] + borders[1:]) / 2
         pieces: list[RegistrationResult] = []
@@ -65,9 +65,9 @@ class LoamLivox(Loam):
             piece = between(features, borders[k], borders[k + 1] if k + 1 < count else np.inf)
             pieces.append(self.registration.locate(piece, pose, clock=clock))
             pose = pieces[-1].T_world_lidar if pieces[-1].ok else pose
-        result, sweep = joined(pieces, middles, prior)
+        result, sweep = join(pieces, middles, prior)
         with clock.stage("deskew"):
-            features = deskewed(prepared, sweep)
+            features = deskew_features(prepared, sweep)
         return replace(result, points=features, sweep=sweep, map_age=self.map_age, stages=clock.seconds)
 
 
@@ -82,7 +82,7 @@ def between(features: Features, begin: float, end: float) -> Features:
     return features.each(part)
 
 
-def joined(
+def join(
     pieces: list[RegistrationResult], middles: Floats, prior: MotionPrior
 ) -> tuple[RegistrationResult, MotionPrior]:
     """The registrations of the pieces as one of the scan, and the motion over its sweep.
@@ -97,7 +97,7 @@ def joined(
     offered = sum(result.source_points for result in pieces)
     if 2 * len(good) <= len(pieces):
         reason = next(result.reason for result in pieces if not result.ok)
-        return failed(prior.pose, offered, reason), prior
+        return failure(prior.pose, offered, reason), prior
     parts = [pieces[k] for k in good]
     base = parts[len(parts) // 2].T_world_lidar
     off = np.stack([se3.log(se3.relative(base, part.T_world_lidar)) for part in parts])
@@ -111,7 +111,7 @@ def joined(
     located = replace(
         parts[len(parts) // 2],
         T_world_lidar=pose,
-        covariance=_combined(parts, shares),
+        covariance=_combine(parts, shares),
         source_points=offered,
         matched=sum(part.matched for part in parts),
         inliers=sum(part.inliers for part in parts),
@@ -121,7 +121,7 @@ def joined(
         prior_error=correction(prior.pose, pose),
         pose_source=next((part.pose_source for part in parts if part.pose_source), ""),
         degenerate=min((part.degenerate for part in parts), key=len),
-        replaced=None,
+        feature_result=None,
         detail=None,
     )
     return located, sweep
@@ -133,7 +133,7 @@ def line_weights(at: Floats, times: Floats) -> Floats:
     return np.asarray(1.0 / len(at) + SLOPE_SHARE * np.outer(times - at.mean(), off) / (off @ off))
 
 
-def _combined(parts: list[RegistrationResult], shares: Floats) -> Floats | None:
+def _combine(parts: list[RegistrationResult], shares: Floats) -> Floats | None:
     """Covariance (6, 6) of the sum of independent poses that count by `shares`; None where one has none."""
     covariances = [part.covariance for part in parts if part.covariance is not None]
     if len(covariances) < len(parts):

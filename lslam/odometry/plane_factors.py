@@ -12,8 +12,8 @@ import numpy as np
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
-from lslam.odometry import closest_point
-from lslam.odometry.inertial.window import Normal
+from lslam.odometry.inertial.filter import Normal
+from lslam.odometry.plane_segmentation import linearise_view
 
 # An update: gravity and the gyroscope's axes, which all states share; each state; each plane.
 SHARED, STATE_SIZE, PLANE_SIZE = 12, 15, 3
@@ -63,7 +63,7 @@ class WindowValues:
         """Length of an update."""
         return self.first_plane + PLANE_SIZE * len(self.planes)
 
-    def moved(self, update: Floats) -> WindowValues:
+    def retract(self, update: Floats) -> WindowValues:
         """The values after an `update` (N,): rotations by R' = exp(d) R, all others by a sum."""
         x = update[SHARED : self.first_plane].reshape(-1, STATE_SIZE)
         poses = se3.normalise(se3.make(so3.exp(x[:, 3:6]) @ self.poses[:, :3, :3], self.poses[:, :3, 3] + x[:, :3]))
@@ -99,7 +99,7 @@ class WindowValues:
             ]
         )
 
-    def cut(self, states: slice, planes: slice | Bools = slice(None)) -> WindowValues:
+    def select(self, states: slice, planes: slice | Bools = slice(None)) -> WindowValues:
         """Some of the states and planes."""
         return replace(
             self,
@@ -157,7 +157,7 @@ class Sightings:
         """Some of them."""
         return Sightings(self.states[which], self.planes[which], self.cp[which], self.information[which])
 
-    def joined(self, more: Sightings) -> Sightings:
+    def join(self, more: Sightings) -> Sightings:
         """These and `more`."""
         return Sightings(
             *(
@@ -214,7 +214,7 @@ def sighting_residuals(
     (K, 3) m; (K, 3, 6) by position and rotation of the IMU; (K, 3, 3) by the plane
     """
     T_world_lidar = values.poses @ T_imu_lidar
-    expected, by_pose, by_plane = closest_point.linearised(
+    expected, by_pose, by_plane = linearise_view(
         values.planes[sightings.planes], anchors[sightings.planes], T_world_lidar[sightings.states]
     )
     lever = (T_world_lidar[:, :3, 3] - values.poses[:, :3, 3])[sightings.states]
@@ -233,7 +233,7 @@ def normal_equations(
     """All factors at `values`; the prior is on the first state."""
     H, g = np.zeros((values.size, values.size)), np.zeros(values.size)
     first = np.r_[0 : SHARED + STATE_SIZE, values.first_plane : values.size]
-    pull = np.einsum("ij,j->i", prior.information, values.cut(slice(1)).since(prior.at)) + prior.gradient
+    pull = np.einsum("ij,j->i", prior.information, values.select(slice(1)).since(prior.at)) + prior.gradient
     H[np.ix_(first, first)] += prior.information
     g[first] += pull
     for k, step in enumerate(steps):

@@ -1,4 +1,9 @@
-"""Planes of one scan: regions grown over Gaussian voxels, as closest points with covariances."""
+"""Planes of one scan: regions grown over Gaussian voxels, as closest points with covariances.
+
+A plane n . x = d is its closest point to the origin, p = n d (Geneva et al. 2018): three numbers for three degrees of freedom,
+and the sign of the normal drops out. It is singular where d = 0, so that a plane is kept in the frame of a sensor that saw it,
+its anchor.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.geometry import so3
 from lslam.core.kernels import gaussians
 from lslam.core.kernels.voxel import MASK, OFFSET
 from lslam.core.types.arrays import Bools, Floats, Longs
-from lslam.odometry import closest_point
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import LEAST_BREADTH
 
@@ -46,6 +51,56 @@ COMMON_M, COMMON_RAD = 0.005, np.deg2rad(0.03)
 WIDE_FACTOR = 3
 # Planes of a scan, and seeds that are tried for them.
 MOST_PLANES, MOST_SEEDS = 60, 150
+
+
+def to_hesse(cp: Floats) -> tuple[Floats, Floats]:
+    """Normals (..., 3) and distances (...) of closest points (..., 3), m."""
+    distance = np.linalg.norm(cp, axis=-1)
+    return cp / distance[..., None], distance
+
+
+def transform_planes(cp: Floats, T: Floats) -> Floats:
+    """Closest points (..., 3) in frame a of planes given in frame b; T : (..., 4, 4) T_b_a."""
+    n, d = to_hesse(cp)
+    ahead = d - np.einsum("...i,...i->...", n, T[..., :3, 3])
+    return np.asarray(np.einsum("...ji,...j->...i", T[..., :3, :3], n) * ahead[..., None])
+
+
+def linearise_view(cp: Floats, T_world_anchor: Floats, T_world_lidar: Floats) -> tuple[Floats, Floats, Floats]:
+    """Planes as a LiDAR sees them, and how that changes with its pose and with the planes.
+
+    cp : (K, 3) in their anchors, m; T_world_anchor, T_world_lidar : (K, 4, 4)
+
+    Returns
+    -------
+    (K, 3) closest points in the LiDAR frames; (K, 3, 6) by t' = t + d[:3], R' = exp(d[3:]) R of the LiDAR, world axes;
+    (K, 3, 3) by `cp`
+    """
+    n, d = to_hesse(cp)
+    Ra, Rl = T_world_anchor[:, :3, :3], T_world_lidar[:, :3, :3]
+    n_world = np.einsum("kij,kj->ki", Ra, n)
+    n_lidar = np.einsum("kji,kj->ki", Rl, n_world)
+    offset = np.einsum("kji,kj->ki", Ra, T_world_lidar[:, :3, 3] - T_world_anchor[:, :3, 3])
+    ahead = d - np.einsum("ki,ki->k", n, offset)
+    by_pose = np.empty((len(cp), 3, 6))
+    by_pose[:, :, :3] = -n_lidar[:, :, None] * n_world[:, None, :]
+    by_pose[:, :, 3:] = ahead[:, None, None] * (np.swapaxes(Rl, 1, 2) @ so3.hat(n_world))
+    across = (np.eye(3) - n[:, :, None] * n[:, None, :]) / d[:, None, None]
+    along = n - np.einsum("kij,kj->ki", across, offset)
+    by_plane = ahead[:, None, None] * (np.swapaxes(Rl, 1, 2) @ Ra @ across) + n_lidar[:, :, None] * along[:, None, :]
+    return n_lidar * ahead[:, None], by_pose, by_plane
+
+
+def plane_covariance(cp: Floats, count: float, mean: Floats, scatter: Floats, variance: float) -> Floats:
+    """(3, 3) m2 of a closest point (3,) that `count` points fitted, each off the plane with `variance`, m2.
+
+    mean (3,), scatter (3, 3) : m, m2, first moment and covariance of the points
+    The inverse of the Fisher information: n . x - d changes with the closest point by (I - n nT) x / d - n.
+    """
+    n, d = to_hesse(cp)
+    across = (np.eye(3) - np.outer(n, n)) / d
+    along = across @ mean - n
+    return np.asarray(np.linalg.inv(count * (across @ scatter @ across + np.outer(along, along)) / variance))
 
 
 @dataclass(frozen=True)
@@ -117,7 +172,7 @@ class PlaneExtractor:
                 if not fresh[cell] or len(regions) == MOST_PLANES or trials == MOST_SEEDS:
                     continue
                 trials += 1
-                region = cells.grown(int(cell), mean, normal, seeds.radii, free)
+                region = cells.grow(int(cell), mean, normal, seeds.radii, free)
                 fresh[cell] = False
                 fresh[region] = False
                 plane = self._plane(cells, region)
@@ -130,11 +185,11 @@ class PlaneExtractor:
         """The plane of a region of voxels in the order of `Planes`, None where it is too small."""
         if len(region) < LEAST_VOXELS or cells.counts[region].sum() < LEAST_POINTS:
             return None
-        n, d, fit = _fitted(cells.counts[region], cells.means[region], cells.scatters[region])
+        n, d, fit = _fit(cells.counts[region], cells.means[region], cells.scatters[region])
         if fit.values[1] < BREADTH_M**2 or abs(d) < LEAST_DISTANCE_M:
             return None
         cp, variance = n * d, max(float(fit.values[0]), self.sigma**2)
-        C = closest_point.covariance(cp, fit.count, fit.mean, fit.scatter, variance) + self._common(cp)
+        C = plane_covariance(cp, fit.count, fit.mean, fit.scatter, variance) + self._common(cp)
         rms = np.sqrt(max(float(fit.values[0]), 0.0))
         means = cells.means[region]
         return (
@@ -150,20 +205,20 @@ class PlaneExtractor:
 
     def _common(self, cp: Floats) -> Floats:
         """(3, 3) m2 of what all points of a plane are off by together."""
-        n, d = closest_point.split(cp)
+        n, d = to_hesse(cp)
         along = np.outer(n, n)
         return np.asarray(self.common_m**2 * along + (self.common_rad * float(d)) ** 2 * (np.eye(3) - along))
 
 
 @dataclass(frozen=True)
-class _Spread:
+class _Moments:
     count: float
     mean: Floats
     scatter: Floats
     values: Floats
 
 
-def _fitted(counts: Floats, means: Floats, scatters: Floats) -> tuple[Floats, float, _Spread]:
+def _fit(counts: Floats, means: Floats, scatters: Floats) -> tuple[Floats, float, _Moments]:
     """Normal (3,), distance and moments of the points of voxels, from the moments of each."""
     count = float(counts.sum())
     mean = np.einsum("v,vi->i", counts, means) / count
@@ -171,7 +226,7 @@ def _fitted(counts: Floats, means: Floats, scatters: Floats) -> tuple[Floats, fl
     scatter = np.einsum("v,vij->ij", counts, scatters + off[:, :, None] * off[:, None, :]) / count
     values, vectors = np.linalg.eigh(scatter)
     n = vectors[:, 0]
-    return n, float(n @ mean), _Spread(count, mean, scatter, values)
+    return n, float(n @ mean), _Moments(count, mean, scatter, values)
 
 
 @dataclass(frozen=True)
@@ -205,7 +260,7 @@ class _Cells:
         touching = csr_matrix((np.ones(len(pairs), np.int8), pairs.T), (len(mean), len(mean)))
         return cls(count, mean, scatter, voxels.planes[slots, 3:6], voxels.planes[slots, 7], tree, touching)
 
-    def grown(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: Bools) -> Longs:
+    def grow(self, seed: int, mean: Floats, n: Floats, radii: tuple[float, ...], free: Bools) -> Longs:
         """The voxels, sorted, of the plane through `mean` (3,) with normal n (3,) that touch the cell `seed`; of the `free`."""
         d, alone = float(n @ mean), np.array([seed])
         region = alone
@@ -215,7 +270,7 @@ class _Cells:
             region = around[self._on(around, n, d)]
             if len(region) < 3:
                 return alone
-            n, d, _ = _fitted(self.counts[region], self.means[region], self.scatters[region])
+            n, d, _ = _fit(self.counts[region], self.means[region], self.scatters[region])
         thick = self._off(region, n, d)
         region = region[thick <= MIXED_RATIO * np.median(thick)]
         at = np.flatnonzero(region == seed)
@@ -259,7 +314,7 @@ class _Seeds:
         )
 
 
-def turned(planes: Planes, T: Floats) -> tuple[Floats, Floats]:
+def boxes_in(planes: Planes, T: Floats) -> tuple[Floats, Floats]:
     """Corners (K, 3) of the boxes round the planes in the frame that T (4, 4) takes them to."""
     centre, half = 0.5 * (planes.lows + planes.highs), 0.5 * (planes.highs - planes.lows)
     moved, grown = centre @ T[:3, :3].T + T[:3, 3], half @ np.abs(T[:3, :3]).T

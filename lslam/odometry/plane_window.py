@@ -13,8 +13,7 @@ from lslam.core.geometry import se3
 from lslam.core.kernels import linalg
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.imu import MotionState, PreintegratedStep
-from lslam.odometry import closest_point
-from lslam.odometry.inertial.window import Normal
+from lslam.odometry.inertial.filter import Normal
 from lslam.odometry.plane_factors import (
     ORDER,
     PLANE_SIZE,
@@ -27,7 +26,7 @@ from lslam.odometry.plane_factors import (
     sighting_residuals,
     step_residual,
 )
-from lslam.odometry.plane_segmentation import Planes, turned
+from lslam.odometry.plane_segmentation import Planes, boxes_in, to_hesse, transform_planes
 
 # States in the window: a second of most sensors.
 LAG_SCANS = 10
@@ -57,7 +56,7 @@ class Landmarks:
         """Some of them."""
         return Landmarks(self.anchors[which], self.lows[which], self.highs[which], self.unseen[which])
 
-    def seen(self, which: Longs, lows: Floats, highs: Floats) -> Landmarks:
+    def observe(self, which: Longs, lows: Floats, highs: Floats) -> Landmarks:
         """After planes `which` (K,) were seen within boxes (K, 3) and all others were not."""
         low, high, unseen = self.lows.copy(), self.highs.copy(), self.unseen + 1
         np.minimum.at(low, which, lows)
@@ -65,7 +64,7 @@ class Landmarks:
         unseen[which] = 0
         return replace(self, lows=low, highs=high, unseen=unseen)
 
-    def joined(self, anchor: Floats, lows: Floats, highs: Floats) -> Landmarks:
+    def join(self, anchor: Floats, lows: Floats, highs: Floats) -> Landmarks:
         """These and K new ones, with their boxes (K, 3) and a common anchor (4, 4)."""
         return Landmarks(
             np.concatenate([self.anchors, np.broadcast_to(anchor, (len(lows), 4, 4))]),
@@ -87,7 +86,7 @@ class PlaneWindow:
     prior: WindowPrior
     landmarks: Landmarks = field(default_factory=Landmarks)
     steps: tuple[PreintegratedStep, ...] = ()
-    seen: Sightings = field(default_factory=Sightings.none)
+    sightings: Sightings = field(default_factory=Sightings.none)
 
     @classmethod
     def begin(cls, state: MotionState, T_imu_lidar: Floats) -> PlaneWindow:
@@ -102,7 +101,7 @@ class PlaneWindow:
         """(4, 4) of the newest state."""
         return np.asarray(se3.normalise(self.values.poses[-1] @ self.T_imu_lidar))
 
-    def extended(self, step: PreintegratedStep) -> PlaneWindow:
+    def extend(self, step: PreintegratedStep) -> PlaneWindow:
         """With one more state, where `step` leads from the newest one."""
         v = self.values
         doubled = replace(
@@ -115,12 +114,12 @@ class PlaneWindow:
         r, _ = step_residual(doubled, v.states - 1, step)
         update = np.zeros(doubled.size)
         update[doubled.first_plane - STATE_SIZE : doubled.first_plane] = -r
-        return replace(self, values=doubled.moved(update), steps=(*self.steps, step))
+        return replace(self, values=doubled.retract(update), steps=(*self.steps, step))
 
     def normal(self) -> Normal:
         """The normal equations of all factors."""
         return normal_equations(
-            self.values, self.prior, self.steps, self.seen, self.landmarks.anchors, self.T_imu_lidar
+            self.values, self.prior, self.steps, self.sightings, self.landmarks.anchors, self.T_imu_lidar
         )
 
     def with_sightings(
@@ -128,7 +127,7 @@ class PlaneWindow:
     ) -> PlaneWindow:
         """The newest state saw known `planes` (K,): closest points (K, 3), their information (K, 3, 3) and boxes (K, 3)."""
         more = Sightings(np.full(len(planes), self.values.states - 1), planes, cp, information)
-        return replace(self, seen=self.seen.joined(more), landmarks=self.landmarks.seen(planes, lows, highs))
+        return replace(self, sightings=self.sightings.join(more), landmarks=self.landmarks.observe(planes, lows, highs))
 
     def with_planes(self, cp: Floats, information: Floats, lows: Floats, highs: Floats) -> PlaneWindow:
         """The newest state saw new planes (K): its LiDAR is their anchor."""
@@ -140,10 +139,10 @@ class PlaneWindow:
         prior = WindowPrior(pad, np.concatenate([self.prior.gradient, np.zeros(PLANE_SIZE * count)]), at)
         values = replace(self.values, planes=np.concatenate([self.values.planes, cp]))
         more = Sightings(np.full(count, values.states - 1), old + np.arange(count), cp, information)
-        landmarks = self.landmarks.joined(self.T_world_lidar, lows, highs)
-        return replace(self, values=values, prior=prior, seen=self.seen.joined(more), landmarks=landmarks)
+        landmarks = self.landmarks.join(self.T_world_lidar, lows, highs)
+        return replace(self, values=values, prior=prior, sightings=self.sightings.join(more), landmarks=landmarks)
 
-    def solved(self) -> tuple[PlaneWindow | None, int]:
+    def solve(self) -> tuple[PlaneWindow | None, int]:
         """At the minimum of all factors, and after how many Gauss-Newton steps; None where H is not positive definite."""
         window, count = self, 0
         pose = np.arange(6) + self.values.first_plane - STATE_SIZE
@@ -153,7 +152,7 @@ class PlaneWindow:
             update = normal.step()
             if not np.isfinite(update).all():
                 return None, count
-            window = replace(window, values=window.values.moved(update))
+            window = replace(window, values=window.values.retract(update))
             far = update[pose]
             if float(far @ normal.H[np.ix_(pose, pose)] @ far) < SMALL**2:
                 break
@@ -177,7 +176,7 @@ class PlaneWindow:
         out[SHARED : self.values.first_plane - STATE_SIZE] = True
         return out
 
-    def marginalised(self) -> PlaneWindow:
+    def marginalise(self) -> PlaneWindow:
         """Without the oldest state where there are more than `LAG_SCANS`, and without planes that were not seen for long."""
         window = self
         while window.values.states > LAG_SCANS:
@@ -185,23 +184,23 @@ class PlaneWindow:
         return window._without_planes(window.landmarks.unseen >= UNSEEN_SCANS)
 
     def _without_oldest(self) -> PlaneWindow:
-        v, of_first = self.values, self.seen.states == 0
-        few = replace(self, values=v.cut(slice(2)), steps=self.steps[:1], seen=self.seen.only(of_first))
+        v, of_first = self.values, self.sightings.states == 0
+        few = replace(self, values=v.select(slice(2)), steps=self.steps[:1], sightings=self.sightings.only(of_first))
         out = np.zeros(few.values.size, bool)
         out[SHARED : SHARED + STATE_SIZE] = True
         left = few.normal().without(out)
-        rest = self.seen.only(~of_first)
-        values = v.cut(slice(1, None))
+        rest = self.sightings.only(~of_first)
+        values = v.select(slice(1, None))
         return replace(
             self,
             values=values,
-            prior=WindowPrior(left.H, left.g, values.cut(slice(1))),
+            prior=WindowPrior(left.H, left.g, values.select(slice(1))),
             steps=self.steps[1:],
-            seen=replace(rest, states=rest.states - 1),
+            sightings=replace(rest, states=rest.states - 1),
         )
 
     def _without_planes(self, is_old: Bools) -> PlaneWindow:
-        is_old = is_old & ~np.isin(np.arange(len(is_old)), self.seen.planes)
+        is_old = is_old & ~np.isin(np.arange(len(is_old)), self.sightings.planes)
         if not is_old.any():
             return self
         out = np.concatenate([np.zeros(SHARED + STATE_SIZE, bool), np.repeat(is_old, PLANE_SIZE)])
@@ -211,10 +210,10 @@ class PlaneWindow:
         number = np.cumsum(~is_old) - 1
         return replace(
             self,
-            values=self.values.cut(slice(None), ~is_old),
-            prior=WindowPrior(rest.H, rest.g, at.cut(slice(None), ~is_old)),
+            values=self.values.select(slice(None), ~is_old),
+            prior=WindowPrior(rest.H, rest.g, at.select(slice(None), ~is_old)),
             landmarks=self.landmarks.only(~is_old),
-            seen=replace(self.seen, planes=number[self.seen.planes]),
+            sightings=replace(self.sightings, planes=number[self.sightings.planes]),
         )
 
 
@@ -258,13 +257,13 @@ def associate(window: PlaneWindow, planes: Planes, covariance: Floats) -> Longs:
 def _candidates(window: PlaneWindow, planes: Planes) -> tuple[Longs, Longs]:
     """Pairs of planes and landmarks that are alike, near, and overlap as far as was seen."""
     marks, T = window.landmarks, window.T_world_lidar
-    expected = closest_point.seen_from(window.values.planes, np.linalg.inv(marks.anchors) @ T)
-    n, _ = closest_point.split(planes.cp)
-    m, e = closest_point.split(expected)
+    expected = transform_planes(window.values.planes, np.linalg.inv(marks.anchors) @ T)
+    n, _ = to_hesse(planes.cp)
+    m, e = to_hesse(expected)
     # Of a landmark on whose other side the sensor is meant to be, the normal points the other way.
     cosine = n @ m.T
     off = np.abs(planes.means @ m.T - e)
-    lows, highs = turned(planes, T)
+    lows, highs = boxes_in(planes, T)
     is_near = (
         (lows[:, None] - BOXES_APART_M < marks.highs[None]) & (highs[:, None] + BOXES_APART_M > marks.lows[None])
     ).all(axis=2)

@@ -15,12 +15,12 @@ from lslam.core.kernels import voxel
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import FASTEST_M_S, FASTEST_RAD_S, ScanResult
-from lslam.registration.acceptance import Acceptance, failed
+from lslam.registration.acceptance import Acceptance, failure
 from lslam.registration.result import RegistrationResult
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 
-def recorded(scan: Scan, result: RegistrationResult, covariance: Floats | None, own: Floats | None) -> ScanResult:
+def to_scan_result(scan: Scan, result: RegistrationResult, covariance: Floats | None, own: Floats | None) -> ScanResult:
     """The result of a scan from its registration.
 
     covariance : (6, 6) of the pose in the world; own : likewise, relative to the local map
@@ -58,13 +58,13 @@ def judge(
     limits = Acceptance(min_overlap=c.min_overlap, max_jump_m=c.max_jump_m, max_jump_deg=c.max_jump_deg)
     count = alignment.source_points
     if count < MIN_SOURCE_POINTS:
-        result = failed(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")
+        result = failure(T_prior, count, f"{count} usable points, {MIN_SOURCE_POINTS} needed")
     elif not np.isfinite(alignment.T_world_lidar).all():
-        result = failed(T_prior, count, "the solution is not finite")
+        result = failure(T_prior, count, "the solution is not finite")
     else:
         pose = se3.normalise(alignment.T_world_lidar)
         result = limits.judge(replace(alignment, T_world_lidar=pose, matched=alignment.inliers), T_prior)
-    return recorded(scan, replace(result, stages=stages), None, None)
+    return to_scan_result(scan, replace(result, stages=stages), None, None)
 
 
 # s; over a shorter time a registration may err by as much as the fastest moves.

@@ -50,7 +50,7 @@ class SmallGicp(Traits):
     def prepare(self, scan: Scan) -> Any:
         """The package's point cloud: gated, down-sampled, with a covariance per point; None without usable points."""
         points = clean_points(scan.points, self._preprocess)
-        return self._covered(points.astype(np.float64))[0] if len(points) >= MIN_SOURCE_POINTS else None
+        return self._with_covariances(points.astype(np.float64))[0] if len(points) >= MIN_SOURCE_POINTS else None
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         """Align with the local map; enter a keyframe when the sensor has moved on."""
@@ -88,10 +88,10 @@ class SmallGicp(Traits):
     def _insert(self, points: Floats, pose: Floats) -> None:
         self._clouds.append(se3.apply(pose, points))
         del self._clouds[:-MAP_KEYFRAMES]
-        self._target = self._covered(np.concatenate(self._clouds))
+        self._target = self._with_covariances(np.concatenate(self._clouds))
         self._T_world_keyframe = pose.copy()
 
-    def _covered(self, points: Floats) -> tuple[Any, Any]:
+    def _with_covariances(self, points: Floats) -> tuple[Any, Any]:
         """Cloud with covariances, and its tree."""
         cloud, tree = self._package.preprocess_points(points, downsampling_resolution=LEAF_M, num_threads=self._threads)
         return cloud, tree

@@ -12,12 +12,12 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance
+from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR
+from lslam.registration.optimiser import KERNEL_DECAY, Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import KERNEL_DECAY, Annealing
-from lslam.registration.solver import solve
 
 # A scan that moved by less since the last registered one is stationary: several times the noise of a registration.
 STANDING_M, STANDING_DEG = 0.02, 0.1
@@ -45,10 +45,7 @@ class StationaryDetector(Stateful):
         self._limit_m, self._limit_rad = STANDING_M, float(np.deg2rad(STANDING_DEG))
         c = self._config
         # Of the reference, in voxels as coarse as those of a map's first scans: a ring is no plane.
-        self._planes = GaussianMap(
-            c.voxel_size * COARSE_FACTOR,
-            reach=1.2 * preprocess.range_max,
-        )
+        self._planes = GaussianMap(c.voxel_size * COARSE_FACTOR, reach=1.2 * preprocess.range_max)
         # The pose of its own points on them after one step; None: there is no reference.
         self._T_own: Floats | None = None
         self._last: ScanResult | None = None

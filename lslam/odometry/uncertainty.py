@@ -39,13 +39,13 @@ class DeskewUncertainty(Stateful):
         self._within = np.eye(4)
         self._span_s = self._lead_s = 0.0
 
-    def observe(self, prior: MotionPrior, stamp_ns: int, pose: Floats, is_registered: bool) -> Floats:
+    def observe(self, prior: MotionPrior, stamp_ns: int, pose: Floats, has_registration: bool) -> Floats:
         """(6, 6) covariance, world axes, of the pose (4, 4) found at `stamp_ns` for the scan that `prior` deskewed.
 
         Zero for scans of one instant. A pose without a registration is not learnt from, nor is the one after it.
         """
         step_s = 0.0 if self._stamp_ns is None else 1e-9 * (stamp_ns - self._stamp_ns)
-        if is_registered and self._span_s > 0 and step_s > 0:
+        if has_registration and self._span_s > 0 and step_s > 0:
             expected = se3.log(self._within) * step_s / self._span_s
             if prior.change is None:
                 off = se3.log(se3.relative(se3.exp(expected), se3.relative(self._pose, pose)))
@@ -53,7 +53,7 @@ class DeskewUncertainty(Stateful):
                 off = se3.log(se3.relative(prior.poses[0], prior.poses[-1])) * step_s / prior.span_s - expected
             self._learn(off, step_s)
         # The first sweep was deskewed by the second scan's registration: their residual is zero by construction.
-        self._span_s = prior.span_s if is_registered and self._stamp_ns is not None else 0.0
+        self._span_s = prior.span_s if has_registration and self._stamp_ns is not None else 0.0
         self._lead_s = float(prior.times[0] + prior.times[-1])
         self._stamp_ns, self._pose = stamp_ns, pose.copy()
         self._within = se3.relative(prior.poses[0], prior.poses[-1])

@@ -30,11 +30,11 @@ from lslam.osm.classes import classify
 from lslam.osm.corrections import place_buildings
 from lslam.osm.matcher import Laid, accepted_part
 from lslam.osm.walls import WALL_RANGE_M, OsmMap
+from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.residuals import residual_named
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import solve
+from lslam.registration.residuals import find_residual
 
 # Keyframes after which the baseline's graph is optimised again; Del Tufo's timer does so every 3 s.
 EVERY = 5
@@ -206,7 +206,7 @@ def _align(
     upright = _upright(source, HEIGHTS)
     points = PreparedPoints(upright.astype(np.float32), upright, np.zeros((len(upright), 6)), len(upright))
     annealing, c = Annealing(WIDTH, 0.5, 0.8, STEPS), RegistrationConfig(sigma=NOISE, blob_weight=1.0, weak_share=0.0)
-    found = solve((ground,), points, se2.to_se3(prior), annealing, c, residual=residual_named(residual))
+    found = solve((ground,), points, se2.to_se3(prior), annealing, c, residual=find_residual(residual))
     pose = se2.of_se3(found.T_world_lidar)
     if not found.ok or found.overlap < LEAST_OVERLAP or np.linalg.norm(pose[:2] - prior[:2]) > FARTHEST_M:
         return None

@@ -10,7 +10,7 @@ from lslam.core.errors import UsageError
 from lslam.evaluation import check_words, parse_delta
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
 from lslam.osm import matcher_named
-from lslam.registration.residuals import residual_named
+from lslam.registration.residuals import find_residual
 
 # Methods that match a scan against Gaussian voxels, and what only some methods look at. A policy of `recovery` that is switched
 # off is heeded by all: those that override it have it switched off.
@@ -55,7 +55,7 @@ def check_config(config: Config) -> None:
 
         require_open3d()
     if config.registration.residual is not None:
-        residual_named(config.registration.residual)
+        find_residual(config.registration.residual)
     _check_heeded(config)
     matcher_named(config.osm.matcher)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):

@@ -30,10 +30,9 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.checkpoints import Checkpoints, OdometryCheckpoints
 from lslam.odometry.frontend.inertial_start import with_imu_settings
-from lslam.odometry.frontend.mounting import with_up
 from lslam.odometry.frontend.point_times import with_point_times
 from lslam.odometry.frontend.register_scans import sweep_of
-from lslam.odometry.frontend.scene_scale import LENGTHS, with_scene_scale
+from lslam.odometry.frontend.scene_scale import LENGTHS, with_scene_scale, with_up
 from lslam.odometry.frontend.wheel_start import Wheels, begin_wheels
 from lslam.odometry.given import GivenMotion, GivenPoses
 from lslam.osm.source import OsmSource, open_osm

@@ -31,7 +31,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.state_files import Records
 from lslam.odometry.frontend.register_scans import read_ahead, to_trajectory
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.job import PreparedRun
 from lslam.pipeline.manifest import Manifest
 from lslam.pipeline.map_pass import motion_within

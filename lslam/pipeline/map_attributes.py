@@ -34,7 +34,7 @@ def with_attributes(sequence: Sequence, config: Config) -> Sequence:
     if not scans or any(scan.rings is not None for scan in scans):
         return sequence
     try:
-        return with_rings(sequence, config.input.rings, is_required=False)
+        return with_rings(sequence, config.input.rings, is_strict=False)
     except InputError as error:
         raise InputError(f"{error}; or leave ring out of {KEY}") from None
 

@@ -34,8 +34,8 @@ from lslam.maps.observations import Observations
 from lslam.maps.occupancy import OccupancyGrid, OccupancyMapper
 from lslam.odometry.frontend.checkpoints import Checkpoints
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.tracker import Loaded
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.frontend.tracker import ScanInput
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.map_attributes import attribute_notes, with_attributes
 from lslam.pipeline.run_folder import CHECKPOINT, RunFolder
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
@@ -110,7 +110,7 @@ def scans_again(
     interrupted: str,
     done: int = 0,
     offer: Callable[[int, bool], None] | None = None,
-) -> Iterator[tuple[int, Loaded]]:
+) -> Iterator[tuple[int, ScanInput]]:
     """Second pass over raw scans: their numbers, and the results of `prepare`, which runs ahead in a thread.
 
     interrupted : message of the InterruptedRunError that is raised when `should_stop` says so

@@ -25,13 +25,13 @@ from lslam.odometry.frontend.inertial_start import (
     Inertial,
     begin_inertial,
     close_inertial,
+    copy_of,
     load_start,
     save_start,
     with_imu_settings,
 )
 from lslam.odometry.frontend.keyframing import Keyframing
-from lslam.odometry.frontend.motion_models import copy_of
-from lslam.odometry.frontend.register_scans import estimate, is_diverged, to_trajectory
+from lslam.odometry.frontend.register_scans import diverges, estimate, to_trajectory
 from lslam.odometry.frontend.segments import Begin
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.frontend.wheel_start import close_wheels
@@ -117,7 +117,7 @@ def estimate_poses(job: PreparedRun) -> RunRecord:
     _report_faults(results, manifest)
     results = join_segments(results, store, config, manifest, watch.should_stop)
     manifest.keyframes = {"count": len(store), "bytes": store.size}
-    manifest.judge(results, len(sequence), is_diverged(results))
+    manifest.judge(results, len(sequence), diverges(results))
     checks = [] if monitor is None else checks_within(monitor.checks, results)
     if monitor is not None:
         results = mark_lost(results, checks, manifest)

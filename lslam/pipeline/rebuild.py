@@ -60,7 +60,7 @@ from lslam.pipeline.map_files import (
 from lslam.pipeline.map_pass import INTERRUPTED, BuiltMap
 from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.registration.preprocessing.sweep_clock import SweepClock
-from lslam.registration.preprocessing.views import Clocked, WithoutClasses
+from lslam.registration.preprocessing.views import ClockView, WithoutClasses
 from lslam.reports.evaluations import run_document
 from lslam.reports.html import with_new_map
 from lslam.reports.recording import ViewedRun
@@ -186,7 +186,7 @@ def _with_clock(run: EarlierRun, opened: Sequence) -> Sequence:
         is_stated = facts["verdict"] == "stated"
     except MISFIT as error:
         raise InputError(f"{run.folder / MANIFEST}: point_times: {error}; run the sequence again") from None
-    return opened if clock is None and not is_stated else Clocked(opened, clock, zip(firsts, later, strict=True))
+    return opened if clock is None and not is_stated else ClockView(opened, clock, zip(firsts, later, strict=True))
 
 
 def rebuild(

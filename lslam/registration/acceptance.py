@@ -10,8 +10,8 @@ import numpy as np
 
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import OPEN_M, OPEN_RAD
+from lslam.registration.history import UsualAgreement
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import UsualAgreement
 
 Test = Literal["solution", "directions", "rmse", "overlap", "inliers", "agreement", "jump"]
 
@@ -80,10 +80,10 @@ class Acceptance:
         rejection = self.rejection(result, jump)
         if rejection is None:
             return replace(result, prior_error=jump)
-        return replace(failed(T_prior, result.source_points, rejection.reason), iterations=result.iterations)
+        return replace(failure(T_prior, result.source_points, rejection.reason), iterations=result.iterations)
 
 
-def failed(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
+def failure(T_prior: Floats, source_points: int, reason: str) -> RegistrationResult:
     """The motion prior with its covariance."""
     return RegistrationResult(
         T_prior.copy(),

@@ -1,30 +1,104 @@
-"""The ways a scan is laid on the local map: from nearly the right place, or from metres off."""
+"""Points on Gaussian voxels: the terms of their residual, and the ways a scan is laid on a map.
+
+From nearly the right place, or from metres off.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.arrays import Floats
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.kernels import prior_residual
 from lslam.registration.local_map import LocalMap
-from lslam.registration.optimiser import EVERYWHERE, Correspondences, Limits, Term, optimise
-from lslam.registration.preprocessing.ground import Z
-from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.residuals import PLANE, ResidualKind
-from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import (
+from lslam.registration.optimiser import (
     COARSE_DECAY,
     COARSE_KERNEL_M,
+    EVERYWHERE,
     KERNEL_DECAY,
     KERNEL_MIN_M,
     START_ITERATIONS,
     Annealing,
+    Correspondences,
+    Limits,
+    Problem,
+    Term,
+    optimise,
 )
-from lslam.registration.solver import prior_term, solve, voxel_terms
+from lslam.registration.preprocessing.ground import Z
+from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.residuals import PLANE, ResidualKind
+from lslam.registration.result import RegistrationResult
+
+
+def solve(
+    levels: Sequence[GaussianMap],
+    points: PreparedPoints,
+    T_prior: Floats,
+    annealing: Annealing,
+    c: RegistrationConfig,
+    *,
+    residual: ResidualKind = PLANE,
+    directions: Floats = EVERYWHERE,
+) -> RegistrationResult:
+    """Align the source points with maps by annealed Gauss-Newton, starting at `T_prior` (4, 4), as `c` weighs them.
+
+    Points without a plane or a blob in one of the maps, the finest first, are matched in the next. `directions` as in `Limits`.
+    """
+    matches = Correspondences(len(points.source))
+    terms = voxel_terms(residual, residual.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
+    limits = Limits(c.weak_share, by_surfaces=residual.by_surfaces, directions=directions)
+    return optimise(terms, T_prior, annealing, limits, matches)
+
+
+def prior_term(T_prior: Floats, information: Floats) -> Term:
+    """The pose (4, 4) as a measurement, of information (6, 6), world axes, 1/m2 and 1/rad2."""
+    R, t = (np.ascontiguousarray(part, np.float64) for part in (T_prior[:3, :3], T_prior[:3, 3]))
+    return Term(prior_residual.linearise, (), (R, t, information), ())
+
+
+def voxel_terms(
+    kind: ResidualKind,
+    points: tuple[Any, ...],
+    levels: Sequence[GaussianMap],
+    matches: Correspondences,
+    sigma: float,
+    blob_weight: float,
+) -> list[Term]:
+    """The residual of the points on each of the maps, the finest first, which share their matches.
+
+    points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
+
+    The mean of a voxel beyond the second size constrains nothing.
+    """
+    last, linearise, usual = len(levels) - 1, kind.linearise, levels[:2][-1].size
+    return [
+        Term(
+            linearise,
+            points,
+            kind.voxels(level),
+            (
+                level.size,
+                float(sigma) ** 2,
+                part_of_usual(level.size, usual),
+                float(blob_weight) if k < 2 else 0.0,
+                kind.along,
+                0 < k == last,
+            ),
+            matches.search(level),
+        )
+        for k, level in enumerate(levels)
+    ]
+
+
+def part_of_usual(size: float, usual: float) -> float:
+    """Weight of planes in voxels that are larger than usual, m: what bends within them makes their points err together."""
+    return min(usual / size, 1.0)
 
 
 class MapAlignment:
@@ -35,24 +109,6 @@ class MapAlignment:
         # Of the last refinement, and when in the life of the map it was.
         self._matches, self._changes = Correspondences(0), 0
 
-    def refine(
-        self,
-        points: PreparedPoints,
-        start: Floats,
-        width: float,
-        steps: int,
-        coarser: Sequence[GaussianMap] = (),
-        allowed: Floats = EVERYWHERE,
-        information: Floats | None = None,
-    ) -> RegistrationResult:
-        """Align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
-
-        coarser : maps for the points that find nothing in the fine one, finest first; none: all that there are
-        allowed : (6, 6) projector on the directions that are aligned, world axes; no rows: all
-        information : (6, 6) of the start as a prior, world axes, 1/m2 and 1/rad2; None: it is only a start
-        """
-        return optimise(*self.problem(points, start, width, steps, coarser, allowed, information))
-
     def problem(
         self,
         points: PreparedPoints,
@@ -60,25 +116,31 @@ class MapAlignment:
         width: float,
         steps: int,
         coarser: Sequence[GaussianMap] = (),
-        allowed: Floats = EVERYWHERE,
+        directions: Floats = EVERYWHERE,
         information: Floats | None = None,
-    ) -> tuple[list[Term], Floats, Annealing, Limits, Correspondences, float, float]:
-        """The arguments of `optimise` by which `refine` aligns."""
+    ) -> Problem:
+        """To align with the fine map from `start` (4, 4), the kernel closing from `width`, m, or as the user wants it.
+
+        coarser : maps for the points that find nothing in the fine one, finest first; none: all that there are
+        directions : (6, 6) projector on the directions that are aligned, world axes; no rows: all
+        information : (6, 6) of the start as a prior, world axes, 1/m2 and 1/rad2; None: it is only a start
+        """
         c, coarser = self.config, coarser or self.map.coarser
         coarser = coarser if self.kind.is_wide else coarser[:1]
         # The larger the planes, the farther their surface may be from them.
         end = coarser[0].size / self.map.coarser[0].size * KERNEL_MIN_M
         width, end = (max(width, end), end) if c.inlier_distance is None else (c.inlier_distance,) * 2
-        matches = self._remembered(len(points.source))
+        matches = self._recall(len(points.source))
         arrays, levels = self.kind.points(points, c.sigma), (self.map.fine, *coarser)
         terms = voxel_terms(self.kind, arrays, levels, matches, c.sigma, c.blob_weight)
         if information is not None:
             terms.append(prior_term(start, information))
-        limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, allowed=allowed)
+        limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, directions=directions)
         farthest = np.inf if c.inlier_distance is None else c.inlier_distance
-        return terms, start, Annealing(width, end, KERNEL_DECAY, steps), limits, matches, farthest, c.inlier_ratio
+        annealing = Annealing(width, end, KERNEL_DECAY, steps)
+        return Problem(terms, start, annealing, limits, matches, farthest, c.inlier_ratio)
 
-    def _remembered(self, count: int) -> Correspondences:
+    def _recall(self, count: int) -> Correspondences:
         """What was looked up for as many points in the map as it is: a scan is deskewed twice, and moves little between."""
         if self._changes != self.map.changes or len(self._matches) != count:
             self._matches, self._changes = Correspondences(count), self.map.changes
@@ -97,7 +159,7 @@ class MapAlignment:
         coarser = self.coarse_maps(points, T_prior)
         coarse = solve(coarser[:1], points, T_prior, self.slowly(min(width, COARSE_KERNEL_M)), c)
         start = coarse.T_world_lidar if coarse.ok else T_prior
-        fine = self.refine(points, start, c.kernel_max, START_ITERATIONS, coarser)
+        fine = optimise(*self.problem(points, start, c.kernel_max, START_ITERATIONS, coarser))
         return replace(fine, iterations=coarse.iterations + fine.iterations)
 
     def coarse_maps(self, points: PreparedPoints, T_prior: Floats) -> tuple[GaussianMap, ...]:

@@ -15,8 +15,8 @@ from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.history import History
+from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, START_ITERATIONS, Annealing
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import KERNEL_DECAY, KERNEL_MIN_M, START_ITERATIONS, Annealing
 
 # The kernel opens so many times its end width around a pose that is nearly right.
 NEAR_KERNEL_FACTOR = 2.0

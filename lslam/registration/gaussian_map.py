@@ -1,6 +1,11 @@
-"""The local map: hashed voxels, each a running Gaussian with a normal; old ground is forgotten as the sensor leaves it."""
+"""Hashed voxels, each a running Gaussian with a normal, of the local map and of one scan.
+
+The map forgets old ground as the sensor leaves it; a scan tells what surface a source point lies on.
+"""
 
 from __future__ import annotations
+
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +14,7 @@ from lslam.core.errors import InputError
 from lslam.core.kernels import gaussians
 from lslam.core.types.arrays import Floats
 from lslam.core.types.state import State, Stateful
+from lslam.registration.kernels.discs import EXTENT_M2, source_discs
 
 # Variance added to every voxel, (1 cm)2: a standing sensor would otherwise collapse the Gaussians.
 FLOOR_M2 = 1e-4
@@ -29,7 +35,7 @@ class GaussianMap(Stateful):
     min_points, planarity, count_cap : when a voxel is matched, when it is a plane, how much it remembers
     reach : m, voxels farther than this from the sensor are given back
     breadth : how broad points must lie across the beams that saw them, see `kernels.gaussians`; 0: not asked
-    shared : m2, variance that the points of one scan share, along the normal: of their pose, in a map of several scans
+    scan_variance : m2, variance that the points of one scan share, along the normal: of their pose, in a map of several scans
     """
 
     def __init__(
@@ -42,11 +48,11 @@ class GaussianMap(Stateful):
         reach: float = 150.0,
         capacity: int = 1 << 16,
         breadth: float = 0.0,
-        shared: float = 0.0,
+        scan_variance: float = 0.0,
     ) -> None:
         self.size, self.min_points, self.planarity = size, min_points, planarity
         self.count_cap, self.reach = count_cap, reach
-        self.breadth, self.shared = breadth, shared
+        self.breadth, self.scan_variance = breadth, scan_variance
         self.moments = np.zeros((capacity, 13))
         self.planes = np.zeros((capacity, 8))
         self.keys = np.full(capacity, gaussians.FREE, np.int64)
@@ -68,26 +74,16 @@ class GaussianMap(Stateful):
         while len(self.keys) - len(self) < len(points):
             self._grow()
         R, t = np.ascontiguousarray(T_world_lidar[:3, :3]), np.ascontiguousarray(T_world_lidar[:3, 3])
-        return gaussians.insert(
-            points,
-            R,
-            t,
+        rules = (
             self.size,
             self.count_cap,
             float(self.min_points),
             self.planarity,
             FLOOR_M2,
-            self.shared,
+            self.scan_variance,
             self.breadth,
-            self.reach,
-            self.moments,
-            self.planes,
-            self.keys,
-            self.refreshed,
-            self.table,
-            self.pool,
-            self.free,
         )
+        return gaussians.insert(points, R, t, *rules, self.reach, *self._arrays)
 
     def clear(self) -> None:
         """Forget everything; the room is kept."""
@@ -98,7 +94,6 @@ class GaussianMap(Stateful):
 
     def shapes(self) -> Floats:
         """(C, 14) full Gaussians of the voxels, for `ndt`: computed when asked for, where voxels have grown."""
-        from lslam.registration.kernels.discs import EXTENT_M2
         from lslam.registration.kernels.ndt_residual import describe
 
         if len(self._shapes) < len(self.keys):
@@ -129,7 +124,7 @@ class GaussianMap(Stateful):
             reach=self.reach,
             capacity=capacity,
             breadth=self.breadth,
-            shared=self.shared,
+            scan_variance=self.scan_variance,
         )
         gaussians.coarsen(
             factor,
@@ -137,20 +132,19 @@ class GaussianMap(Stateful):
             float(coarse.min_points),
             self.planarity,
             FLOOR_M2,
-            self.shared,
+            self.scan_variance,
             self.breadth,
             self.moments,
             self.keys,
             int(self.pool[gaussians.USED]),
-            coarse.moments,
-            coarse.planes,
-            coarse.keys,
-            coarse.refreshed,
-            coarse.table,
-            coarse.pool,
-            coarse.free,
+            *coarse._arrays,
         )
         return coarse
+
+    @property
+    def _arrays(self) -> tuple[Any, ...]:
+        """All voxels, as the kernels take them."""
+        return self.moments, self.planes, self.keys, self.refreshed, self.table, self.pool, self.free
 
     def state(self) -> State:
         """The voxels: all of the pool that was ever used."""
@@ -200,3 +194,47 @@ class GaussianMap(Stateful):
     def _rehash(self) -> None:
         self.table = np.full(4 * len(self.keys), -1, np.int32)
         gaussians.rehash(self.keys, self.table, int(self.pool[gaussians.USED]))
+
+
+# m; a sparse sensor's neighbouring rings share a cell of the second size, where the first holds one of them.
+COVARIANCE_CELL_M = 1.0
+CELL_FACTOR = 2
+# As many neighbours as Segal et al. (2009) take.
+COVARIANCE_POINTS = 20
+
+Neighbourhood = Literal["voxel", "knn"]
+
+
+def source_covariance(
+    source: Floats, map_points: NDArray[np.float32], thin: float, neighbourhood: Neighbourhood = "voxel"
+) -> Floats:
+    """Covariances (S, 6), m2, LiDAR frame, of source points (S, 3): discs of variance `thin` along their normal.
+
+    neighbourhood : of which of the scan's own points (M, 3): `_of_voxels` or `_of_neighbours`
+    """
+    return (_of_neighbours if neighbourhood == "knn" else _of_voxels)(source, map_points, thin)
+
+
+def _of_neighbours(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
+    """As generalized ICP has it: the normal of the nearest points, whether these are of several rings or of one."""
+    from scipy.spatial import cKDTree
+
+    cloud = map_points.astype(np.float64)
+    near = cloud[cKDTree(cloud).query(source, min(COVARIANCE_POINTS, len(cloud)))[1].reshape(len(source), -1)]
+    away = near - near.mean(axis=1, keepdims=True)
+    normal = np.linalg.eigh(np.swapaxes(away, 1, 2) @ away)[1][:, :, 0]
+    discs = EXTENT_M2 * np.eye(3) - (EXTENT_M2 - thin) * normal[:, :, None] * normal[:, None, :]
+    return np.ascontiguousarray(discs[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+
+
+def _of_voxels(source: Floats, map_points: NDArray[np.float32], thin: float) -> Floats:
+    """The normal is that of the scan's own points in the cell around. A ring by itself has none: a disc across it would be
+    a guess that holds the sensor to where the ring was. Such points get no normal but their noise, `thin` in all
+    directions, and the map's normal alone decides.
+    """
+    scan = GaussianMap(COVARIANCE_CELL_M, capacity=1 << int(np.ceil(np.log2(max(len(map_points), 256)))), reach=np.inf)
+    scan.insert(map_points, np.eye(4))
+    out = np.tile([thin, 0.0, 0.0, thin, 0.0, thin], (len(source), 1))
+    for cells in (scan.coarsen(CELL_FACTOR), scan):
+        source_discs(source, cells.size, cells.planes, cells.keys, cells.table, thin, out)
+    return out

@@ -7,23 +7,38 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.core.geometry import se3
+from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.gauss_newton import UNSEEN_SHARE, step, step_on_surfaces, trimming_distance2
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.registration.result import LEAST_MATCHED, RegistrationResult
-from lslam.registration.robust import Annealing
 
 # A step below these ends the iteration: a tenth of the noise of a point, and what that is of a turn.
 STEP_M = 1e-3
 STEP_RAD = STEP_M / LEVER_M
+# m; the kernel's width at the end, five sigma of a point, and its factor from step to step.
+KERNEL_MIN_M, KERNEL_DECAY = 0.15, 0.5
+# Coarse planes: the kernel's width at the start, m, which is the capture range, and its factor.
+COARSE_KERNEL_M, COARSE_DECAY = 5.0, 0.85
+# Steps of each stage while starting or recovering.
+START_ITERATIONS = 40
 EVERYWHERE: Floats = np.zeros((0, 6))
+
+
+@dataclass(frozen=True)
+class Annealing:
+    """Widths of the Geman-McClure kernel, m: from `start` times `decay` per step down to `end`, `steps` at most."""
+
+    start: float
+    end: float
+    decay: float
+    steps: int
 
 
 class Correspondences:
@@ -76,14 +91,31 @@ class Limits:
     weak_share : part of the information below which it does not; least : 1/m2, likewise
     unseen : part of either below which it is not even followed
     by_surfaces : the residual's matrices are full, and its surfaces alone tell
-    allowed : (6, 6) projector on the directions of the steps; no rows: all
+    directions : (6, 6) projector on the directions of the steps; no rows: all
     """
 
     weak_share: float
     least: float = 0.0
     unseen: float = UNSEEN_SHARE
     by_surfaces: bool = False
-    allowed: Floats = field(default_factory=lambda: EVERYWHERE)
+    directions: Floats = field(default_factory=lambda: EVERYWHERE)
+
+
+def pose_change(pose: Floats, reference: Floats) -> Floats:
+    """(6,) d of t = t' + d[:3], R = exp(d[3:]) R' from a reference pose (4, 4) to another, as the steps are."""
+    return np.concatenate([pose[:3, 3] - reference[:3, 3], so3.log(pose[:3, :3] @ reference[:3, :3].T)])
+
+
+class Problem(NamedTuple):
+    """What `optimise` solves, and from where: its arguments."""
+
+    terms: Sequence[Term]
+    T_start: Floats
+    annealing: Annealing
+    limits: Limits
+    matches: Correspondences
+    inlier_distance: float = np.inf
+    inlier_ratio: float = 1.0
 
 
 def optimise(
@@ -120,7 +152,7 @@ def optimise(
             term.linearise(term.points, term.target, term.settings, term.search, pose, width, sums)
         if facts[at.MATCHED] < LEAST_MATCHED:
             break
-        is_moved, count, move, turn = advance(pose, sums, scale, bounds, limits.allowed, d, weak)
+        is_moved, count, move, turn = advance(pose, sums, scale, bounds, limits.directions, d, weak)
         if not is_moved:
             break
         converged = scale <= end and move < STEP_M and turn < STEP_RAD
@@ -128,8 +160,8 @@ def optimise(
         if inlier_ratio < 1.0:
             gate2 = trimming_distance2(matches.away2, float(inlier_ratio), farthest2)
     weak = weak[:count]
-    if len(limits.allowed):
-        weak = weak[np.linalg.norm(weak @ limits.allowed, axis=1) > 0.5]
+    if len(limits.directions):
+        weak = weak[np.linalg.norm(weak @ limits.directions, axis=1) > 0.5]
     return RegistrationResult.of(
         se3.make(*pose),
         H,
@@ -148,7 +180,7 @@ def warm_up() -> None:
     sums = np.eye(6), np.zeros((6, 6)), np.zeros(6), np.zeros(at.COUNT)
     limits = Limits(0.1)
     bounds = (float(limits.weak_share), float(limits.least), float(limits.unseen))
-    step((np.eye(3), np.zeros(3)), sums, 1.0, bounds, limits.allowed, np.zeros(6), np.zeros((6, 6)))
+    step((np.eye(3), np.zeros(3)), sums, 1.0, bounds, limits.directions, np.zeros(6), np.zeros((6, 6)))
 
 
 def normal_equations(terms: Sequence[Term], T: Floats, width: float, matches: Correspondences) -> tuple[Floats, Floats]:

@@ -1,15 +1,241 @@
-"""The recovery policies that a configuration switches on, in the order in which they are tried."""
+"""The recovery policies that a configuration switches on, in the order in which they are tried.
+
+The search for the start is one: at the first steps nothing is known yet of how fast the sensor moves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from lslam.core.config.odometry import RecoveryConfig
-from lslam.registration.attempt import Attempt, Policy
+import numpy as np
+
+from lslam.core.config.input import PreprocessConfig
+from lslam.core.config.odometry import RecoveryConfig, RegistrationConfig
+from lslam.core.geometry import se3, so3
+from lslam.core.types.arrays import Bools, Floats, Points
+from lslam.registration.alignment import solve, upright_directions, voxel_terms
+from lslam.registration.attempt import NEAR_KERNEL_FACTOR, Attempt, Policy
+from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.history import is_more
+from lslam.registration.optimiser import (
+    KERNEL_MIN_M,
+    START_ITERATIONS,
+    Annealing,
+    Correspondences,
+    normal_equations,
+    optimise,
+)
+from lslam.registration.preprocessing.ground import Ground, Z, above_ground, ground_of, up_of
+from lslam.registration.preprocessing.prepare import PreparedPoints, subset, thin
+from lslam.registration.residuals import MEANS
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import is_more
-from lslam.registration.start_search import StartSearch
+
+# m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
+# and none of them passes for a plane.
+NEAR_M = 0.4
+ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, blob_weight=1.0, weak_share=0.0)
+# m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
+HIGH_M = 1.2
+# m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
+START_STEP_M = 1.0
+# A hand-held sensor turns at 100 deg/s, by 30 deg at every third scan; so far apart that 20 m away a step is left.
+TURN_STEP_DEG = 3.0
+START_TURNS_DEG = np.delete(np.arange(-30.0, 31.0, TURN_STEP_DEG), 10)
+# Every so many-th source point is enough to tell a good start from a bad one; so many of the best are looked at closely.
+SEARCH_STRIDE, MOST_STARTS = 4, 3
+# Along a bare wall the rings repeat best where nothing moved, by five percent: a start elsewhere must have more, and twice
+# as much where planes, the prior or both say otherwise.
+CLEAR_RATIO = 1.05
+MUCH_RATIO = 2 * CLEAR_RATIO - 1
+
+
+class NonGroundPoints:
+    """Non-ground points of a few scans: points (N, 3), LiDAR frame, and pose (4, 4) of each.
+
+    Ground, guard rails and walls are self-similar, and a sensor's own rings match best at zero motion. The pattern of posts,
+    trees, signs and ends of walls is unique.
+    """
+
+    def __init__(self, scans: Iterable[tuple[Points, Floats]], preprocess: PreprocessConfig) -> None:
+        self._cells = GaussianMap(NEAR_M, min_points=1, planarity=np.inf, reach=np.inf, capacity=1 << 12)
+        self._up = up_of(preprocess)
+        for points, T_world_lidar in scans:
+            index = above_ground(points, self._up)
+            self._cells.insert(points[index], T_world_lidar)
+
+    def agreeing(self, high: PreparedPoints, T_world_lidar: Floats) -> Bools:
+        """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
+        matches = Correspondences(len(high.source))
+        terms = voxel_terms(MEANS, MEANS.points(high, NEAR_M), (self._cells,), matches, NEAR_M, 1.0)
+        normal_equations(terms, T_world_lidar, NEAR_M, matches)
+        return (matches.away2 >= 0) & (matches.away2 < NEAR_M**2)
+
+    def share(self, high: PreparedPoints, T_world_lidar: Floats) -> float:
+        """Which part of them does."""
+        return np.count_nonzero(self.agreeing(high, T_world_lidar)) / max(len(high.source), 1)
+
+    def align(self, high: PreparedPoints, T_start: Floats) -> RegistrationResult:
+        """Lay them on these points, point to point, from less than `START_STEP_M` away, with height and tilt as they are.
+
+        At the wrong height, or tilted by a degree, rings agree with those of another scan that hit something else.
+        """
+        level = np.eye(6) - upright_directions(T_start, self._up)
+        annealing = Annealing(START_STEP_M, NEAR_M / 2, 0.7, 20)
+        return solve((self._cells,), high, T_start, annealing, ALL_ALIKE, residual=MEANS, directions=level)
+
+
+def ground_under(points: PreparedPoints, preprocess: PreprocessConfig) -> Ground:
+    """The ground under a scan."""
+    return ground_of(points.map_points, up_of(preprocess))
+
+
+def high_points(points: PreparedPoints, ground: Ground) -> PreparedPoints:
+    """What to look for among `NonGroundPoints` at some pose: the points of another scan that are high above its ground."""
+    above = points.map_points[ground.above(points.map_points, HIGH_M)]
+    return PreparedPoints(above, above.astype(np.float64), np.zeros((len(above), 6)), len(above))
+
+
+def on_ground(points: PreparedPoints, ground: Ground) -> PreparedPoints:
+    """The source points that lie on the ground."""
+    is_ground = np.ones(len(points.source), bool)
+    is_ground[ground.above(points.source.astype(np.float32))] = False
+    return subset(points, is_ground)
+
+
+class StartSearch:
+    """Tries several places along the sensor's axis; the non-ground points of the last scans decide between them.
+
+    Posts and crash barriers repeat every few metres, so the nearest agreement of planes may be a false one.
+    """
+
+    name = "start search"
+
+    def recover(self, attempt: Attempt, result: RegistrationResult) -> RegistrationResult:
+        """Acts while the map is made of the first scans and on failed ones; the second scan may lie anywhere in reach."""
+        is_settled = result.ok and not attempt.history.is_young
+        if attempt.config.start_reach == 0 or is_settled:
+            return result
+        better = best_by_non_ground(attempt, result, may_be_anywhere=attempt.history.inserted == 1)
+        return attempt.credit(better, self.name) if better is not result and better.ok else better
+
+
+def best_by_non_ground(
+    attempt: Attempt, result: RegistrationResult, *, may_be_anywhere: bool = False
+) -> RegistrationResult:
+    """The result, unless significantly more non-ground points of the last scans are inliers elsewhere.
+
+    may_be_anywhere : whether the sensor may be anywhere within `start_reach`, as after a failed registration
+    """
+    target, c, points, T_prior = attempt.target, attempt.config, attempt.points, attempt.T_prior
+    ground = ground_under(points, target.preprocess)
+    non_ground, high = NonGroundPoints(attempt.history.recent, target.preprocess), high_points(points, ground)
+    if may_be_anywhere:
+        result = _best_start(attempt, result, non_ground, high)
+    coarser = target.coarse_maps(points, T_prior)
+    flat = on_ground(points, ground)
+    width = NEAR_KERNEL_FACTOR * KERNEL_MIN_M
+
+    def place_upright(start: Floats) -> RegistrationResult:
+        """Height and tilt by the ground, the rest by non-ground points, in turn as in LeGO-LOAM (Shan and Englot 2018)."""
+        aligned = non_ground.align(high, upright(start))
+        return aligned.with_pose(upright(aligned.T_world_lidar), aligned.covariance)
+
+    def upright(pose: Floats) -> Floats:
+        directions = upright_directions(pose, up_of(target.preprocess))
+        problem = target.problem(flat, pose, width, START_ITERATIONS, coarser, directions)
+        return optimise(*problem).T_world_lidar
+
+    def agreeing(at: RegistrationResult) -> Bools:
+        return non_ground.agreeing(high, at.T_world_lidar)
+
+    starts = [T_prior]
+    if may_be_anywhere or not result.ok:
+        starts.append(_likeliest(non_ground, high, T_prior, c.start_reach, up_of(target.preprocess)))
+    aligned = max(map(place_upright, starts), key=lambda at: np.count_nonzero(agreeing(at)))
+    place, most = aligned.T_world_lidar, agreeing(aligned)
+    last = attempt.history.recent[-1][1]
+    is_drawn = result.ok and is_at_rest(place, last)
+    # What rings draw there is no evidence that it is there.
+    margin = CLEAR_RATIO if is_at_rest(result.T_world_lidar, last) else MUCH_RATIO
+    if is_drawn or not is_much_more(most, agreeing(result), margin):
+        return result
+    near = optimise(*target.problem(points, place, width, START_ITERATIONS, target.coarse_maps(points, place)))
+    judged = attempt.judge(near, place)
+    if not judged.ok and not result.ok:
+        return result
+    if not judged.ok or len(judged.degenerate) or is_much_more(most, agreeing(judged)):
+        judged = near.with_pose(place, aligned.covariance)
+    return replace(judged, iterations=result.iterations + near.iterations)
+
+
+def _best_start(
+    attempt: Attempt, best: RegistrationResult, non_ground: NonGroundPoints, high: PreparedPoints
+) -> RegistrationResult:
+    """The best of several starts: a few points on the coarse map show which are worth a whole registration."""
+    target, count = attempt.target, len(high.source)
+    coarse_map, few = target.coarse_maps(attempt.points, attempt.T_prior)[0], thin(attempt.points, SEARCH_STRIDE)
+    slow = target.slowly(2 * START_STEP_M)
+    trials = [
+        solve((coarse_map,), few, attempt.T_prior @ se3.make(np.eye(3), offset), slow, attempt.config)
+        for offset in start_offsets(attempt.config.start_reach, START_STEP_M, up_of(target.preprocess))
+    ]
+    # Without non-ground points, as in hills, the ground decides.
+    trials.sort(key=lambda at: (-non_ground.share(high, at.T_world_lidar), -at.inliers))
+    for promising in distinct(trials, best.T_world_lidar):
+        start = promising.T_world_lidar
+        # Once more as wide as from an unknown start, what was found right could be drawn to the false place again.
+        result = attempt.judge(target.coarse_to_fine(attempt.points, start, 2 * START_STEP_M), start)
+        share, usual = (non_ground.share(high, at.T_world_lidar) for at in (result, best))
+        if count == 0:
+            share, usual = result.agreement, best.agreement
+        # A failed one has the prior's pose: fewer inliers than there are no improvement.
+        if result.ok and (share > CLEAR_RATIO * usual if best.ok else share >= usual):
+            best = result
+    return best
+
+
+def _likeliest(non_ground: NonGroundPoints, high: PreparedPoints, T_prior: Floats, reach: float, up: Floats) -> Floats:
+    """(4, 4) pose up to `reach`, m, from the prior, or turned about `up`, at which most points have one near by."""
+    moved = [T_prior @ se3.make(np.eye(3), offset) for offset in start_offsets(reach, NEAR_M, up)]
+    turns = np.deg2rad(START_TURNS_DEG)
+    turned = [T_prior @ se3.make(so3.exp(turn * up), np.zeros(3)) for turn in turns]
+    return max([*moved, *turned], key=lambda start: non_ground.share(high, start))
+
+
+def is_at_rest(pose: Floats, last: Floats) -> bool:
+    """Whether the pose (4, 4) is so near to the last scan's that the sensor's own rings, on roofs or walls, explain it."""
+    move, turn = se3.relative(last, pose)[:3, 3], so3.angle(se3.relative(last, pose)[:3, :3])
+    return bool(np.linalg.norm(move) < 2 * NEAR_M and turn < np.deg2rad(TURN_STEP_DEG))
+
+
+def is_much_more(ours: Bools, others: Bools, margin: float = MUCH_RATIO) -> bool:
+    """Whether `margin` times as many points agree at one pose as at the other, and not by chance: flags (S,) of the same.
+
+    McNemar's test of paired shares at two sigma, on the points that agree at one of the poses only.
+    """
+    won, lost = np.count_nonzero(ours & ~others), np.count_nonzero(others & ~ours)
+    return bool(np.count_nonzero(ours) > margin * np.count_nonzero(others) and is_more(int(won), int(lost)))
+
+
+def distinct(results: list[RegistrationResult], T_best: Floats) -> list[RegistrationResult]:
+    """The first `MOST_STARTS` places that lie at least half a step from the known pose (4, 4) and from each other."""
+    places, apart = [T_best[:3, 3]], []
+    for result in results:
+        place = result.T_world_lidar[:3, 3]
+        if min(float(np.linalg.norm(place - other)) for other in places) > START_STEP_M / 2:
+            places.append(place)
+            apart.append(result)
+    return apart[:MOST_STARTS]
+
+
+def start_offsets(reach: float, step: float, up: Floats = Z) -> Floats:
+    """(N, 3) m in the LiDAR frame, nearest first: level, ahead and back up to `reach`, sideways one step at most."""
+    count = int(np.ceil(reach / step - 1e-9))
+    ahead = [sign * min(k * step, reach) for k in range(1, count + 1) for sign in (1, -1)]
+    sideways = [sign * min(step, reach) for sign in (1, -1)] if count else []
+    offsets = np.array([(x, 0.0, 0.0) for x in ahead] + [(0.0, y, 0.0) for y in sideways]).reshape(-1, 3)
+    return offsets[np.argsort(np.linalg.norm(offsets, axis=1), kind="stable")] @ so3.level_frame(up)
 
 
 @dataclass(frozen=True)
@@ -65,7 +291,7 @@ class AtRest:
             return result
         if not rest.votes(attempt.target.cloud(attempt.points), T_registered).is_standing:
             return result
-        return attempt.credit(result.moved(rest.T_world_lidar.copy(), result.covariance), self.name)
+        return attempt.credit(result.with_pose(rest.T_world_lidar.copy(), result.covariance), self.name)
 
 
 def policies_of(config: RecoveryConfig, of_features: Sequence[Policy] | None = None) -> tuple[Policy, ...]:

@@ -16,15 +16,15 @@ from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan_result import StageClock
 from lslam.core.types.state import Stateful
-from lslam.registration.acceptance import failed
+from lslam.registration.acceptance import failure
 from lslam.registration.attempt import Attempt, Policy, Target
 from lslam.registration.history import History
 from lslam.registration.local_map import LocalMap
+from lslam.registration.optimiser import KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.policies import policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.rest import RestDetector
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.voxel_target import VoxelTarget
 
 
@@ -100,7 +100,7 @@ class Registration(Stateful):
         """
         count = self.target.count(points)
         if reason := self.target.refusal(points):
-            return replace(failed(T_prior, count, reason), points=points)
+            return replace(failure(T_prior, count, reason), points=points)
         if len(self.target) == 0:
             return RegistrationResult(T_prior, covariance=np.diag([1e-12] * 6), source_points=count, points=points)
         attempt = self.attempt(points, T_prior, is_near, clock)

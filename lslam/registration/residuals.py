@@ -32,7 +32,7 @@ def _with_gaps(points: PreparedPoints, sigma: float) -> Arrays:
 
 
 def _with_covariance(points: PreparedPoints, sigma: float) -> Arrays:
-    from lslam.registration.source_covariance import source_covariance
+    from lslam.registration.gaussian_map import source_covariance
 
     if points.covariance is not None:
         return points.source, points.covariance
@@ -112,7 +112,7 @@ RESIDUALS = {
         "lslam.registration.kernels.gicp_residual", "linearise_gicp", _with_covariance, by_surfaces=True
     ),
     "vgicp": ResidualKind(
-        "lslam.registration.kernels.vgicp_residual",
+        "lslam.registration.kernels.gicp_residual",
         "linearise_vgicp",
         _with_covariance,
         _counted_planes,
@@ -126,7 +126,7 @@ RESIDUALS = {
 MEANS = replace(PLANE, is_wide=False, along=1.0)
 
 
-def residual_named(name: str) -> ResidualKind:
+def find_residual(name: str) -> ResidualKind:
     """The residual of that name. Raises UsageError with the nearest one when there is none."""
     if name not in RESIDUALS:
         raise UsageError(f"no residual {name!r}; {nearest(name, list(RESIDUALS))}")

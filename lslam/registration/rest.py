@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.config.input import PreprocessConfig
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import se3
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.state import Stateful
 from lslam.registration.alignment import upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2
 from lslam.registration.local_map import LEAST_BREADTH
+from lslam.registration.optimiser import pose_change
 from lslam.registration.preprocessing.ground import ground_of, up_of
 from lslam.registration.result import RegistrationResult
 
@@ -59,7 +60,7 @@ class RestDetector(Stateful):
         C, T, reference = result.covariance, result.T_world_lidar, self._reference
         if reference is None or C is None or not result.is_accepted:
             return False
-        d = np.concatenate([T[:3, 3] - reference[:3, 3], so3.log(T[:3, :3] @ reference[:3, :3].T)])
+        d = pose_change(T, reference)
         if d[:3] @ d[:3] + result.lever_arm**2 * (d[3:] @ d[3:]) > self.sigma**2:
             return False
         return float(d @ np.linalg.solve(2.0 * C, d)) < SAME_POSE_CHI2
@@ -136,7 +137,7 @@ class PlanWalls:
         telling = np.flatnonzero(np.abs(gain) > TELLING_CHI2)
         if not len(telling):
             return Votes(0, 0)
-        things = _connected(here[telling, :2], THINGS_APART_VOXELS * self._voxel_size)
+        things = _connect(here[telling, :2], THINGS_APART_VOXELS * self._voxel_size)
         sums = np.bincount(things, gain[telling])
         return Votes(*(int(np.count_nonzero(sign * sums > INLIER_CHI2)) for sign in (1, -1)))
 
@@ -150,7 +151,7 @@ class PlanWalls:
         return np.where(is_near, np.where(self._is_wall[near], cost, np.nan), INLIER_CHI2), is_near
 
 
-def _connected(points: Floats, apart_m: float) -> Longs:
+def _connect(points: Floats, apart_m: float) -> Longs:
     """(N,) numbers of the things that points (N, 2) in plan belong to, which lie `apart_m` from one another."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -193,9 +194,8 @@ class Rest(Stateful):
 
     def _away(self, T_world_lidar: Floats, lever_arm: float) -> float:
         """m from the spot to a pose (4, 4), but for height and tilt, for a point at the `lever_arm`, m."""
-        old, new = self.T_world_lidar, T_world_lidar
-        change = np.concatenate([new[:3, 3] - old[:3, 3], so3.log(new[:3, :3] @ old[:3, :3].T)])
-        level = change - upright_directions(old, up_of(self.preprocess)) @ change
+        change = pose_change(T_world_lidar, self.T_world_lidar)
+        level = change - upright_directions(self.T_world_lidar, up_of(self.preprocess)) @ change
         return float(np.linalg.norm(level[:3]) + np.linalg.norm(level[3:]) * lever_arm)
 
     def enter(self, cloud: NDArray[np.float32], T_world_lidar: Floats, lever_arm: float) -> None:

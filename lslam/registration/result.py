@@ -31,7 +31,7 @@ class RegistrationResult:
     matched : points that found a voxel; overlap : matched / source
     rmse : weighted distance to the planes, m; degenerate : (K, 6) unobserved unit directions (rotation scaled by lever arm)
     prior_error : correction of the motion prior, (m, rad)
-    replaced : the result of the method's features, in whose place this one stands
+    feature_result : the result of the method's features, in whose place this one stands
     points : what was registered, deskewed; detail : whatever else the method's own `update` needs
     sweep : the motion within the sweep, of a method that estimates it itself; None: the prior's, which the pose refines
     map_age : as `ScanResult.map_age`
@@ -55,7 +55,7 @@ class RegistrationResult:
     is_rejected: bool = False
     is_stationary: bool = False
     pose_source: str = ""
-    replaced: RegistrationResult | None = None
+    feature_result: RegistrationResult | None = None
     points: Any = None
     detail: Any = None
     sweep: MotionPrior | None = None
@@ -106,13 +106,13 @@ class RegistrationResult:
         """Whether the pose is a registration's that nothing contradicts."""
         return self.ok and not self.is_rejected
 
-    def moved(self, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
+    def with_pose(self, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
         """The same registration at another pose."""
         return replace(self, T_world_lidar=T_world_lidar, covariance=covariance)
 
-    def rejected(self, reason: str, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
+    def reject(self, reason: str, T_world_lidar: Floats, covariance: Floats | None) -> RegistrationResult:
         """The scan at another pose, since something contradicts the registration."""
-        moved = self.moved(T_world_lidar, covariance)
+        moved = self.with_pose(T_world_lidar, covariance)
         return replace(moved, is_rejected=True, reason=reason, converged=False)
 
     @property

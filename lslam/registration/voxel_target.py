@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,16 +13,14 @@ from lslam.core.kernels.residuals import TILT_FACTOR
 from lslam.core.types.arrays import Floats
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import Attempt, Target
-from lslam.registration.gaussian_map import FLOOR_M2
+from lslam.registration.gaussian_map import FLOOR_M2, source_covariance
 from lslam.registration.history import History
-from lslam.registration.local_map import LastScan, LocalMap, MapScans, make_map_scans
-from lslam.registration.optimiser import optimise
-from lslam.registration.preprocessing.beams import ring_gap
+from lslam.registration.local_map import LastScan, LocalMap, make_map_scans
+from lslam.registration.optimiser import KERNEL_MIN_M, Annealing, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.residuals import residual_named
+from lslam.registration.preprocessing.rings import ring_gap
+from lslam.registration.residuals import find_residual
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import KERNEL_MIN_M, Annealing
-from lslam.registration.source_covariance import source_covariance
 
 MIN_SOURCE_POINTS = 30
 # Share of points with a ring spacing above a voxel from which on the coarse level is searched, too.
@@ -31,38 +28,26 @@ SPARSE_SHARE = 0.1
 
 
 class VoxelTarget(MapAlignment, Target):
-    """The local map, the choice of the scans that it is made of, and the residual that the configuration names.
-
-    make_scans : makes what chooses the scans
-    """
+    """The local map, the choice of the scans that it is made of, and the residual that the configuration names."""
 
     source = "points"
     STATE = ("map", "scans", "_ring_gap")
 
-    def __init__(
-        self,
-        config: RegistrationConfig,
-        preprocess: PreprocessConfig,
-        make_scans: Callable[[RegistrationConfig], MapScans] = make_map_scans,
-    ) -> None:
-        residual, scans = residual_named(config.residual or "plane"), make_scans(config)
+    def __init__(self, config: RegistrationConfig, preprocess: PreprocessConfig) -> None:
+        residual, scans = find_residual(config.residual or "plane"), make_map_scans(config)
         # The poses of several scans err by the floor; residuals multiply a tilt.
-        shared = 0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR
-        local_map = LocalMap(
-            config.voxel_size * residual.voxel_share,
-            reach=1.2 * preprocess.range_max,
-            shared=shared,
-        )
+        scan_variance = 0.0 if isinstance(scans, LastScan) else FLOOR_M2 / TILT_FACTOR
+        size, reach = config.voxel_size * residual.voxel_share, 1.2 * preprocess.range_max
+        local_map = LocalMap(size, reach=reach, scan_variance=scan_variance)
         super().__init__(local_map, config, residual)
         self.times_steps = residual.times_steps
-        self.preprocess, self._make_scans = preprocess, make_scans
-        self.scans = scans
+        self.preprocess, self.scans = preprocess, scans
         # Vertical angular resolution, rad, for point to point; 0 where unknown.
         self._ring_gap = 0.0
 
     def fresh(self) -> VoxelTarget:
         """An empty one of the same settings."""
-        return VoxelTarget(self.config, self.preprocess, self._make_scans)
+        return VoxelTarget(self.config, self.preprocess)
 
     def __len__(self) -> int:
         return len(self.map)
@@ -78,10 +63,10 @@ class VoxelTarget(MapAlignment, Target):
 
     def ready(self, points: PreparedPoints, history: History) -> PreparedPoints:
         """With the covariance of the surface, or the gap between the rings, at each point, where the residual takes it."""
-        points = self.covered(points)
+        points = self.with_covariance(points)
         return replace(points, gaps=self._gaps(points, history)) if self.kind.needs_gaps else points
 
-    def covered(self, points: PreparedPoints) -> PreparedPoints:
+    def with_covariance(self, points: PreparedPoints) -> PreparedPoints:
         """With the covariance of the surface at each point, where the residual takes it."""
         if not self.kind.needs_covariance or points.covariance is not None:
             return points

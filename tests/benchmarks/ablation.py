@@ -36,9 +36,9 @@ from lslam.core.errors import UsageError
 from lslam.core.types.scan import Scan
 from lslam.odometry import create_odometry, feature_policies
 from lslam.odometry.frontend import tracker
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.registration import local_map, residuals, solver, start_search
+from lslam.registration import alignment, local_map, policies, residuals
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ BLOBS_AS_BEFORE = {**residuals.RESIDUALS, "plane": replace(residuals.RESIDUALS["
 MAP: dict[str, Variant] = {
     "breadth": ((), ((local_map, "LEAST_BREADTH", 0.0),)),
     "wide voxels": ((), ((local_map, "WIDE_FACTORS", ()),)),
-    "wide weigh less": ((), ((solver, "part_of_usual", lambda size, usual: 1.0),)),
+    "wide weigh less": ((), ((alignment, "part_of_usual", lambda size, usual: 1.0),)),
 }
 WITHOUT: dict[str, dict[str, Variant]] = {
     "icp": {
@@ -67,10 +67,10 @@ WITHOUT: dict[str, dict[str, Variant]] = {
         "coarse-to-fine": (("recovery.coarse_to_fine=false",), ()),
         "start search": (("recovery.start_search=false",), ()),
         "held at rest": (("recovery.at_rest=false",), ()),
-        "at rest": ((), ((start_search, "is_at_rest", lambda pose, last: False),)),
-        "HIGH_M": ((), ((start_search, "HIGH_M", 0.3),)),
-        "CLEAR_RATIO": ((), ((start_search, "CLEAR_RATIO", 1.0),)),
-        "MUCH_RATIO": ((), ((start_search, "MUCH_RATIO", 1.0),)),
+        "at rest": ((), ((policies, "is_at_rest", lambda pose, last: False),)),
+        "HIGH_M": ((), ((policies, "HIGH_M", 0.3),)),
+        "CLEAR_RATIO": ((), ((policies, "CLEAR_RATIO", 1.0),)),
+        "MUCH_RATIO": ((), ((policies, "MUCH_RATIO", 1.0),)),
         "agreement": (("registration.min_agreement=0",), ()),
         "possible jumps": ((), ((tracker, "fault", lambda pose, stamp_ns, last: ""),)),
         "bounded acceleration": ((), ((ConstantVelocity, "MAX_ACCELERATION", np.inf),)),
@@ -142,7 +142,7 @@ def row(method: str, variant: Variant, case: Case) -> tuple[float, float, float,
         odometry = create_odometry(load_config(settings=[f"odometry.method={method}", *settings], environ={}))
         tracker = Tracker(odometry)
         for k, scan in enumerate(scans):
-            results.append(tracker.track(Loaded(k, scan.stamp_ns, scan, odometry.prepare(scan))))
+            results.append(tracker.track(ScanInput(k, scan.stamp_ns, scan, odometry.prepare(scan))))
     found = np.stack([result.T_world_lidar for result in results])
     acted = Counter(result.posed_by for result in results if result.posed_by)
     failed = sum(result.status != "ok" for result in results)

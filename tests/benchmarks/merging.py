@@ -16,7 +16,7 @@ from lslam.core.errors import UsageError
 from lslam.core.geometry.se3 import poses_at
 from lslam.io.readers import open_sequence
 from lslam.maps import merge
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.map_pass import motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
 

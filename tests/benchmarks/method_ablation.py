@@ -23,10 +23,11 @@ from traced import Traced
 from lslam.core.geometry import se3
 from lslam.core.types.imu import ImuStream
 from lslam.core.types.trajectory import Trajectory
-from lslam.odometry import elastic_constraints, lips, loam_livox, plane_factors, plane_segmentation, plane_window
-from lslam.odometry.elastic_constraints import NOTHING, LastSweep
-from lslam.odometry.inertial import imu_cleaning, saturation
-from lslam.odometry.inertial.course import Course
+from lslam.odometry import ct_icp, elastic, lips, loam_livox, plane_factors, plane_segmentation, plane_window
+from lslam.odometry.ct_icp import LastSweep
+from lslam.odometry.elastic import NOTHING
+from lslam.odometry.inertial import imu_cleaning
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.odometry.inertial.filter import FilterMotion
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.lio_mapping import LioMapping
@@ -70,7 +71,7 @@ def driven(words: str, seed: int, count: int | None, ablation: Ablation) -> Trac
     return Later(simulate(scenario, seed=seed, **values), first)
 
 
-with_hidden = saturation.with_hidden
+fill_saturation = imu_cleaning.fill_saturation
 constraints = LastSweep.constraints
 
 
@@ -81,12 +82,12 @@ def as_read(imu: ImuStream, notes: list[str]) -> ImuStream:
 
 def doubted(imu: ImuStream, notes: list[str]) -> ImuStream:
     """What is cut off is trusted the less, and not filled in."""
-    return replace(with_hidden(imu, notes), accel=imu.accel, gyro=imu.gyro)
+    return replace(fill_saturation(imu, notes), accel=imu.accel, gyro=imu.gyro)
 
 
 def trusted(imu: ImuStream, notes: list[str]) -> ImuStream:
     """It is filled in and trusted as any other reading."""
-    return replace(with_hidden(imu, notes), clipping_sigma=None)
+    return replace(fill_saturation(imu, notes), clipping_sigma=None)
 
 
 def without(**changes: Any) -> Callable[..., Any]:
@@ -104,16 +105,16 @@ ABLATIONS = {
     "saturation": Ablation(
         ("fast-lio2", "icp+imu.use=true"), ("quadrotor",),
         {
-            "all of it": ((imu_cleaning, "with_hidden", as_read),),
-            "filling in": ((imu_cleaning, "with_hidden", doubted),),
-            "its sigma": ((imu_cleaning, "with_hidden", trusted),),
+            "all of it": ((imu_cleaning, "fill_saturation", as_read),),
+            "filling in": ((imu_cleaning, "fill_saturation", doubted),),
+            "its sigma": ((imu_cleaning, "fill_saturation", trusted),),
             "deskewing again": ((FilterMotion, "refine", lambda self, prior, stamp_ns, pose: (
                 prior if prior.covariance is not None else InertialMotion.refine(self, prior, stamp_ns, pose)
             )),),
-            "HIDDEN 0.25": ((saturation, "HIDDEN_RANGE_SHARE", 0.25),),
-            "HIDDEN 1": ((saturation, "HIDDEN_RANGE_SHARE", 1.0),),
-            "FORGOTTEN 0.1": ((saturation, "FORGOTTEN_S", 0.1),),
-            "FORGOTTEN 0.4": ((saturation, "FORGOTTEN_S", 0.4),),
+            "HIDDEN 0.25": ((imu_cleaning, "HIDDEN_RANGE_SHARE", 0.25),),
+            "HIDDEN 1": ((imu_cleaning, "HIDDEN_RANGE_SHARE", 1.0),),
+            "FORGOTTEN 0.1": ((imu_cleaning, "FORGOTTEN_S", 0.1),),
+            "FORGOTTEN 0.4": ((imu_cleaning, "FORGOTTEN_S", 0.4),),
         },
         whole=True,
     ),
@@ -124,13 +125,13 @@ ABLATIONS = {
             "location": ((LastSweep, "constraints", without(location=NOTHING, since=0.0)),),
             "velocity": ((LastSweep, "constraints", without(velocity=NOTHING)),),
             "both": ((LastSweep, "constraints", without(location=NOTHING, since=0.0, velocity=NOTHING)),),
-            "MISS_RATIO 1/3": ((elastic_constraints, "MISS_RATIO", 1 / 3),),
-            "MISS_RATIO 1/12": ((elastic_constraints, "MISS_RATIO", 1 / 12),),
-            "LAG 1": ((elastic_constraints, "LAG_RATIO", 1.0),),
-            "FORGETTING_FACTOR 0": ((elastic_constraints, "FORGETTING_FACTOR", 0.0),),
-            "FORGETTING_FACTOR 0.95": ((elastic_constraints, "FORGETTING_FACTOR", 0.95),),
-            "LEAST_CHANGE 1e-4": ((elastic_constraints, "LEAST_CHANGE", 1e-4),),
-            "LEAST_SKEW 1e-3": ((elastic_constraints, "LEAST_SKEW", 1e-3),),
+            "MISS_RATIO 1/3": ((ct_icp, "MISS_RATIO", 1 / 3),),
+            "MISS_RATIO 1/12": ((ct_icp, "MISS_RATIO", 1 / 12),),
+            "LAG 1": ((ct_icp, "LAG_RATIO", 1.0),),
+            "FORGETTING_FACTOR 0": ((ct_icp, "FORGETTING_FACTOR", 0.0),),
+            "FORGETTING_FACTOR 0.95": ((ct_icp, "FORGETTING_FACTOR", 0.95),),
+            "LEAST_CHANGE 1e-4": ((ct_icp, "LEAST_CHANGE", 1e-4),),
+            "LEAST_SKEW 1e-3": ((elastic, "LEAST_SKEW", 1e-3), (ct_icp, "LEAST_SKEW", 1e-3)),
         },
         imu=None,
     ),

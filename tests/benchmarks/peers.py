@@ -27,7 +27,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.odometry import create_odometry, small_gicp
 from lslam.odometry import open3d as open3d_method
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.odometry.scan_outcome import measurable
 from lslam.registration.preprocessing.prepare import clean_points
@@ -100,7 +100,7 @@ class Ours(Timed):
     def register(self, converted: Scan) -> Floats:
         scan = converted if self._rings is None else replace(converted, rings=self._rings.rings_of(converted))
         scan = measurable(scan)
-        loaded = Loaded(scan.index, scan.stamp_ns, scan, self._odometry.prepare(scan))
+        loaded = ScanInput(scan.index, scan.stamp_ns, scan, self._odometry.prepare(scan))
         return self._tracker.track(loaded).T_world_lidar
 
 

@@ -23,7 +23,7 @@ from lslam.io.readers import open_sequence
 from lslam.pipeline.map_attributes import with_attributes
 from lslam.pipeline.map_pass import build_map
 from lslam.registration.preprocessing.rings import RingRule
-from lslam.registration.preprocessing.views import Ringed
+from lslam.registration.preprocessing.views import RingView
 from lslam.simulation.scenarios import simulate
 
 COUNT = 10
@@ -146,11 +146,11 @@ class PartlyRinged(SequenceView):
 def test_points_without_a_ring_stay_where_none_is_required() -> None:
     drive, rule = simulate("block", lidar="vlp16", count=2), RingRule("field", 16)
     whole = drive.scan(1)
-    kept = Ringed(PartlyRinged(drive), rule, is_required=False).scan(1)
+    kept = RingView(PartlyRinged(drive), rule, is_strict=False).scan(1)
     assert len(kept) == len(whole)
     assert kept.rings is not None
     assert np.count_nonzero(kept.rings == NO_RING) == -(-len(whole) // 3)
-    assert len(Ringed(PartlyRinged(drive), rule).scan(1)) == len(whole) - -(-len(whole) // 3)
+    assert len(RingView(PartlyRinged(drive), rule).scan(1)) == len(whole) - -(-len(whole) // 3)
 
 
 def test_what_cannot_be_is_said_in_one_sentence(ran: Path, tmp_path: Path) -> None:

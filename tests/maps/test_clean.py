@@ -13,7 +13,7 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.maps import clean
 from lslam.maps.clean import CUBE, OFFSETS, SHARE, Cleaner, PosedScan, spread
 from lslam.maps.kernels.see_through import nearest_ranges, vote
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.map_pass import build_map, motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.simulation.scenarios import simulate

@@ -20,26 +20,24 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Odometry
-from lslam.odometry.elastic import SWEEP_PARTS, SweepPoints, register_elastic
-from lslam.odometry.elastic_constraints import (
-    FORGETTING_FACTOR,
-    LAG_RATIO,
-    LEAST_CHANGE,
+from lslam.odometry.ct_icp import FORGETTING_FACTOR, LAG_RATIO, LEAST_CHANGE, MISS_RATIO, LastSweep
+from lslam.odometry.elastic import (
     LEAST_SKEW,
-    MISS_RATIO,
+    SWEEP_PARTS,
     ElasticConstraints,
     ElasticSweep,
-    LastSweep,
+    SweepPoints,
+    register_elastic,
 )
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import begin_inertial
 from lslam.odometry.frontend.register_scans import estimate, read_ahead
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.fusion import InertialMotion
+from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.deskew import deskew_points, knots_over
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
-from lslam.registration.robust import Annealing
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -138,7 +136,7 @@ def test_the_motion_measured_by_an_imu_keeps_its_shape_as_the_ends_move() -> Non
     np.testing.assert_allclose(sweep.poses, bow, atol=1e-12)
     assert np.abs(ElasticSweep.of(MotionPrior(times, bow)).poses - bow).max() > 2e-3
     shift = np.tile([0.3, -0.1, 0.2, 0.0, 0.0, 0.0], (2, 1))
-    np.testing.assert_allclose(sweep.moved(shift).poses[:, :3, 3], bow[:, :3, 3] + [0.3, -0.1, 0.2], atol=1e-12)
+    np.testing.assert_allclose(sweep.move(shift).poses[:, :3, 3], bow[:, :3, 3] + [0.3, -0.1, 0.2], atol=1e-12)
 
 
 def test_the_parts_of_a_sweep_add_up_to_the_whole() -> None:
@@ -148,7 +146,7 @@ def test_the_parts_of_a_sweep_add_up_to_the_whole() -> None:
     H, _, _ = points.linearise(true.prior, (0.15, 0.15, np.inf))
     assert H.shape == (SWEEP_PARTS, 6, 6)
     shift = np.array([0.01, -0.02, 0.01, 0.001, 0.002, -0.001])
-    moved = true.moved(np.tile(shift, (2, 1)))
+    moved = true.move(np.tile(shift, (2, 1)))
     _, g_moved, _ = points.linearise(moved.prior, (10.0, 10.0, np.inf))
     H0, g0, _ = points.linearise(true.prior, (10.0, 10.0, np.inf))
     assert np.linalg.norm(g_moved.sum(0) - g0.sum(0) - H0.sum(0) @ shift) < 0.1 * np.linalg.norm(H0.sum(0) @ shift)
@@ -264,7 +262,7 @@ def test_the_skew_of_the_map_decays_over_five_scans() -> None:
     held = last.constraints(100_000_000, steady)
     np.testing.assert_allclose(held.skew, 0.0075)
     sigma2 = 1e-4 * (0.25**2 + 0.25**2 + 0.75**2) + LEAST_SKEW**2
-    np.testing.assert_allclose(np.linalg.inv(held.skewed), sigma2 * np.eye(6), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.inv(held.skew_information), sigma2 * np.eye(6), rtol=1e-9, atol=1e-15)
     changes = []
     for k in range(1, 6):
         changes.append(1.0 / held.velocity[0, 0] / LAG_RATIO**2 - 2 * LEAST_CHANGE**2)

@@ -43,7 +43,7 @@ def test_the_deskew_uncertainty_of_a_steady_acceleration_is_exact(every: int, pa
         within = ((np.arange(1000) + 0.5) / 1000 - passed) * SPAN
         off = float(np.mean(0.5 * a * (t + within) ** 2 - used * within)) - 0.5 * a * t**2
         pose = 0.5 * a * t**2 + off
-        S = doubt.observe(steady(pose, used, passed), round(1e9 * t), at(pose), is_registered=True)
+        S = doubt.observe(steady(pose, used, passed), round(1e9 * t), at(pose), has_registration=True)
     assert off > (1e-3 if passed == 0 else 5e-4)
     # Ten lessons in six directions: a part of it counts for those across, as if none were special.
     np.testing.assert_allclose(np.trace(S[:3, :3]), off**2, rtol=1e-3)
@@ -60,18 +60,18 @@ def test_the_first_deskew_uncertainty_allows_braking_and_hand_rotation(passed: f
     doubt = DeskewUncertainty()
     usual = (np.repeat([3.0, 1.0], 3) * SPAN**2 / part) ** 2
     for k in range(2):
-        S = doubt.observe(steady(k, 10.0, passed), k * 10**8, at(k), is_registered=True)
+        S = doubt.observe(steady(k, 10.0, passed), k * 10**8, at(k), has_registration=True)
         np.testing.assert_allclose(S, np.diag(usual))
-    assert not doubt.observe(steady(2.0, 10.0, passed), 2 * 10**8, at(2.0), is_registered=True).any()
+    assert not doubt.observe(steady(2.0, 10.0, passed), 2 * 10**8, at(2.0), has_registration=True).any()
 
 
 def test_deskew_uncertainty_resumes_to_the_last_bit() -> None:
     """The next lesson needs where in its sweep the stamp of the scan before lay."""
     whole, again = DeskewUncertainty(), DeskewUncertainty()
     for k in range(6):
-        whole.observe(steady(k**2 / 10, 10.0, 0.2), k * 10**8, at(k**2 / 10), is_registered=True)
+        whole.observe(steady(k**2 / 10, 10.0, 0.2), k * 10**8, at(k**2 / 10), has_registration=True)
     again.restore(deepcopy(whole.state()))
-    after = [one.observe(steady(3.6, 10.0, 0.2), 6 * 10**8, at(3.6), is_registered=True) for one in (whole, again)]
+    after = [one.observe(steady(3.6, 10.0, 0.2), 6 * 10**8, at(3.6), has_registration=True) for one in (whole, again)]
     assert after[0].any()
     np.testing.assert_array_equal(*after)
 
@@ -85,7 +85,7 @@ def test_a_sweep_longer_than_the_step_counts_as_one_of_its_length(passed: float)
                   for t in [(np.linspace(0.0, 1.0, 5) - passed) * SPAN]]  # fmt: skip
         pose = at(k + 0.01 * (-1) ** k)
         S = [
-            one.observe(prior, k * step, pose, is_registered=True)
+            one.observe(prior, k * step, pose, has_registration=True)
             for one, prior in zip((full, longer), priors, strict=True)
         ]
     assert S[0][0, 0] > 1e-7
@@ -99,8 +99,10 @@ def test_uncertainty_lies_along_the_axes_of_the_world() -> None:
     straight, turned = DeskewUncertainty(), DeskewUncertainty()
     for k in range(12):
         prior, pose = steady(k, 10.0), at(k + 0.01 * rng.normal())
-        S = straight.observe(prior, k * 10**8, pose, is_registered=True)
-        found = turned.observe(MotionPrior(prior.times, turn @ prior.poses), k * 10**8, turn @ pose, is_registered=True)
+        S = straight.observe(prior, k * 10**8, pose, has_registration=True)
+        found = turned.observe(
+            MotionPrior(prior.times, turn @ prior.poses), k * 10**8, turn @ pose, has_registration=True
+        )
     R = np.kron(np.eye(2), turn[:3, :3])
     np.testing.assert_allclose(found, R @ S @ R.T, atol=1e-15)
     assert S[0, 0] > 2 * S[1, 1]
@@ -109,7 +111,7 @@ def test_uncertainty_lies_along_the_axes_of_the_world() -> None:
 def test_scans_of_one_instant_have_no_deskew_uncertainty() -> None:
     doubt = DeskewUncertainty()
     for k in range(5):
-        S = doubt.observe(MotionPrior.at_once(at(k)), k * 10**8, at(k**2), is_registered=True)
+        S = doubt.observe(MotionPrior.at_once(at(k)), k * 10**8, at(k**2), has_registration=True)
         assert not S.any()
 
 
@@ -117,9 +119,9 @@ def test_a_failed_scan_does_not_change_the_deskew_uncertainty() -> None:
     rng = np.random.default_rng(0)
     doubt = DeskewUncertainty()
     for k in range(12):
-        S = doubt.observe(steady(k, 10.0), k * 10**8, at(k + 0.01 * rng.normal()), is_registered=True)
-    lost = doubt.observe(steady(12.0, 10.0), 12 * 10**8, at(40.0), is_registered=False)
-    after = doubt.observe(steady(13.0, 10.0), 13 * 10**8, at(13.0), is_registered=True)
+        S = doubt.observe(steady(k, 10.0), k * 10**8, at(k + 0.01 * rng.normal()), has_registration=True)
+    lost = doubt.observe(steady(12.0, 10.0), 12 * 10**8, at(40.0), has_registration=False)
+    after = doubt.observe(steady(13.0, 10.0), 13 * 10**8, at(13.0), has_registration=True)
     np.testing.assert_array_equal(lost, after)
     assert after[0, 0] < 2 * S[0, 0]
 

@@ -30,7 +30,7 @@ def test_a_scan_enters_the_map_at_the_pose_of_the_update(method: str) -> None:
     for scan in drive:
         prepared = odometry.prepare(scan)
         found = odometry.register(scan, prepared, prior)
-        put = found.moved(moved @ found.T_world_lidar, covariance)
+        put = found.with_pose(moved @ found.T_world_lidar, covariance)
         done = odometry.update(scan, prior, put)
     again = odometry.register(scan, prepared, MotionPrior.at_once(put.T_world_lidar))
     np.testing.assert_allclose(again.T_world_lidar, put.T_world_lidar, atol=0.02)
@@ -61,7 +61,7 @@ def test_a_rejected_scan_enters_at_the_prior_and_does_not_change_the_thresholds(
     assert (result.ok, round(result.prior_error[0])) == (True, 1)
     history = registration.history
     before, inserted = (history.threshold.width, history.agreement.usual), history.inserted
-    done = odometry.update(scan, prior, result.rejected("felt otherwise", prior.pose, 1e-6 * np.eye(6)))
+    done = odometry.update(scan, prior, result.reject("felt otherwise", prior.pose, 1e-6 * np.eye(6)))
     np.testing.assert_array_equal(done.T_world_lidar, prior.pose)
     assert (done.status, done.reason) == ("bridged", "felt otherwise")
     assert history.inserted == inserted + 1

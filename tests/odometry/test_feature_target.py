@@ -14,24 +14,23 @@ from lslam.core.config.odometry import LoamConfig, RecoveryConfig
 from lslam.core.geometry import se3
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import StageClock
-from lslam.odometry.all_points import ALL_POINTS, CONSTRAINED_SCANS
 from lslam.odometry.feature_map import feature_scan
-from lslam.odometry.feature_policies import LessPlanar, feature_policies
+from lslam.odometry.feature_policies import ALL_POINTS, CONSTRAINED_SCANS, LessPlanar, feature_policies
 from lslam.odometry.feature_solver import (
     NONE,
     FeatureNoise,
+    ScanMatching,
     ScanStep,
     joint_step,
     remap_solution,
-    solve_on_scan,
     two_steps,
     upright_directions,
 )
 from lslam.odometry.feature_target import FeatureTarget, LoamVariant
+from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.features import Features, extract_features
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
 
 Floats = NDArray[np.float64]
 
@@ -66,11 +65,9 @@ def features_at(pose: Floats, seed: int = 0, with_pillars: bool = True) -> Featu
 def engine(
     step: ScanStep | None, with_map: bool, loam: LoamConfig | None = None, recovery: RecoveryConfig | None = None
 ) -> Registration:
-    recovery = recovery or RecoveryConfig()
-    config, variant = Config().registration, LoamVariant(step, with_map)
-    with_all_points = recovery.fallback == "all-points"
-    target = FeatureTarget(config, loam or LoamConfig(), variant, with_all_points=with_all_points)
-    return Registration(config, target=target, policies=feature_policies(recovery))
+    config = Config(loam=loam or LoamConfig(), recovery=recovery or RecoveryConfig())
+    target = FeatureTarget(config, LoamVariant(step, with_map))
+    return Registration(config.registration, target=target, policies=feature_policies(config.recovery))
 
 
 VARIANTS = [(joint_step, False), (joint_step, True), (None, True), (two_steps, True)]
@@ -143,7 +140,7 @@ def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
     target = feature_scan(features_at(prior), prior)
     features = features_at(truth, 1)
     upright = upright_directions(prior)
-    ground = solve_on_scan(target, NONE, features.planes.points, prior, ANNEALING, NOISE, allowed=upright)
+    ground = ScanMatching(target, ANNEALING, NOISE).align(NONE, features.planes.points, prior, upright)
     moved = se3.relative(prior, ground.T_world_lidar)
     np.testing.assert_allclose(moved[:2, 3], 0.0, atol=1e-3)
     assert abs(np.arctan2(moved[1, 0], moved[0, 0])) < 1e-3
@@ -151,7 +148,7 @@ def test_edges_alone_find_the_plan_and_planes_the_upright_directions() -> None:
     np.testing.assert_allclose(upright @ upright, upright, atol=1e-12)
     assert np.trace(upright) == pytest.approx(3.0)
     clock = StageClock()
-    both = two_steps(target, features, prior, ANNEALING, NOISE, True, clock)
+    both = two_steps(ScanMatching(target, ANNEALING, NOISE), features, prior, clock)
     assert list(clock.seconds) == ["ground", "edges"]
     assert distance(both.T_world_lidar, truth)[0] < distance(ground.T_world_lidar, truth)[0] < distance(prior, truth)[0]
     assert distance(both.T_world_lidar, truth)[0] < 0.05
@@ -163,7 +160,7 @@ def test_planes_of_two_walls_leave_their_direction_open_and_the_prior_there() ->
     target = feature_scan(features_at(np.eye(4), with_pillars=False), np.eye(4))
     seen = features_at(se3.exp(np.array([0.3, 0.05, 0.03, 0, 0, 0])), 1, with_pillars=False).planes.points
     flat = seen[np.abs(seen[:, 0]) < 5.0]
-    result = solve_on_scan(target, NONE, flat, prior, ANNEALING, NOISE)
+    result = ScanMatching(target, ANNEALING, NOISE).align(NONE, flat, prior)
     assert len(result.degenerate) == 1
     along = result.degenerate[0, :3] / np.linalg.norm(result.degenerate[0, :3])
     assert abs(along[0]) > np.cos(np.deg2rad(10))
@@ -213,7 +210,7 @@ def test_a_map_of_all_points_is_given_up_when_features_are_fed_again(
     entered = []
     for is_starved in (False, True, *[False] * (CONSTRAINED_SCANS + 2)):
         monkeypatch.setattr(
-            "lslam.odometry.feature_policies.is_well_constrained", lambda *_, starved=is_starved: not starved
+            "lslam.odometry.feature_policies.holds_position", lambda *_, starved=is_starved: not starved
         )
         result = registration.locate(features, np.eye(4))
         assert (result.pose_source == ALL_POINTS) == is_starved

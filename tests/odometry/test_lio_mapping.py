@@ -21,8 +21,8 @@ from lslam.odometry import create_odometry
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.inertial_start import begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.inertial.window_motion import WindowMotion
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
+from lslam.odometry.inertial.window import WindowMotion
 from lslam.odometry.lio_mapping import LioMapping
 from lslam.pipeline.check import check_config
 from lslam.simulation.lidar_models import LIDARS
@@ -100,7 +100,7 @@ def test_a_scan_that_is_missing_stays_in_the_window_without_equations() -> None:
     sequence, config = replace(walk(), scans=walk().scans[:14]), windowed()
     tracker, odometry, motion = tracker_of(sequence, config)
     loaded = list(read_ahead(sequence, odometry.prepare, 1))
-    loaded[11] = Loaded(11, loaded[11].stamp_ns, error="gone")
+    loaded[11] = ScanInput(11, loaded[11].stamp_ns, error="gone")
     results = [tracker.track(scan) for scan in loaded]
     assert [r.status for r in results[10:]] == ["ok", "skipped", "ok", "ok"]
     assert motion.window is not None

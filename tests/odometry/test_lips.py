@@ -28,8 +28,8 @@ from lslam.odometry.frontend.inertial_start import Inertial, begin_inertial
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.tracker import Tracker
 from lslam.odometry.inertial.constant_velocity import middle_of
+from lslam.odometry.inertial.filter import Normal
 from lslam.odometry.inertial.linked_motion import LinkedMotion
-from lslam.odometry.inertial.window import Normal
 from lslam.odometry.lips import Lips
 from lslam.odometry.scan_outcome import fault
 from lslam.simulation.scenarios import simulate
@@ -163,9 +163,9 @@ def test_the_scan_after_a_rejected_one_is_linked_to_its_smoothed_pose() -> None:
     fused = one.motion.fuse(denied.stamp_ns, far, prior)
     reason = fault(fused.T_world_lidar, denied.stamp_ns, ScanResult(4, loaded[4].stamp_ns, np.eye(4)))
     assert "impossible jump" in reason
-    result = one.odometry.update(denied, prior, fused.rejected(reason, prior.pose.copy(), None))
+    result = one.odometry.update(denied, prior, fused.reject(reason, prior.pose.copy(), None))
     assert (result.status, result.covariance) == ("bridged", None)
-    one.motion.correct(result.stamp_ns, result.T_world_lidar, prior, is_registered=False)
+    one.motion.correct(result.stamp_ns, result.T_world_lidar, prior, has_registration=False)
     assert isinstance(one.motion, LinkedMotion)
     one.motion.refusal = "it was silent from here on"
     after = one.motion.sweep(loaded[6].stamp_ns, last.span)

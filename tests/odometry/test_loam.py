@@ -20,9 +20,8 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
-from lslam.odometry.all_points import ALL_POINTS
-from lslam.odometry.feature_policies import LessPlanar
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.feature_policies import ALL_POINTS, LessPlanar
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.loam import Loam
 from lslam.registration.policies import AtRest
 from lslam.registration.preprocessing.deskew import deskew_points
@@ -64,7 +63,7 @@ class Driver:
         self.loam, self.tracker = odometry, Tracker(odometry)
 
     def feed(self, scan: Scan) -> ScanResult:
-        return self.tracker.track(Loaded(scan.index, scan.stamp_ns, scan, self.loam.prepare(scan)))
+        return self.tracker.track(ScanInput(scan.index, scan.stamp_ns, scan, self.loam.prepare(scan)))
 
     def drive(self, scans: list[Scan]) -> list[ScanResult]:
         return [self.feed(scan) for scan in scans]

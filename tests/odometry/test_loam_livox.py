@@ -23,8 +23,8 @@ from lslam.io.readers import open_sequence
 from lslam.odometry import create_odometry
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import estimate
-from lslam.odometry.frontend.tracker import Loaded, Tracker
-from lslam.odometry.loam_livox import SLOPE_SHARE, joined, line_weights
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
+from lslam.odometry.loam_livox import SLOPE_SHARE, join, line_weights
 from lslam.registration.result import RegistrationResult
 from lslam.simulation.scenarios import simulate
 
@@ -45,7 +45,7 @@ def scans() -> tuple[list[Scan], Floats]:
 
 
 def tracked(tracker: Tracker, given: list[Scan]) -> list[ScanResult]:
-    return [tracker.track(Loaded(s.index, s.stamp_ns, s, tracker.odometry.prepare(s))) for s in given]
+    return [tracker.track(ScanInput(s.index, s.stamp_ns, s, tracker.odometry.prepare(s))) for s in given]
 
 
 def error(results: list[ScanResult], truth: Floats) -> float:
@@ -100,7 +100,7 @@ def test_pieces_that_agree_move_the_sweep_and_pieces_that_differ_bend_it() -> No
     times = np.linspace(0, 0.1, 33)
     prior = MotionPrior(times, se3.exp(times[:, None] * np.array([10.0, 0, 0, 0, 0, 1.0])))
     off = se3.exp(np.array([0.1, -0.2, 0.05, 0.01, 0.0, -0.02]))
-    located, sweep = joined(pieces([prior.pose @ off] * 3), MIDDLES, prior)
+    located, sweep = join(pieces([prior.pose @ off] * 3), MIDDLES, prior)
     np.testing.assert_allclose(located.T_world_lidar, off, atol=1e-12)
     np.testing.assert_allclose(sweep.poses, off @ prior.poses, atol=1e-12)
     assert located.matched == 240
@@ -109,7 +109,7 @@ def test_pieces_that_agree_move_the_sweep_and_pieces_that_differ_bend_it() -> No
     np.testing.assert_allclose(located.covariance, np.eye(6) * (1 / 3 + (1.5 * SLOPE_SHARE) ** 2 / 2), atol=1e-12)
     # 0.3 m/s faster than the prior says.
     faster = [se3.exp(np.array([0.3 * t, 0, 0, 0, 0, 0])) for t in MIDDLES]
-    located, sweep = joined(pieces(faster), MIDDLES, prior)
+    located, sweep = join(pieces(faster), MIDDLES, prior)
     at = 0.3 * (0.05 + SLOPE_SHARE * (times - 0.05))
     np.testing.assert_allclose(sweep.poses[:, 0, 3], prior.poses[:, 0, 3] + at, atol=1e-12)
     np.testing.assert_allclose(located.T_world_lidar, sweep.pose, atol=1e-12)
@@ -118,10 +118,10 @@ def test_pieces_that_agree_move_the_sweep_and_pieces_that_differ_bend_it() -> No
 def test_a_piece_may_fail_and_half_of_them_may_not() -> None:
     prior = MotionPrior(np.linspace(0, 0.1, 33), np.tile(np.eye(4), (33, 1, 1)))
     off = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
-    located, sweep = joined(pieces([off, np.eye(4), off], (True, False, True)), MIDDLES, prior)
+    located, sweep = join(pieces([off, np.eye(4), off], (True, False, True)), MIDDLES, prior)
     assert located.ok
     np.testing.assert_allclose(sweep.poses, np.tile(off, (33, 1, 1)), atol=1e-12)
-    located, sweep = joined(pieces([off, np.eye(4), off], (True, False, False)), MIDDLES, prior)
+    located, sweep = join(pieces([off, np.eye(4), off], (True, False, False)), MIDDLES, prior)
     assert not located.ok
     assert located.reason == "lost"
     assert sweep is prior

@@ -6,8 +6,7 @@ import numpy as np
 from analytic_scenes import bushes, pose_at, random_pose, room, seen_from
 
 from lslam.core.geometry import se3
-from lslam.odometry import closest_point
-from lslam.odometry.plane_segmentation import PlaneExtractor, turned
+from lslam.odometry.plane_segmentation import PlaneExtractor, boxes_in, to_hesse, transform_planes
 
 # Floor and walls of the room.
 WALLS = np.array([[0, 0, -1.7], [10, 0, 0], [-10, 0, 0], [0, 8, 0], [0, -8, 0]], float)
@@ -18,7 +17,7 @@ def test_a_room_is_its_floor_and_walls_with_right_covariances() -> None:
     for seed in range(8):
         pose = pose_at(tuple(rng.uniform(-1, 1, 3)), 30.0 * seed)
         planes = extractor.extract(seen_from(room(np.random.default_rng(seed), 1500), pose))
-        true = closest_point.seen_from(WALLS, pose)
+        true = transform_planes(WALLS, pose)
         for wall in true:
             nearest = int(np.argmin(np.linalg.norm(planes.cp - wall, axis=1)))
             off = planes.cp[nearest] - wall
@@ -34,7 +33,7 @@ def test_a_room_is_its_floor_and_walls_with_right_covariances() -> None:
 def test_what_all_points_share_is_added() -> None:
     points = seen_from(room(np.random.default_rng(0), 1500), np.eye(4))
     sure, doubtful = (PlaneExtractor(0.005, common, 0.0).extract(points) for common in (0.0, 0.1))
-    n, _ = closest_point.split(sure.cp)
+    n, _ = to_hesse(sure.cp)
     grown = np.einsum("ki,kij,kj->k", n, doubtful.covariance - sure.covariance, n)
     np.testing.assert_allclose(grown, 0.01, rtol=1e-6)
 
@@ -57,7 +56,7 @@ def test_a_scan_does_not_depend_on_the_ones_before() -> None:
 def test_boxes_hold_what_they_held_from_anywhere() -> None:
     planes = PlaneExtractor(0.03).extract(seen_from(room(np.random.default_rng(0), 1500), np.eye(4)))
     T = random_pose(np.random.default_rng(0), 5, 180)
-    lows, highs = turned(planes, T)
+    lows, highs = boxes_in(planes, T)
     for corner in (planes.lows, planes.highs, planes.means):
         moved = se3.apply(T, corner)
         assert ((moved > lows - 0.5) & (moved < highs + 0.5)).all()

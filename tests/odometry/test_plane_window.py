@@ -10,9 +10,9 @@ from analytic_scenes import random_pose
 
 from lslam.core.geometry import se3
 from lslam.core.types.imu import MotionState, PreintegratedStep
-from lslam.odometry import closest_point, plane_window
+from lslam.odometry import plane_window
 from lslam.odometry.plane_factors import SHARED, STATE_SIZE, sighting_residuals, step_residual
-from lslam.odometry.plane_segmentation import Planes
+from lslam.odometry.plane_segmentation import Planes, transform_planes
 from lslam.odometry.plane_window import PlaneWindow, associate
 
 # A room round the way, in the world.
@@ -44,7 +44,7 @@ def seen_planes(T_world_lidar: np.ndarray, rng: np.random.Generator) -> Planes:
     """The room's walls from a LiDAR, with noise."""
     count = len(WALLS)
     C = np.broadcast_to(1e-4 * np.eye(3), (count, 3, 3)).copy()
-    cp = closest_point.seen_from(WALLS, T_world_lidar) + 0.01 * rng.normal(size=(count, 3))
+    cp = transform_planes(WALLS, T_world_lidar) + 0.01 * rng.normal(size=(count, 3))
     none = np.zeros(count)
     return Planes(cp, C, none + 100, cp, np.zeros((count, 3, 3)), none, cp - 2, cp + 2)
 
@@ -62,8 +62,8 @@ def driven(count: int, seed: int = 0) -> PlaneWindow:
     window = PlaneWindow.begin(state_of(rng), T_IMU_LIDAR)
     for k in range(count):
         true = se3.make(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) @ T_IMU_LIDAR
-        window = window.extended(step_of(rng)) if k else window
-        solution, _ = added(window, seen_planes(true, rng)).solved()
+        window = window.extend(step_of(rng)) if k else window
+        solution, _ = added(window, seen_planes(true, rng)).solve()
         assert solution is not None
         window = solution
     return window
@@ -71,22 +71,22 @@ def driven(count: int, seed: int = 0) -> PlaneWindow:
 
 def test_derivatives_of_the_factors_are_those_of_differences() -> None:
     window, rng = driven(2), np.random.default_rng(1)
-    values = window.values.moved(0.02 * rng.normal(size=window.values.size))
+    values = window.values.retract(0.02 * rng.normal(size=window.values.size))
     # Rotations enter by their logarithm, whose derivative is the identity at zero: biases as they are, the end turned to it.
     felt = {"gyro_bias": values.gyro_biases[0], "gyro_axes": values.axes}
     step, h = replace(step_of(rng, 1.0), accel_bias=np.full(3, 0.1), **felt), 1e-6
     turn = np.zeros(values.size)
     turn[SHARED + STATE_SIZE + 3 : SHARED + STATE_SIZE + 6] = -step_residual(values, 0, step)[0][3:6]
-    values = values.moved(turn)
+    values = values.retract(turn)
     r, J = step_residual(values, 0, step)
     np.testing.assert_allclose(r[3:6], 0.0, atol=1e-12)
     assert np.linalg.norm(r[:3]) > 0.1
-    seen = window.seen.only(window.seen.states == 1)
+    seen = window.sightings.only(window.sightings.states == 1)
     s, by_pose, by_plane = sighting_residuals(values, seen, window.landmarks.anchors, T_IMU_LIDAR)
     for k in range(SHARED + 2 * STATE_SIZE):
         d = np.zeros(values.size)
         d[k] = h
-        moved = values.moved(d)
+        moved = values.retract(d)
         np.testing.assert_allclose((step_residual(moved, 0, step)[0] - r) / h, J[:, k], atol=1e-4)
         own = k - SHARED - STATE_SIZE
         if 0 <= own < 6:
@@ -95,12 +95,12 @@ def test_derivatives_of_the_factors_are_those_of_differences() -> None:
     for k in range(3):
         d = np.zeros(values.size)
         d[values.first_plane + k :: 3] = h
-        other = sighting_residuals(values.moved(d), seen, window.landmarks.anchors, T_IMU_LIDAR)[0]
+        other = sighting_residuals(values.retract(d), seen, window.landmarks.anchors, T_IMU_LIDAR)[0]
         np.testing.assert_allclose((other - s) / h, by_plane[:, :, k], atol=1e-3)
 
 
 def test_an_extended_window_has_a_state_where_the_step_leads() -> None:
-    window = driven(1).extended(step_of(np.random.default_rng(5)))
+    window = driven(1).extend(step_of(np.random.default_rng(5)))
     r, _ = step_residual(window.values, 0, window.steps[0])
     np.testing.assert_allclose(r, 0.0, atol=1e-5)
 
@@ -109,20 +109,20 @@ def test_marginalising_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Newest state and covariance are those of the whole; a plane that is left out leaves its information, too."""
     whole = driven(4)
     monkeypatch.setattr(plane_window, "LAG_SCANS", 2)
-    few = whole.marginalised()
+    few = whole.marginalise()
     assert few.values.states == 2
     np.testing.assert_allclose(few.joint_covariance(), whole.joint_covariance(), rtol=1e-5, atol=1e-12)
-    again, _ = few.solved()
+    again, _ = few.solve()
     assert again is not None
     np.testing.assert_allclose(again.values.poses[-1], whole.values.poses[-1], atol=2e-4)
     unseen = few.landmarks.unseen.copy()
     unseen[2] = plane_window.UNSEEN_SCANS
-    kept = few.seen.only(few.seen.planes != 2)
-    one_less = replace(few, landmarks=replace(few.landmarks, unseen=unseen), seen=kept)
-    assert len(one_less.marginalised().landmarks) == len(WALLS) - 1
+    kept = few.sightings.only(few.sightings.planes != 2)
+    one_less = replace(few, landmarks=replace(few.landmarks, unseen=unseen), sightings=kept)
+    assert len(one_less.marginalise().landmarks) == len(WALLS) - 1
     state = slice(0, 27)
     np.testing.assert_allclose(
-        one_less.marginalised().joint_covariance()[state, state], one_less.joint_covariance()[state, state], rtol=1e-5,
+        one_less.marginalise().joint_covariance()[state, state], one_less.joint_covariance()[state, state], rtol=1e-5,
         atol=1e-12,
     )  # fmt: skip
 
@@ -139,7 +139,7 @@ def test_the_path_through_a_room_is_within_its_covariance() -> None:
 
 def test_planes_are_associated_with_their_landmarks_and_others_with_none() -> None:
     rng = np.random.default_rng(3)
-    window = driven(3).extended(step_of(rng))
+    window = driven(3).extend(step_of(rng))
     planes = seen_planes(window.T_world_lidar, rng)
     np.testing.assert_array_equal(associate(window, planes, window.joint_covariance()), np.arange(len(WALLS)))
     # 0.3 m deeper, leaning by 5 deg, or in another part of the wall's plane: another surface.

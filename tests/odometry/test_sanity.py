@@ -12,7 +12,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.scan import FARTHEST_M, Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.scan_outcome import measurable, plausible
 
 Floats = NDArray[np.float64]
@@ -96,7 +96,7 @@ class Jumping(Traits):
 def test_a_method_that_jumps_is_bridged_until_it_may_have_got_there() -> None:
     tracker = Tracker(Jumping(5))
     scans = [Scan(np.ones((3, 3), np.float32), k * PERIOD_NS, k) for k in range(20)]
-    results = [tracker.track(Loaded(k, scan.stamp_ns, scan)) for k, scan in enumerate(scans)]
+    results = [tracker.track(ScanInput(k, scan.stamp_ns, scan)) for k, scan in enumerate(scans)]
     # 100 m take two thirds of a second at the speed of nothing that carries a LiDAR.
     assert [r.status for r in results] == ["ok"] * 5 + ["bridged"] * 7 + ["ok"] * 8
     assert results[7].T_world_lidar[0, 3] == pytest.approx(7.0)

@@ -16,7 +16,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
 from lslam.odometry.base import Traits
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 
 Floats = NDArray[np.float64]
 # What is claimed of a true step (4, 4), and of the seconds that it took.
@@ -60,7 +60,7 @@ class Lost(Traits):
 
     def register(self, scan: Scan, prepared: Any, prior: MotionPrior) -> ScanResult:
         if self.count not in self.known:
-            self.known[self.count] = self.tracker.track(Loaded(scan.index, scan.stamp_ns, scan, prepared))
+            self.known[self.count] = self.tracker.track(ScanInput(scan.index, scan.stamp_ns, scan, prepared))
         result = self.known[self.count]
         step = se3.relative(self.true, result.T_world_lidar)
         if self.begin <= self.count < self.end:

@@ -10,7 +10,7 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.map_pass import motion_within, scan_poser
 
 POINT = np.array([[20.0, 5.0, 1.0]])

@@ -13,6 +13,7 @@ from lslam.core.config.odometry import RegistrationConfig
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.local_map import LEAST_BREADTH, LocalMap, make_map_scans
+from lslam.registration.optimiser import optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points
 from lslam.registration.registration import Registration
 from lslam.simulation.scenarios import simulate
@@ -21,7 +22,7 @@ ARRAYS = ("moments", "planes", "keys", "table")
 
 
 def new_map() -> LocalMap:
-    return LocalMap(0.8, reach=100.0, shared=FLOOR_M2)
+    return LocalMap(0.8, reach=100.0, scan_variance=FLOOR_M2)
 
 
 def scan(seed: int) -> PreparedPoints:
@@ -42,7 +43,7 @@ def test_map_points_enter_fine_voxels_and_source_points_all_larger_ones() -> Non
         "count_cap": 200.0,
         "reach": 100.0,
         "breadth": LEAST_BREADTH,
-        "shared": FLOOR_M2,
+        "scan_variance": FLOOR_M2,
     }
     fine, *coarser = (GaussianMap(size, **kept) for size in (0.8, 3 * 0.8, 6 * 0.8, 12 * 0.8))
     fine.insert(points.map_points, T)
@@ -103,7 +104,7 @@ def test_cached_correspondences_are_discarded_when_the_map_changes() -> None:
     alignment, points = MapAlignment(target, config), scan(1)
 
     def align(by: MapAlignment, x: float) -> list[float]:
-        found = by.refine(points, pose_at((x, 0.0, 0.0)), 0.5, 10)
+        found = optimise(*by.problem(points, pose_at((x, 0.0, 0.0)), 0.5, 10))
         return [*found.T_world_lidar.ravel(), found.rmse, found.matched]
 
     for x in (0.1, 0.05):

@@ -8,9 +8,8 @@ from analytic_scenes import pose_at
 from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.errors import UsageError
 from lslam.registration.local_map import LastKeyframes
-from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.preprocessing.prepare import PreparedPoints, small_room
 from lslam.registration.registration import Registration
 
 Floats = NDArray[np.float64]
@@ -49,6 +48,8 @@ def test_the_oldest_leaves_when_there_are_too_many() -> None:
     assert listed.held == [2.0, 3.0, 4.0]
 
 
-def test_a_registration_on_arrays_has_no_submap() -> None:
-    with pytest.raises(UsageError, match="--method dlo"):
-        Registration(RegistrationConfig(target="submap"))
+def test_a_registration_on_arrays_may_have_a_submap() -> None:
+    registration = Registration(RegistrationConfig(target="submap"))
+    registration.register(small_room())
+    assert registration.register(small_room()).ok
+    assert len(registration.target.scans.poses) == 1

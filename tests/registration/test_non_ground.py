@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3
+from lslam.registration.policies import NEAR_M, NonGroundPoints, ground_under, high_points, on_ground
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.start_search import NEAR_M, NonGroundPoints, ground_under, high_points, on_ground
 
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]

@@ -17,14 +17,13 @@ from lslam.core.kernels import linearisation as at
 from lslam.core.kernels.jit import kernel
 from lslam.core.kernels.linearisation import Floats, Pose, Search, Settings, Sums, Width
 from lslam.core.kernels.residuals import Voxels, add_row, nearest, octant_slots
+from lslam.registration.alignment import solve, voxel_terms
 from lslam.registration.gaussian_map import GaussianMap
-from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
+from lslam.registration.optimiser import Annealing, Correspondences, Limits, Term, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.residuals import RESIDUALS, ResidualKind, residual_named
+from lslam.registration.residuals import RESIDUALS, ResidualKind, find_residual
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import solve, voxel_terms
 
 STEPS = 30
 
@@ -170,7 +169,7 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
     def found(count: int) -> RegistrationResult:
         return solve(
             levels[:count], scan, np.eye(4), Annealing(1.0, 0.15, 0.7, 40), RegistrationConfig(blob_weight=0.0),
-            residual=residual_named(residual),
+            residual=find_residual(residual),
         )  # fmt: skip
 
     one, two, three = (found(k) for k in (1, 2, 3))
@@ -193,7 +192,7 @@ def test_no_point_is_matched_on_two_maps(residual: str) -> None:
         level.insert(seen(), np.eye(4))
     scan = as_source(seen()[::20])
     result = solve(
-        levels, scan, np.eye(4), Annealing(0.15, 0.15, 0.5, 5), RegistrationConfig(), residual=residual_named(residual)
+        levels, scan, np.eye(4), Annealing(0.15, 0.15, 0.5, 5), RegistrationConfig(), residual=find_residual(residual)
     )  # fmt: skip
     assert 0 < result.inliers <= result.matched <= result.source_points
 

@@ -12,11 +12,10 @@ from lslam.core.config import load_config
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import NO_RECOVERY, RecoveryConfig, rest_alone
 from lslam.core.geometry import se3
-from lslam.registration.policies import AtRest, CoarseToFine, policies_of
+from lslam.registration.policies import AtRest, CoarseToFine, StartSearch, policies_of
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.result import RegistrationResult
-from lslam.registration.start_search import StartSearch
 
 Floats = NDArray[np.float64]
 

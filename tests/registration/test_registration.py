@@ -20,9 +20,9 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InputError
 from lslam.core.geometry import se3, so3
+from lslam.registration.optimiser import KERNEL_MIN_M
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.registration import Registration
-from lslam.registration.robust import KERNEL_MIN_M
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 Floats = NDArray[np.float64]

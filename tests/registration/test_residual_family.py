@@ -17,12 +17,12 @@ from lslam.core.config.odometry import RegistrationConfig, Residual
 from lslam.core.geometry import se3
 from lslam.odometry.icp import registration_of
 from lslam.odometry.uncertainty import PoseUncertainty
+from lslam.registration.alignment import solve
+from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS as TABLE
-from lslam.registration.residuals import residual_named
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import solve
+from lslam.registration.residuals import find_residual
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]
@@ -64,7 +64,7 @@ def test_the_coarse_map_alone_brings_a_start_near(residual: Residual) -> None:
         points = prepare_points(seen_from(room(rng), T), registration.preprocess)
         slow = Annealing(5.0, 0.15, 0.85, 40)
         coarse = registration.map.coarser[0]
-        found = solve((coarse,), points, np.eye(4), slow, RegistrationConfig(), residual=residual_named(residual))
+        found = solve((coarse,), points, np.eye(4), slow, RegistrationConfig(), residual=find_residual(residual))
         assert distance(T, found.T_world_lidar)[0] < 0.1
 
 

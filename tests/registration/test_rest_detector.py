@@ -69,7 +69,7 @@ def test_a_pose_that_is_unsure_or_rejected_is_no_rest() -> None:
     detector.judge(result)
     assert not detector.judge(RegistrationResult(result.T_world_lidar, covariance=None)).is_stationary
     detector.judge(result)
-    assert not detector.judge(result.rejected("the IMU", result.T_world_lidar, C)).is_stationary
+    assert not detector.judge(result.reject("the IMU", result.T_world_lidar, C)).is_stationary
     # 10 cm are no rest, however little is known.
     far = RegistrationResult(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])), covariance=1e4 * C, lever_arm=LEVER_M)
     detector.judge(result)

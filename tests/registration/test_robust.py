@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from lslam.registration.robust import AdaptiveThreshold, UsualAgreement
+from lslam.registration.history import AdaptiveThreshold, UsualAgreement
 
 
 def test_the_threshold_starts_wide_and_follows_the_errors() -> None:

@@ -24,12 +24,11 @@ from numpy.typing import NDArray
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.kernels.residuals import TILT_FACTOR
-from lslam.registration.alignment import upright_directions
+from lslam.registration.alignment import solve, upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
+from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import Annealing
-from lslam.registration.solver import solve
 
 Floats = NDArray[np.float64]
 # Of the points of a room.
@@ -82,7 +81,7 @@ def test_the_ground_aligns_height_and_tilt_alone(room_map: GaussianMap, weak_sha
     start = T @ off
     result = solve(
         (room_map,), as_source(seen_from(room(rng, 300), T)), start, FINE,
-        RegistrationConfig(sigma=NOISE, blob_weight=0.5, weak_share=weak_share), allowed=upright_directions(start),
+        RegistrationConfig(sigma=NOISE, blob_weight=0.5, weak_share=weak_share), directions=upright_directions(start),
     )  # fmt: skip
     moved = se3.log(se3.relative(start, result.T_world_lidar))
     left = se3.log(se3.relative(T, result.T_world_lidar))
@@ -128,7 +127,7 @@ def test_covariance_is_the_spread_over_maps_whose_scans_err() -> None:
     rng = np.random.default_rng(3)
 
     def erring() -> GaussianMap:
-        target = GaussianMap(0.8, shared=FLOOR_M2 / TILT_FACTOR)
+        target = GaussianMap(0.8, scan_variance=FLOOR_M2 / TILT_FACTOR)
         for error in rng.normal(0.0, np.sqrt(FLOOR_M2), (4, 6)):
             target.insert(room(rng, 2000).astype(np.float32), se3.exp(error / np.repeat([1.0, LEVER_ARM_M], 3)))
         return target

@@ -8,8 +8,8 @@ from analytic_scenes import is_near, random_pose, room, seen_from
 from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
+from lslam.registration.gaussian_map import COVARIANCE_POINTS, Neighbourhood, source_covariance
 from lslam.registration.registration import Registration
-from lslam.registration.source_covariance import COVARIANCE_POINTS, Neighbourhood, source_covariance
 
 THIN = 9e-4
 

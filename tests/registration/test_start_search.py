@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from recovery_drives import driven, seen_by
 
 from lslam.core.geometry import se3, so3
+from lslam.registration.policies import MUCH_RATIO, is_much_more, start_offsets
 from lslam.registration.registration import Registration
-from lslam.registration.start_search import MUCH_RATIO, is_much_more, start_offsets
 from lslam.simulation.scenarios import simulate
 
 Floats = NDArray[np.float64]

@@ -11,9 +11,8 @@ from lslam.core.geometry import se3
 from lslam.core.kernels import voxel as voxels
 from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats
-from lslam.registration.preprocessing.ground import Z, world_up_of
+from lslam.registration.preprocessing.ground import Z, find_up, world_up_of
 from lslam.registration.preprocessing.prepare import NO_TIMES
-from lslam.registration.preprocessing.up import find_up
 
 
 def neighbours(count: int, number: int, size: int) -> range:

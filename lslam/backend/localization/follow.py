@@ -21,9 +21,10 @@ from lslam.core.types.state import Stateful
 from lslam.registration.acceptance import Acceptance, correction
 from lslam.registration.alignment import MapAlignment
 from lslam.registration.attempt import NEAR_KERNEL_FACTOR
+from lslam.registration.history import UsualAgreement
+from lslam.registration.optimiser import COARSE_KERNEL_M, KERNEL_MIN_M, optimise
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import COARSE_KERNEL_M, KERNEL_MIN_M, UsualAgreement
 from lslam.registration.voxel_target import MIN_SOURCE_POINTS
 
 # Sigmas that the kernel spans, and the chance that the innovation of a scan that the map holds lies beyond its gate.
@@ -103,10 +104,10 @@ class MapFollower(Stateful):
         width = max(self._spread(), NEAR_KERNEL_FACTOR * KERNEL_MIN_M)
         if start is self.T and width <= c.kernel_max:
             information = np.asarray(np.linalg.inv(self.covariance), np.float64)
-            return alignment.refine(points, start, width, c.max_iterations, information=information)
+            return optimise(*alignment.problem(points, start, width, c.max_iterations, information=information))
         if start is self.T:
             start = alignment.coarse_to_fine(points, start, width).T_world_lidar
-        return alignment.refine(points, start, c.kernel_max, c.max_iterations)
+        return optimise(*alignment.problem(points, start, c.kernel_max, c.max_iterations))
 
     def _judge(self, result: RegistrationResult) -> tuple[FixStatus, str]:
         """What the map says of a scan, and why not more."""

@@ -142,10 +142,6 @@ class LocalView:
         c = self._config
         centre = (np.array(block) + 0.5) * BLOCK_M
         # Nobody knows which beams saw a point of a finished map.
-        target = LocalMap(
-            c.voxel_size,
-            reach=np.inf,
-            breadth=0.0,
-        )
+        target = LocalMap(c.voxel_size, reach=np.inf, breadth=0.0)
         insert_all(target, self._map.around(centre, self._reach + BLOCK_M / 2))
         return MapAlignment(target, c)

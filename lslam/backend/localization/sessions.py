@@ -23,8 +23,8 @@ from lslam.core.types.constraint import Constraint
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Keyframe
+from lslam.registration.preprocessing.ground import ahead_of
 from lslam.registration.preprocessing.prepare import NO_TIMES
-from lslam.registration.preprocessing.up import ahead_of
 
 # m, voxels of the cloud that further sessions are searched in.
 FINE = 0.2

@@ -20,12 +20,12 @@ from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Verdict
 from lslam.registration.acceptance import Acceptance
+from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
+from lslam.registration.optimiser import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
+from lslam.registration.preprocessing.ground import ahead_of
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
-from lslam.registration.preprocessing.up import ahead_of
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
-from lslam.registration.solver import solve
 
 # m between two keyframes that are tried, at least.
 SPACING_M = 6.0

@@ -14,9 +14,8 @@ from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR
-from lslam.registration.preprocessing.ground import Z
+from lslam.registration.preprocessing.ground import NEAR_Z, Z
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.preprocessing.up import NEAR_Z
 
 # Cosines: surfaces tilted by less against the estimate so far are taken for ground, floors and flat roofs.
 ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 15.0, 15.0))

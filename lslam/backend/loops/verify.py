@@ -15,10 +15,10 @@ from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.constraint import LoopStage
 from lslam.registration.acceptance import Acceptance
+from lslam.registration.alignment import solve
+from lslam.registration.optimiser import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
-from lslam.registration.solver import solve
 
 # Cells, at least and at most; the least image serves where the search is short.
 SMALL, LARGE = BevGrid(128), BevGrid(256)

@@ -127,7 +127,7 @@ def _merge_lidars(sequence: Sequence, overrides: SequenceInfo) -> Sequence:
     """Sequence merged with the LiDARs in the table `lidars` of its `sequence.toml`. Raises InputError when one is missing."""
     from lslam.io.formats.sequence_toml import FILE_NAME, SequenceInfo
     from lslam.io.readers.sidecars import read_info
-    from lslam.registration.preprocessing.merged_lidars import FurtherLidar, MergedLidars
+    from lslam.registration.preprocessing.views import FurtherLidar, MergedLidars
 
     folder = sequence.path if sequence.path.is_dir() else sequence.path.parent
     of_all = SequenceInfo(motion_compensated=overrides.motion_compensated)

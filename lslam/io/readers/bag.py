@@ -52,7 +52,7 @@ from lslam.io.readers.point_clock import (
 from lslam.io.readers.point_times import Sample
 from lslam.io.readers.sequence_on_disk import SequenceOnDisk, in_metres, settle_unit
 from lslam.io.readers.sidecars import calibration_over, compensation_note, read_info, stated_times
-from lslam.registration.preprocessing.merged_lidars import FurtherLidar, MergedLidars
+from lslam.registration.preprocessing.views import FurtherLidar, MergedLidars
 
 KIND = "bag"
 _LAYOUTS = ("velodyne", "velodyne_points", "sequences")

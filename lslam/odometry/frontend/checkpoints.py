@@ -6,87 +6,49 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
 from lslam.core.errors import InputError
-from lslam.core.types.constraint import Constraint, LoopCandidate, MapFix
-from lslam.core.types.imu import (
-    GravityDirection,
-    ImuDiagnostics,
-    ImuState,
-    ImuStream,
-    InertialState,
-    InertialStep,
-    MotionState,
-    PreintegratedStep,
-)
-from lslam.core.types.motion_prior import MotionPrior
-from lslam.core.types.scan import Scan
-from lslam.core.types.scan_result import MotionCheck, ScanEquations, ScanResult
+from lslam.core.types import constraint, imu, motion_prior, scan, scan_result
+from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State
 from lslam.core.types.warned import warnings_so_far
 from lslam.io.formats.state_files import Records, read_state, write_state
+from lslam.odometry import feature_map, icp_svd, plane_factors, plane_window
 from lslam.odometry.base import Resumable
-from lslam.odometry.feature_map import FeatureScan
+from lslam.odometry.frontend import segments, tracker
 from lslam.odometry.frontend.keyframing import Keyframing
-from lslam.odometry.frontend.segments import Tracked
-from lslam.odometry.frontend.tracker import Loaded
 from lslam.odometry.frontend.windows import WindowTracker
-from lslam.odometry.icp_svd import Partners
-from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.initialise import InertialStart
-from lslam.odometry.inertial.navigation_state import NavigationState
-from lslam.odometry.inertial.wheel_calibration import WheelCalibration
-from lslam.odometry.inertial.window import Moment, Past, Window
-from lslam.odometry.integrity.monitor import Seen
-from lslam.odometry.plane_factors import Sightings, WindowPrior, WindowValues
-from lslam.odometry.plane_window import Landmarks, PlaneWindow
-from lslam.registration.preprocessing.features import FeaturePoints, Features
-from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.odometry.inertial import filter as inertial_filter
+from lslam.odometry.inertial import gyroscope, imu_estimate, initialise, wheel_calibration, window
+from lslam.odometry.integrity import monitor
+from lslam.registration.preprocessing import features, prepare
 
-STATE_CLASSES = (
-    Constraint,
-    FeaturePoints,
-    Features,
-    FeatureScan,
-    GravityDirection,
-    Gyroscope,
-    ImuEstimate,
-    ImuDiagnostics,
-    ImuNoise,
-    ImuState,
-    ImuStream,
-    InertialState,
-    InertialStep,
-    Landmarks,
-    Loaded,
-    LoopCandidate,
-    MapFix,
-    Moment,
-    MotionCheck,
-    MotionPrior,
-    MotionState,
-    NavigationState,
-    Partners,
-    Past,
-    PlaneWindow,
-    PreintegratedStep,
-    PreparedPoints,
-    Scan,
-    ScanEquations,
-    ScanResult,
-    Seen,
-    Sightings,
-    InertialStart,
-    Tracked,
-    Window,
-    WheelCalibration,
-    WindowPrior,
-    WindowValues,
+# The dataclasses of these modules, plain values all of them, may be part of a state.
+_STATE_MODULES = (
+    *(
+        constraint,
+        imu,
+        motion_prior,
+        scan,
+        scan_result,
+        features,
+        prepare,
+        feature_map,
+        icp_svd,
+        plane_factors,
+        plane_window,
+    ),
+    *(gyroscope, imu_estimate, inertial_filter, initialise, wheel_calibration, window, monitor, segments, tracker),
 )
-
+STATE_CLASSES = tuple(
+    value
+    for module in _STATE_MODULES
+    for value in vars(module).values()
+    if isinstance(value, type) and is_dataclass(value) and value.__module__ == module.__name__
+)
 
 log = logging.getLogger("lslam")
 
@@ -243,7 +205,7 @@ class OdometryCheckpoints:
     def _write(self, results: list[ScanResult], tracker: WindowTracker, keyframing: Keyframing, is_over: bool) -> None:
         if all(result.status == "skipped" for result in results):
             return  # bad input: nothing to go on with
-        if not is_over and (keyframing.is_waiting or not tracker.is_settled):
+        if not is_over and (keyframing.is_waiting or not tracker.is_complete):
             return  # the next scan is needed to say what the first one was
         if is_over:
             keyframing.settle()

@@ -19,7 +19,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
 from lslam.odometry import create_odometry
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import gate_points
@@ -80,16 +80,16 @@ class _KnownSteps(ConstantVelocity):
         self._instant_ns, self._pose = 2 * stamps_ns[0] - stamps_ns[1], se3.inverse(steps[0])
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """As constant velocity, with the next step in place of the last."""
-        super().correct(stamp_ns, pose, prior, is_registered)
+        super().correct(stamp_ns, pose, prior, has_registration)
         self._twist, self._step_s = self._steps[min(self._next, len(self._steps) - 1)]
         self._next += 1
 
 
 @dataclass(frozen=True)
-class _Placed:
+class _ScanAtPose:
     """A scan where odometry has it, deskewed: its pose, points for surfaces (N, 3) and points that were kept out (M, 3), m."""
 
     pose: Floats
@@ -110,13 +110,13 @@ class ClockWindow:
         self._whole = Config.model_validate({"preprocess": gate})
         self._config = Config.model_validate({"preprocess": gate | few})
         self.scans = [scan for scan in scans if len(scan) > 0]
-        self._masks = [self._split(scan) for scan in self.scans]
+        self._masks = [self._divide(scan) for scan in self.scans]
         self._scores: dict[SweepClock | None, Floats] = {}
 
     @cached_property
     def _steps(self) -> list[Floats]:
         """Motion (4, 4) from scan to scan, without a clock."""
-        poses = [placed.pose for placed in self._placed(None, self._whole, None)]
+        poses = [at_poses.pose for at_poses in self._place(None, self._whole, None)]
         return [se3.relative(a, b) for a, b in pairwise(poses)]
 
     @property
@@ -130,42 +130,42 @@ class ClockWindow:
         if clock not in self._scores:
             config = self._config.model_copy(update={"recovery": _NO_SEARCH})
             motion = _KnownSteps([scan.stamp_ns for scan in self.scans], self._steps)
-            placed = self._placed(clock, config, motion)[SKIPPED - 1 :]
-            is_judged = self._is_same_motion(placed)
+            at_poses = self._place(clock, config, motion)[SKIPPED - 1 :]
+            is_judged = self._is_same_motion(at_poses)
             # Rings on flat ground agree best with themselves where the motion is lost: that is no evidence.
-            self._scores[clock] = _distances(placed)[1:] if is_judged else np.full(len(placed) - 1, _LOST)
+            self._scores[clock] = _distances(at_poses)[1:] if is_judged else np.full(len(at_poses) - 1, _LOST)
         return self._scores[clock]
 
     def is_astray(self, clock: SweepClock | None) -> bool:
         """Whether odometry found another motion under the clock than the window has, so that its scores say nothing."""
         return bool((self.scores(clock) >= _LOST).all())
 
-    def _placed(self, clock: SweepClock | None, config: Config, motion: ConstantVelocity | None) -> list[_Placed]:
+    def _place(self, clock: SweepClock | None, config: Config, motion: ConstantVelocity | None) -> list[_ScanAtPose]:
         """The scans where odometry has them under the clock."""
         odometry = create_odometry(config)
         tracker = Tracker(odometry, motion=motion)
-        placed = []
+        at_poses = []
         for number, (scan, (used, unused)) in enumerate(zip(self.scans, self._masks, strict=True)):
             timed = replace(scan, times=None if clock is None else clock.times_of(scan.points)[0])
             registered, kept_out = timed.select(used), timed.select(unused)
-            loaded = Loaded(number, scan.stamp_ns, registered, odometry.prepare(registered))
-            pose = tracker.track(loaded).T_world_lidar
-            surface = registered.select(_thinned(len(registered), _SURFACE))
-            both = (se3.apply(pose, _deskewed(part, tracker.sweep)) for part in (surface, kept_out))
-            placed.append(_Placed(pose, *both))
-        return placed
+            entry = ScanInput(number, scan.stamp_ns, registered, odometry.prepare(registered))
+            pose = tracker.track(entry).T_world_lidar
+            surface = registered.select(_thin(len(registered), _SURFACE))
+            both = (se3.apply(pose, _deskew(part, tracker.sweep)) for part in (surface, kept_out))
+            at_poses.append(_ScanAtPose(pose, *both))
+        return at_poses
 
-    def _is_same_motion(self, placed: list[_Placed]) -> bool:
+    def _is_same_motion(self, at_poses: list[_ScanAtPose]) -> bool:
         """Whether the scans move as they do without a clock, as far as rotations within their sweeps allow."""
         turn = max(float(so3.angle(step[:3, :3])) for step in self._steps)
-        for a, b, step in zip(placed[:-1], placed[1:], self._steps[SKIPPED - 1 :], strict=True):
+        for a, b, step in zip(at_poses[:-1], at_poses[1:], self._steps[SKIPPED - 1 :], strict=True):
             expected, moved = step[:3, 3], se3.relative(a.pose, b.pose)[:3, 3]
             allowed = _ASTRAY * float(np.linalg.norm(expected)) + _ASTRAY_M + _LEVER_M * turn
             if float(np.linalg.norm(moved - expected)) > allowed:
                 return False
         return True
 
-    def _split(self, scan: Scan) -> tuple[Longs, Longs]:
+    def _divide(self, scan: Scan) -> tuple[Longs, Longs]:
         """Indices of the points for odometry and of those that are kept out, in their order, by chance."""
         usable = gate_points(np.ascontiguousarray(scan.points, np.float32), self._config.preprocess)
         order = np.random.default_rng((len(usable), scan.index)).permutation(usable)
@@ -202,15 +202,15 @@ def mean_score(windows: list[ClockWindow], clock: SweepClock | None) -> float:
     return float(np.concatenate([window.scores(clock) for window in windows]).mean())
 
 
-def _deskewed(scan: Scan, sweep: MotionPrior) -> Floats:
+def _deskew(scan: Scan, sweep: MotionPrior) -> Floats:
     return np.asarray(deskew_points(scan.points, scan.times, sweep), np.float64)
 
 
-def _thinned(count: int, most: int) -> Longs:
+def _thin(count: int, most: int) -> Longs:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
-def _distances(scans: list[_Placed]) -> Floats:
+def _distances(scans: list[_ScanAtPose]) -> Floats:
     """(S,) mean of the bounded distances of each scan's points from the surfaces that the other scans make."""
     from scipy.spatial import cKDTree
 

@@ -16,8 +16,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Sequence
 from lslam.odometry.frontend.clock_agreement import SCANS, ClockWindow, compare_clocks, mean_score, read_window
-from lslam.registration.preprocessing.clock_proposals import Proposal
-from lslam.registration.preprocessing.sweep_clock import SweepClock, is_same_motion
+from lslam.registration.preprocessing.sweep_clock import Proposal, SweepClock, is_same_motion
 
 Verdict = Literal["stated", "clear", "compensated", "unclear", "standing", "unknown"]
 

@@ -6,7 +6,10 @@ For the manifest, what the run found of the calibration: the rotation of its ext
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +23,8 @@ from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.sequence import Selection, Sequence, select
 from lslam.io.formats.state_files import read_state, write_state
-from lslam.odometry import create_odometry
+from lslam.odometry import METHODS, create_odometry
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
-from lslam.odometry.frontend.motion_models import motion_of
 from lslam.odometry.frontend.register_scans import read_ahead
 from lslam.odometry.frontend.scene_scale import in_scale
 from lslam.odometry.frontend.tracker import Tracker
@@ -166,8 +168,8 @@ def first_poses(sequence: Sequence, config: Config, motion: InertialMotion | Non
     instants: list[int] = []
     middles: list[Floats] = []
     covariances: list[Floats] = []
-    for loaded in read_ahead(few, odometry.prepare, config.input.workers):
-        result = tracker.track(loaded)
+    for entry in read_ahead(few, odometry.prepare, config.input.workers):
+        result = tracker.track(entry)
         if result.status == "skipped":
             continue
         if result.status != "ok":
@@ -217,7 +219,6 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
     if motion.refusal:
         part.problems.append(f"the IMU was refused on the way, the run went on without it: {motion.refusal}")
     last = motion.estimate
-    errors = motion.prior_errors()
     norms = [r.prior_norm for r in results[1:] if r.status == "ok"]
     steady = [r.imu.steady_norm for r in results[1:] if r.status == "ok" and r.imu.steady_norm is not None]
     iterations = [r.iterations for r in results[1:] if r.status == "ok" and not r.repeats_pose]
@@ -227,18 +228,17 @@ def close_inertial(part: Inertial, results: list[ScanResult]) -> dict[str, Any]:
         "velocity": motion.config.velocity,
         "time_offset_s": round(opening.offset_s + last.gyroscope.offset_s, 5),
         **calibration_of(last.gyroscope, opening),
-        "is_checked_by_turns": opening.is_checked,
+        "is_checked_by_turns": opening.has_turn_check,
         "is_static_start": opening.is_static,
-        "gyro_bias_rad_s": _rounded(last.gyroscope.bias, 5),
-        "accel_bias_m_s2": _rounded(last.accel_bias, 4),
-        "gravity_in_world_m_s2": _rounded(last.gravity, 4),
+        "gyro_bias_rad_s": _round(last.gyroscope.bias, 5),
+        "accel_bias_m_s2": _round(last.accel_bias, 4),
+        "gravity_in_world_m_s2": _round(last.gravity, 4),
         "scans_in_gaps": motion.gap_scans,
         "median_prior_norm": round(float(np.median(norms)), 5) if norms else None,
         "median_constant_velocity_norm": round(float(np.median(steady)), 5) if steady else None,
         "mean_iterations": round(float(np.mean(iterations)), 2) if iterations else None,
         **_savings(results),
-        "prior_error_m": None if errors is None else round(errors[0], 5),
-        "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
+        **motion.errors.facts,
     }
 
 
@@ -260,7 +260,7 @@ def _savings(results: list[ScanResult]) -> dict[str, Any]:
     }
 
 
-def _rounded(values: Floats, digits: int) -> list[float]:
+def _round(values: Floats, digits: int) -> list[float]:
     return [round(float(v), digits) for v in values]
 
 
@@ -277,13 +277,13 @@ def mounting_problem(motion: InertialMotion) -> str:
     """
     gyroscope = motion.estimate.gyroscope
     angle, sigma = gyroscope.tilt
-    if gyroscope.is_mounted or angle < LEAST_TURN_RAD or angle < SIGMAS * sigma:
+    if gyroscope.has_mounting or angle < LEAST_TURN_RAD or angle < SIGMAS * sigma:
         return ""
     first = "" if motion.HAS_DEVICE else "--method fast-lio2 "
     if motion.config.velocity != "registration":
         first = "--set imu.velocity=registration "
     cause = "correct T_lidar_imu, or have it estimated"
-    if not _is_turned(gyroscope):
+    if not _has_turn(gyroscope):
         cause = (
             "the gyroscope's axes are askew or T_lidar_imu is turned, turns about one axis do not tell which; the latter is "
             "estimated"
@@ -294,7 +294,7 @@ def mounting_problem(motion: InertialMotion) -> str:
     )
 
 
-def _is_turned(gyroscope: Gyroscope) -> bool:
+def _has_turn(gyroscope: Gyroscope) -> bool:
     """Whether a rotation of the whole device is certain, whatever its axes may be askew."""
     rotation, covariance = gyroscope.rotation[0], gyroscope.rotation_covariance
     angle = float(np.linalg.norm(rotation))
@@ -310,7 +310,7 @@ def calibration_of(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, An
     facts: dict[str, Any] = {}
     if gyroscope.has_offset:
         facts["time_offset_sigma_s"] = round(float(np.sqrt(gyroscope.covariance[12, 12])), 6)
-    if gyroscope.is_mounted:
+    if gyroscope.has_mounting:
         vector, sigma = gyroscope.rotation
         T = opening.T_lidar_imu.copy()
         mounting = gyroscope.mounting
@@ -320,3 +320,19 @@ def calibration_of(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, An
         facts["mounting_sigma_deg"] = round(float(np.rad2deg(sigma)), 3)
         facts["T_lidar_imu"] = [round(float(v), 6) for v in T[:3].ravel()]
     return facts
+
+
+def motion_of(opening: InertialStart, config: Config) -> InertialMotion:
+    """The motion model that the method asks for: `create_motion` of its module, where it has one."""
+    create: Callable[[InertialStart, Config], InertialMotion] = InertialMotion.of
+    if config.odometry.method in METHODS:
+        module, _ = METHODS[config.odometry.method]
+        create = getattr(import_module(module), "create_motion", create)
+    return create(opening, config)
+
+
+def copy_of(motion: InertialMotion, opening: InertialStart, config: Config) -> InertialMotion:
+    """A second model of the same IMU that goes on where `motion` is."""
+    other = motion_of(opening, config)
+    other.restore(deepcopy(motion.state()))
+    return other

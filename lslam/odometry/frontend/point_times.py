@@ -20,16 +20,16 @@ from lslam.core.types.sequence import Sequence, SequenceView, StatedTimes, selec
 from lslam.odometry import create_odometry
 from lslam.odometry.frontend.clock_agreement import FEWEST_SCANS, ClockWindow, compare_clocks, read_window
 from lslam.odometry.frontend.clock_choice import TURNS, ClockChoice, choose_clock
-from lslam.registration.preprocessing.clock_proposals import (
+from lslam.registration.preprocessing.sweep_clock import (
     Proposal,
+    SweepClock,
     azimuth_proposal,
     columns_clock,
+    is_same_motion,
     order_clock,
     propose_clock,
 )
-from lslam.registration.preprocessing.merged_lidars import MergedLidars
-from lslam.registration.preprocessing.sweep_clock import SweepClock, is_same_motion
-from lslam.registration.preprocessing.views import Clocked
+from lslam.registration.preprocessing.views import ClockView, MergedLidars
 
 log = logging.getLogger("lslam")
 
@@ -69,7 +69,7 @@ def with_point_times(sequence: Sequence, preprocess: PreprocessConfig, is_stated
         return sequence
     nominal = SweepClock("order", 1 / sequence.rate_hz, stated.reference == "end")
     if stated.kind is not None:
-        return _with(sequence, _as_stated(sequence, scans, stated.kind, nominal, preprocess))
+        return _with(sequence, _stated_clock(sequence, scans, stated.kind, nominal, preprocess))
     if len(sequence) < FEWEST_SCANS:
         return sequence
     choice = _by_agreement(sequence, scans, nominal, preprocess)
@@ -91,7 +91,7 @@ def _by_agreement(
         proposal = propose_clock(samples, nominal, rows)
         if proposal is None:
             return ClockChoice(None, "unknown", "point times: none, the sensor makes no full turns")
-        return _decided(part, proposal, samples[0], preprocess)
+        return _decide(part, proposal, samples[0], preprocess)
 
     choice = decide(0)
     if choice.clock is None:
@@ -99,7 +99,7 @@ def _by_agreement(
     return replace(choice, later=tuple(later_choices(sequence, choice.clock, decide, preprocess)))
 
 
-def _decided(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
+def _decide(sequence: Sequence, proposal: Proposal, sample: Scan, preprocess: PreprocessConfig) -> ClockChoice:
     """As `choose_clock`, with the kernels compiled before."""
     with jit.announce_compiling(log):
         create_odometry(Config()).warm_up()
@@ -115,10 +115,10 @@ def _with(sequence: Sequence, choice: ClockChoice) -> Sequence:
     if choice.clock is None and choice.verdict != "stated":
         return SequenceView(sequence, notes=notes, clock_choice=choice)
     clocks = [(first, later.clock) for first, later in choice.later]
-    return Clocked(sequence, choice.clock, clocks, notes=notes, clock_choice=choice)
+    return ClockView(sequence, choice.clock, clocks, notes=notes, clock_choice=choice)
 
 
-def _as_stated(
+def _stated_clock(
     sequence: Sequence, scans: list[Scan], kind: str, nominal: SweepClock, preprocess: PreprocessConfig
 ) -> ClockChoice:
     """The clock that is stated. Raises InputError where the scans do not have it."""
@@ -136,7 +136,7 @@ def _as_stated(
         proposal = azimuth_proposal(scans, nominal)
         clock = proposal.clock
         if proposal.is_guess:
-            choice = _decided(sequence, proposal, scans[0], preprocess)
+            choice = _decide(sequence, proposal, scans[0], preprocess)
             if choice.clock is None:
                 raise InputError(
                     f"{sequence.path}: point_times = 'azimuth', and neither the order of the points nor the agreement of "

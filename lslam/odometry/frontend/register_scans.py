@@ -25,8 +25,8 @@ from lslam.core.types.trajectory import Trajectory
 from lslam.odometry.base import Odometry
 from lslam.odometry.frontend.checkpoints import OdometryCheckpoints
 from lslam.odometry.frontend.keyframing import Keyframing
-from lslam.odometry.frontend.segments import Begin, SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.segments import Begin, SegmentTracker, TrackedScan
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.frontend.windows import WindowTracker
 from lslam.odometry.inertial.constant_velocity import MotionModel
 from lslam.odometry.integrity.monitor import IntegrityMonitor
@@ -75,14 +75,14 @@ def estimate(
         results = checkpoints.begin(windows, keyframing)
     middle = windows.middle
     ahead = read_ahead(sequence, odometry.prepare, threads, first=len(results))
-    for loaded in chain(ahead, (None,)):
-        windows.open(loaded)
-        decided = windows.decide(loaded, None if loaded is None else windows.present.track(loaded))
-        for tracked in decided:
-            if results and tracker.has_middles and not tracked.is_two_sided:
-                results[-1] = between_middles(results[-1], middle, tracked)
-            results.append(_observed(tracked, len(results), keyframing, monitor))
-            middle = tracked.middle
+    for entry in chain(ahead, (None,)):
+        windows.open(entry)
+        decided = windows.decide(entry, None if entry is None else windows.present.track(entry))
+        for track in decided:
+            if results and tracker.has_middles and not track.has_both_sides:
+                results[-1] = between_middles(results[-1], middle, track)
+            results.append(_observe(track, len(results), keyframing, monitor))
+            middle = track.middle
             on_scan(results[-1])
         if decided and should_stop():
             break
@@ -93,21 +93,21 @@ def estimate(
     return results
 
 
-def _observed(
-    tracked: Tracked, position: int, keyframing: Keyframing | None, monitor: IntegrityMonitor | None
+def _observe(
+    track: TrackedScan, position: int, keyframing: Keyframing | None, monitor: IntegrityMonitor | None
 ) -> ScanResult:
     """The result of the scan at this position of the run with its times, after keyframing and monitor saw it."""
-    loaded, result = tracked.loaded, tracked.result
-    stages = {"read": loaded.read_s, "prepare": loaded.prepare_s, **result.stages}
+    entry, result = track.entry, track.result
+    stages = {"read": entry.read_s, "prepare": entry.prepare_s, **result.stages}
     if keyframing is not None:
         began = time.perf_counter()
-        keyframing.see(position, loaded.scan, result, tracked.sweep)
+        keyframing.see(position, entry.scan, result, track.sweep)
         stages["keyframe"] = time.perf_counter() - began
     if monitor is not None:
         began = time.perf_counter()
-        monitor.see(position, loaded.scan, loaded.prepared, result, tracked.sweep)
+        monitor.see(position, entry.scan, entry.prepared, result, track.sweep)
         stages["integrity"] = time.perf_counter() - began
-    return replace(result, stages=stages, fault="" if loaded.scan is None else loaded.scan.fault)
+    return replace(result, stages=stages, fault="" if entry.scan is None else entry.scan.fault)
 
 
 def sweep_of(sequence: Sequence) -> Span | None:
@@ -130,12 +130,12 @@ def sweep_of(sequence: Sequence) -> Span | None:
     return max((span for span in spans if span is not None), key=lambda span: span.seconds, default=None)
 
 
-def is_diverged(results: list[ScanResult]) -> bool:
+def diverges(results: list[ScanResult]) -> bool:
     """Whether fewer than half of the scans were registered and stand in one frame, that of the trajectory."""
     return sum(r.status == "ok" and r.frame == 0 for r in results) < max(1, len(results) // 2)
 
 
-def between_middles(result: ScanResult, middle: tuple[int, Floats], following: Tracked) -> ScanResult:
+def between_middles(result: ScanResult, middle: tuple[int, Floats], following: TrackedScan) -> ScanResult:
     """The result with its pose at the stamp between the middles of its sweep and the next one, where it lies there.
 
     middle : instant, ns, and pose of the middle of its own sweep
@@ -175,13 +175,13 @@ def to_trajectory(results: list[ScanResult], method: str) -> Trajectory:
 
 def read_ahead(
     sequence: Sequence, prepare: Callable[[Scan], Any] | None, threads: int, depth: int = 2, first: int = 0
-) -> Iterator[Loaded]:
+) -> Iterator[ScanInput]:
     """The scans from `first` on, read (and prepared) by one background thread while the caller works on earlier ones."""
     if threads < 2:
         for i in range(first, len(sequence)):
             yield _load(sequence, i, prepare)
         return
-    pending: list[Future[Loaded]] = []
+    pending: list[Future[ScanInput]] = []
     with ThreadPoolExecutor(1, "lslam-read") as pool:
         try:
             for i in range(first, len(sequence)):
@@ -195,7 +195,7 @@ def read_ahead(
                 future.cancel()
 
 
-def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> Loaded:
+def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> ScanInput:
     stamp_ns = int(sequence.stamps_ns[i])
     began = time.perf_counter()
     try:
@@ -203,13 +203,13 @@ def _load(sequence: Sequence, i: int, prepare: Callable[[Scan], Any] | None) -> 
     except InputError as error:
         # A selection knows the scan's number in the recording, which no scan is there to tell.
         index = int(sequence.indices[i]) if isinstance(sequence, Selection) else i
-        return Loaded(index, stamp_ns, error=str(error), read_s=time.perf_counter() - began)
+        return ScanInput(index, stamp_ns, error=str(error), read_s=time.perf_counter() - began)
     read = time.perf_counter()
     if len(scan) == 0:
-        return Loaded(scan.index, stamp_ns, error="the scan has no points", read_s=read - began)
+        return ScanInput(scan.index, stamp_ns, error="the scan has no points", read_s=read - began)
     count, scan = len(scan), measurable(scan)
     if len(scan) == 0:
         why = f"0 usable points: none of {count} is finite and within {FARTHEST_M / 1e3:g} km"
-        return Loaded(scan.index, stamp_ns, error=why, read_s=read - began, status="bridged")
+        return ScanInput(scan.index, stamp_ns, error=why, read_s=read - began, status="bridged")
     prepared = prepare(scan) if prepare is not None else None
-    return Loaded(scan.index, stamp_ns, scan, prepared, "", read - began, time.perf_counter() - read)
+    return ScanInput(scan.index, stamp_ns, scan, prepared, "", read - began, time.perf_counter() - read)

@@ -12,36 +12,36 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Odometry
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.registration.robust import UsualAgreement
+from lslam.registration.history import UsualAgreement
 
 # Begins an empty map: the tracker of a scan that is expected at a pose (4, 4).
 Begin = Callable[[Floats], Tracker]
 
 
 @dataclass(frozen=True)
-class Tracked:
+class TrackedScan:
     """A scan with its result; sweep, middle : of the tracker, as of this scan.
 
-    is_two_sided : later scans told the motion within the sweep as well
+    has_both_sides : later scans told the motion within the sweep as well
     """
 
-    loaded: Loaded
+    entry: ScanInput
     result: ScanResult
     sweep: MotionPrior
     middle: tuple[int, Floats]
-    is_two_sided: bool = False
+    has_both_sides: bool = False
 
-    def moved(self, T: Floats) -> Tracked:
+    def transform(self, T: Floats) -> TrackedScan:
         """In the world that `T` (4, 4) leads to."""
         instant_ns, middle = self.middle
         sweep = replace(self.sweep, poses=T @ self.sweep.poses)
         return replace(self, result=self.result.in_world(T), sweep=sweep, middle=(instant_ns, T @ middle))
 
-    def at(self, pose: Floats) -> Tracked:
+    def at(self, pose: Floats) -> TrackedScan:
         """With the scan at another pose (4, 4)."""
-        return self.moved(pose @ se3.inverse(self.result.T_world_lidar))
+        return self.transform(pose @ se3.inverse(self.result.T_world_lidar))
 
 
 class SegmentTracker(Stateful):
@@ -65,7 +65,7 @@ class SegmentTracker(Stateful):
         self._usual = UsualAgreement(RegistrationConfig().min_agreement)
         # The hypothesis of a new map, and the scans since, as each of the two has them.
         self._other: Tracker | None = None
-        self._open: list[tuple[Tracked, Tracked]] = []
+        self._open: list[tuple[TrackedScan, TrackedScan]] = []
 
     @property
     def odometry(self) -> Odometry:
@@ -82,49 +82,49 @@ class SegmentTracker(Stateful):
         """Whether poses hold at the middle of a sweep: those of a method that deskews by constant velocity."""
         return isinstance(self.present.motion, ConstantVelocity) and self.present.is_deskewing
 
-    def decide(self, loaded: Loaded | None, result: ScanResult | None) -> list[Tracked]:
+    def decide(self, entry: ScanInput | None, result: ScanResult | None) -> list[TrackedScan]:
         """The scans that are decided with the next one, in order: none while two hypotheses are open, all at the end, None.
 
         result : of the present tracker
         """
-        if loaded is None or result is None:
+        if entry is None or result is None:
             return self._finish()
-        first = self._tracked(self.present, loaded, result, self._segment)
-        other = None if self._other is None else self._trial(self._other, loaded)
-        is_registered = first.result.status == "ok"
-        if is_registered:
+        first = self._scan_by(self.present, entry, result, self._segment)
+        other = None if self._other is None else self._trial(self._other, entry)
+        has_registration = first.result.status == "ok"
+        if has_registration:
             self._usual.observe(_share(first.result))
         is_new = other is not None and other.result.status == "ok" and not self._usual.is_collapse(_share(other.result))
         if other is not None and is_new:
             self._open.append((first, other))
-            if is_registered and not _is_less(first.result, other.result):
+            if has_registration and not _is_less(first.result, other.result):
                 return self._finish()
-            return self._new_segment() if is_registered or len(self._open) > self.initial_scans else []
+            return self._new_segment() if has_registration or len(self._open) > self.initial_scans else []
         decided = self._finish()
-        if is_registered or self.begin is None or loaded.scan is None:
+        if has_registration or self.begin is None or entry.scan is None:
             return [*decided, first]
         self._other = self.begin(first.result.T_world_lidar)
-        other = self._trial(self._other, loaded)
+        other = self._trial(self._other, entry)
         self._open = [(first, other)]
         return decided if other.result.status == "ok" else [*decided, *self._finish()]
 
-    def _finish(self) -> list[Tracked]:
+    def _finish(self) -> list[TrackedScan]:
         """The scans that are open, as the first hypothesis has them."""
         bridged = [first for first, _ in self._open]
         self._other, self._open = None, []
         return bridged
 
     @property
-    def is_settled(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether nothing waits for the next scan, so that `state` is complete."""
-        return self._other is None and self.present.is_settled
+        return self._other is None and self.present.is_complete
 
     def restore(self, state: State) -> None:
         """Go on where `state` was taken."""
         super().restore(state)
         self._other, self._open = None, []
 
-    def _new_segment(self) -> list[Tracked]:
+    def _new_segment(self) -> list[TrackedScan]:
         assert self._other is not None
         registered = [other for _, other in self._open]
         # The motion model is known to others by its first object.
@@ -135,12 +135,12 @@ class SegmentTracker(Stateful):
         self._segment += 1
         return registered
 
-    def _trial(self, other: Tracker, loaded: Loaded) -> Tracked:
-        return self._tracked(other, loaded, other.track(loaded), self._segment + 1)
+    def _trial(self, other: Tracker, entry: ScanInput) -> TrackedScan:
+        return self._scan_by(other, entry, other.track(entry), self._segment + 1)
 
     @staticmethod
-    def _tracked(tracker: Tracker, loaded: Loaded, result: ScanResult, segment: int) -> Tracked:
-        return Tracked(loaded, replace(result, segment=segment), tracker.sweep, tracker.middle)
+    def _scan_by(tracker: Tracker, entry: ScanInput, result: ScanResult, segment: int) -> TrackedScan:
+        return TrackedScan(entry, replace(result, segment=segment), tracker.sweep, tracker.middle)
 
 
 def _is_less(result: ScanResult, other: ScanResult) -> bool:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -14,9 +16,9 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Scan, Span
 from lslam.core.types.scan_result import ScanResult, StageClock, Status
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.base import Deskewing, Odometry, Registering, Resumable, Windowed
+from lslam.odometry.base import Deskewing, Odometry, Registering, Resumable, WindowMethod
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, MotionModel, middle_of
-from lslam.odometry.inertial.window_motion import WindowMotion
+from lslam.odometry.inertial.window import WindowMotion
 from lslam.odometry.scan_outcome import fault, plausible
 from lslam.odometry.stationary import StationaryDetector
 from lslam.registration.gaussian_map import FLOOR_M2
@@ -26,9 +28,12 @@ from lslam.registration.result import RegistrationResult
 # between the prior and the first.
 SAME_MINIMUM_RATIO = 0.3
 
+# Registers the scan that is being tracked from a motion prior.
+Register = Callable[..., RegistrationResult]
+
 
 @dataclass(frozen=True)
-class Loaded:
+class ScanInput:
     """One scan as the background thread leaves it; `error` : why it is unreadable, and `status` : what its result has then."""
 
     index: int
@@ -59,60 +64,65 @@ class Tracker(Stateful):
         self.odometry, self.stationary = odometry, stationary
         # Asked for in each scan, and a tenth of a millisecond each time that a protocol is.
         self._deskewing = odometry if isinstance(odometry, Deskewing) else None
-        self._windowed = odometry if isinstance(odometry, Windowed) else None
+        self._window_method = odometry if isinstance(odometry, WindowMethod) else None
         self.motion: MotionModel = ConstantVelocity() if motion is None else motion
         self.sweep = MotionPrior.at_once(np.eye(4))
         self.middle = (0, np.eye(4))
+        # Of the scan that is being tracked.
+        self._clock = StageClock()
         # The newest accepted result.
         self._last: ScanResult | None = None
         # The first scan, until a second one tells how fast it was taken.
         self._first: tuple[Scan, Any, Floats] | None = None
 
-    def track(self, loaded: Loaded) -> ScanResult:
+    def track(self, entry: ScanInput) -> ScanResult:
         """Pose of the next scan."""
-        scan, odometry, motion, clock = loaded.scan, self.odometry, self.motion, StageClock()
-        standing = self._standing(scan, clock)
+        scan, motion, clock = entry.scan, self.motion, StageClock()
+        self._clock = clock
+        standing = self._standing(scan)
         if standing is not None:
             self._keep(standing)
             return replace(standing, stages=clock.seconds)
         span = Span() if scan is None else scan.span
         with clock.stage("imu"):
-            prior = expected = motion.sweep(loaded.stamp_ns, span)
-        steady = None if motion.coasting is None else motion.coasting.predict(loaded.stamp_ns)
+            prior = expected = motion.sweep(entry.stamp_ns, span)
+        steady = None if motion.coasting is None else motion.coasting.predict(entry.stamp_ns)
         trial = None
         if scan is None:
-            result = ScanResult(loaded.index, loaded.stamp_ns, prior.pose, loaded.status, loaded.error, converged=False)
+            result = ScanResult(entry.index, entry.stamp_ns, prior.pose, entry.status, entry.error, converged=False)
         elif self._deskewing is not None:
             odometry = self._deskewing
-            if motion.coasting is not None and motion.is_compared(loaded.stamp_ns, span):
+            register: Register = partial(odometry.register, scan, entry.prepared)
+            if motion.coasting is not None and motion.needs_comparison(entry.stamp_ns, span):
                 # For comparison alone: the map and the motion model are not updated.
                 without = motion.coasting.sweep(scan.stamp_ns, span)
-                trial = odometry.register(scan, loaded.prepared, without)
-                trial, _ = self._refined(odometry, scan, loaded.prepared, without, trial, motion.coasting)
+                trial, _ = self._refine(register, scan, without, motion.coasting, StageClock())
             is_first_open = self._first is not None or not motion.is_known
             # While the motion is unknown the clouds of several LiDARs do not fit each other: one of them tells it.
             alone = scan.of_leading() if is_first_open else None
-            cloud, prepared = (scan, loaded.prepared) if alone is None else (alone, odometry.prepare(alone))
-            located = odometry.register(cloud, prepared, prior)
-            located, prior = self._refined(odometry, cloud, prepared, prior, located, motion, clock)
-            if is_first_open and located.is_accepted and scan.span.seconds > 0:
+            if alone is None:
+                alignment, prior = self._refine(register, scan, prior, motion, clock)
+            else:
+                own = partial(odometry.register, alone, odometry.prepare(alone))
+                alignment, prior = self._refine(own, alone, prior, motion, clock)
+            if is_first_open and alignment.is_accepted and scan.span.seconds > 0:
                 if self._first is None:
-                    self._first = (scan, loaded.prepared, located.T_world_lidar)
+                    self._first = (scan, entry.prepared, alignment.T_world_lidar)
                 else:
-                    prior = expected = self._begin_again(odometry, *self._first, scan, located)
-                    located = odometry.register(scan, loaded.prepared, prior)
-                    prior = located.sweep or prior
-            located, prior = self._fused(odometry, scan, loaded.prepared, located, prior, expected, clock)
-            result = odometry.update(scan, prior, located)
+                    prior = expected = self._begin_again(odometry, *self._first, scan, alignment)
+                    alignment = register(prior)
+                    prior = alignment.sweep or prior
+            alignment, prior = self._fuse(odometry, register, scan.stamp_ns, alignment, prior, expected)
+            result = odometry.update(scan, prior, alignment)
         else:
-            registering = cast(Registering, odometry)
-            result = plausible(registering.register(scan, loaded.prepared, prior), prior.pose, self._last)
-        self._correct(result, prior, clock)
+            registering = cast(Registering, self.odometry)
+            result = plausible(registering.register(scan, entry.prepared, prior), prior.pose, self._last)
+        self._correct(result, prior)
         if self.stationary is not None and scan is not None:
             with clock.stage("standing"):
                 self.stationary.observe(scan, result)
         self._keep(result)
-        return self._recorded(result, expected, steady, trial, clock)
+        return self._record(result, expected, steady, trial)
 
     @property
     def is_deskewing(self) -> bool:
@@ -120,7 +130,7 @@ class Tracker(Stateful):
         return self._deskewing is not None
 
     @property
-    def is_settled(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether nothing waits for the next scan, so that `state` is complete."""
         return self._first is None
 
@@ -134,11 +144,11 @@ class Tracker(Stateful):
             self.odometry.restore(state["odometry"])
         super().restore(state)
 
-    def _standing(self, scan: Scan | None, clock: StageClock) -> ScanResult | None:
+    def _standing(self, scan: Scan | None) -> ScanResult | None:
         """The result of a scan taken while the sensor stood; None where it has moved."""
         if scan is None or self.stationary is None:
             return None
-        with clock.stage("standing"):
+        with self._clock.stage("standing"):
             result = self.stationary.result_of(scan)
         if result is not None:
             self.motion.correct(result.stamp_ns, result.T_world_lidar)
@@ -151,59 +161,45 @@ class Tracker(Stateful):
         if result.status == "ok":
             self._last = result
 
-    def _fused(
+    def _fuse(
         self,
         odometry: Deskewing,
-        scan: Scan,
-        prepared: Any,
-        located: RegistrationResult,
+        register: Register,
+        stamp_ns: int,
+        alignment: RegistrationResult,
         prior: MotionPrior,
         expected: MotionPrior,
-        clock: StageClock,
     ) -> tuple[RegistrationResult, MotionPrior]:
-        """The registration fused with the IMU, or one near the prediction `expected`, and the motion within the sweep."""
-        fused = self._checked(odometry, scan.stamp_ns, located, prior, expected, clock)
+        """The registration fused with the IMU, or one near the prediction `expected`, and the motion within the sweep.
+
+        A registration is rejected where no vehicle gets to its pose from the last one.
+        """
+        with self._clock.stage("imu"):
+            fused = _fuse_with(self.motion, odometry, stamp_ns, alignment, prior)
+        if fused.is_accepted and (reason := fault(fused.T_world_lidar, stamp_ns, self._last)):
+            fused = fused.reject(reason, expected.pose.copy(), None)
         if fused.is_accepted or not self.motion.is_inertial or not odometry.is_searching:
             return fused, prior
-        near = self._near(odometry, scan, prepared, expected, located, fused, clock)
+        near = register(expected, is_near=True)
+        with self._clock.stage("imu"):
+            again = _fuse_with(self.motion, odometry, stamp_ns, near, expected)
+        near = _both(alignment, again if again.is_accepted else _nearest(near, alignment, fused, expected))
         return near, expected if near.sweep is None else near.sweep
 
-    def _checked(
-        self,
-        odometry: Deskewing,
-        stamp_ns: int,
-        located: RegistrationResult,
-        prior: MotionPrior,
-        expected: MotionPrior | None,
-        clock: StageClock,
-    ) -> RegistrationResult:
-        """The registration fused with the IMU; rejected where no vehicle gets to its pose from the last one."""
-        with clock.stage("imu"):
-            fused = _fuse(odometry, self.motion, stamp_ns, located, prior)
-        if expected is None or not fused.is_accepted:
-            return fused
-        reason = fault(fused.T_world_lidar, stamp_ns, self._last)
-        return fused.rejected(reason, expected.pose.copy(), None) if reason else fused
-
-    def _correct(self, result: ScanResult, prior: MotionPrior, clock: StageClock) -> None:
+    def _correct(self, result: ScanResult, prior: MotionPrior) -> None:
         """Update the motion model and the motion within the sweep."""
         pose, is_ok = result.T_world_lidar, result.status == "ok"
         is_blind = is_ok and self._deskewing is None
-        with clock.stage("imu"):
+        with self._clock.stage("imu"):
             self.sweep = self.motion.refine(prior, result.stamp_ns, pose) if is_blind else prior
             self.motion.correct(result.stamp_ns, pose, prior, is_ok)
-            if self._windowed is not None:
-                self._windowed.settle(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
+            if self._window_method is not None:
+                self._window_method.settle(self.motion.poses() if isinstance(self.motion, WindowMotion) else {})
         middle, instant_ns = middle_of(prior, result.stamp_ns, pose)
         self.middle = (instant_ns, middle)
 
-    def _recorded(
-        self,
-        result: ScanResult,
-        expected: MotionPrior,
-        steady: Floats | None,
-        trial: RegistrationResult | None,
-        clock: StageClock,
+    def _record(
+        self, result: ScanResult, expected: MotionPrior, steady: Floats | None, trial: RegistrationResult | None
     ) -> ScanResult:
         """The result beside its predictions, and beside what registration from constant velocity took.
 
@@ -212,7 +208,7 @@ class Tracker(Stateful):
         pose, is_ok = result.T_world_lidar, result.status == "ok"
         own = {
             name: seconds
-            for name, seconds in clock.seconds.items()
+            for name, seconds in self._clock.seconds.items()
             if name != "imu" or self.motion.coasting is not None
         }
         imu = ImuDiagnostics(
@@ -227,61 +223,23 @@ class Tracker(Stateful):
             imu = replace(imu, steady_iterations=trial.iterations, saved_s=saved_s)
         return replace(result, prior_norm=_matrix_norm(expected.pose, pose), imu=imu, stages=stages)
 
-    def _refined(
-        self,
-        odometry: Deskewing,
-        scan: Scan,
-        prepared: Any,
-        prior: MotionPrior,
-        located: RegistrationResult,
-        motion: MotionModel | None = None,
-        clock: StageClock | None = None,
+    def _refine(
+        self, register: Register, scan: Scan, prior: MotionPrior, motion: MotionModel, clock: StageClock
     ) -> tuple[RegistrationResult, MotionPrior]:
-        """Registered again with the motion within the sweep that follows from the pose; also the motion of the final deskewing.
+        """Register, and again with the motion within the sweep that follows from the pose; also that of the final deskewing.
 
-        motion : refines the prior by the registered pose; None: no second registration
-        clock : measures the time of `motion`
+        motion : refines the prior by the registered pose; clock : measures its time
         """
-        if located.sweep is not None:
-            return located, located.sweep
-        if motion is None or not motion.is_known or not located.ok or scan.span.seconds <= 0:
-            return located, prior
-        with (clock or StageClock()).stage("imu"):
-            better = motion.refine(prior, scan.stamp_ns, located.T_world_lidar)
+        alignment = register(prior)
+        if alignment.sweep is not None:
+            return alignment, alignment.sweep
+        if not motion.is_known or not alignment.ok or scan.span.seconds <= 0:
+            return alignment, prior
+        with clock.stage("imu"):
+            better = motion.refine(prior, scan.stamp_ns, alignment.T_world_lidar)
         if _distance(prior, better) <= self.REFINE_M:
-            return located, prior
-        return _both(located, odometry.register(scan, prepared, better)), better
-
-    def _near(
-        self,
-        odometry: Deskewing,
-        scan: Scan,
-        prepared: Any,
-        expected: MotionPrior,
-        located: RegistrationResult,
-        rejected: RegistrationResult,
-        clock: StageClock,
-    ) -> RegistrationResult:
-        """Register again near the IMU's prediction, after a registration that failed or that the IMU rejected.
-
-        With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
-        accepted against the IMU.
-        """
-        near = odometry.register(scan, prepared, expected, is_near=True)
-        fused = self._checked(odometry, scan.stamp_ns, near, expected, None, clock)
-        if fused.is_accepted:
-            return _both(located, fused)
-        away, off = (apart(pose, located.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
-        source = located if near.ok and away < SAME_MINIMUM_RATIO * off else rejected
-        # Where nothing is found near by, the first registration enters with the points as they are seen from there.
-        base = near
-        if not near.ok:
-            own = replace(located, points=near.points, sweep=near.sweep)
-            base = replace(own, iterations=near.iterations, stages=near.stages)
-        moved = base.moved(source.T_world_lidar, source.covariance)
-        is_rejected = base.ok and not source.is_accepted
-        moved = replace(moved, is_rejected=is_rejected, reason=source.reason, converged=source.converged)
-        return _both(located, moved)
+            return alignment, prior
+        return _both(alignment, register(better)), better
 
     def _begin_again(
         self,
@@ -290,13 +248,13 @@ class Tracker(Stateful):
         prepared: Any,
         pose: Floats,
         second: Scan,
-        located: RegistrationResult,
+        alignment: RegistrationResult,
     ) -> MotionPrior:
         """The first scan was taken at an unknown speed: now that it is known, deskew it and build the map anew.
 
         The prior of the second scan, whose registration told the speed.
         """
-        self.motion.correct(second.stamp_ns, located.T_world_lidar)
+        self.motion.correct(second.stamp_ns, alignment.T_world_lidar)
         again = self.motion.sweep(second.stamp_ns, second.span)
         prior = self.motion.rewind(first.stamp_ns, pose, first.span)
         odometry.restart()
@@ -304,11 +262,11 @@ class Tracker(Stateful):
         return again
 
 
-def _fuse(
-    odometry: Deskewing, motion: MotionModel, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
+def _fuse_with(
+    motion: MotionModel, odometry: Deskewing, stamp_ns: int, result: RegistrationResult, prior: MotionPrior
 ) -> RegistrationResult:
     """The registration fused with the motion model; of a window, once more where that moves its scans."""
-    if not (isinstance(motion, WindowMotion) and isinstance(odometry, Windowed)):
+    if not (isinstance(motion, WindowMotion) and isinstance(odometry, WindowMethod)):
         return motion.fuse(stamp_ns, result, prior)
     motion.take(odometry.equations(stamp_ns, result))
     fused = motion.fuse(stamp_ns, result, prior)
@@ -317,6 +275,26 @@ def _fuse(
         return fused
     motion.take(again)
     return motion.fuse(stamp_ns, result, prior)
+
+
+def _nearest(
+    near: RegistrationResult, alignment: RegistrationResult, denial: RegistrationResult, expected: MotionPrior
+) -> RegistrationResult:
+    """The scan where it enters after a registration that failed or that the IMU rejected, and one `near` its prediction.
+
+    With perceptual aliasing a wide search converges at the wrong place. The same minimum from both initial guesses is
+    accepted against the IMU.
+    """
+    away, off = (apart(pose, alignment.T_world_lidar) for pose in (near.T_world_lidar, expected.pose))
+    source = alignment if near.ok and away < SAME_MINIMUM_RATIO * off else denial
+    # Where nothing is found near by, the first registration enters with the points as they are seen from there.
+    base = near
+    if not near.ok:
+        own = replace(alignment, points=near.points, sweep=near.sweep)
+        base = replace(own, iterations=near.iterations, stages=near.stages)
+    moved = base.with_pose(source.T_world_lidar, source.covariance)
+    is_rejected = base.ok and not source.is_accepted
+    return replace(moved, is_rejected=is_rejected, reason=source.reason, converged=source.converged)
 
 
 def _both(first: RegistrationResult, second: RegistrationResult) -> RegistrationResult:

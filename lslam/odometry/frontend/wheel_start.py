@@ -52,7 +52,7 @@ def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
         return {}
     if ignores_prior:
         part.problems.append("wheels: the method predicts by itself, they only bridge scans that fail")
-    last, errors = motion.calibration, motion.prior_errors()
+    last = motion.calibration
     scale, sigma = last.scale
     if motion.gap_scans:
         part.problems.append(f"wheels: {motion.gap_scans} scans fell into gaps and were predicted by constant velocity")
@@ -68,8 +68,7 @@ def close_wheels(part: Wheels, ignores_prior: bool) -> dict[str, Any]:
         "time_offset_s": round(float(last.states[OFFSET_S]), 5),
         "scans_in_gaps": motion.gap_scans,
         "scans_with_slip": motion.slip_scans,
-        "prior_error_m": None if errors is None else round(errors[0], 5),
-        "constant_velocity_error_m": None if errors is None else round(errors[1], 5),
+        **motion.errors.facts,
     }
     if last.has_yaw:
         facts["yaw_scale"], facts["yaw_offset_rad_s"] = (

@@ -19,17 +19,16 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.state import State, Stateful
 from lslam.odometry.base import Deskewing, Resumable
-from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded, Tracker, apart
-from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.odometry.inertial.course import NEIGHBOUR_SWEEPS, Course
+from lslam.odometry.frontend.segments import SegmentTracker, TrackedScan
+from lslam.odometry.frontend.tracker import ScanInput, Tracker, apart
+from lslam.odometry.inertial.constant_velocity import NEIGHBOUR_SWEEPS, ConstantVelocity, Course
 from lslam.odometry.integrity.monitor import IntegrityMonitor
+from lslam.registration.history import is_more
 from lslam.registration.rest import INLIER_CHI2
-from lslam.registration.robust import is_more
 
 
 def first_pose(
-    decided: list[Tracked], initial_scans: int, create: Callable[[], Deskewing]
+    tracks: list[TrackedScan], initial_scans: int, create: Callable[[], Deskewing]
 ) -> tuple[Floats, Floats | None]:
     """(4, 4) pose of the first scan on the map of the later ones, the initial ones left out, and its covariance (6, 6) there.
 
@@ -41,63 +40,63 @@ def first_pose(
     first in all directions, or an initial one was not registered, or taken at rest. So it is where a smoother links each scan
     to the one before.
     """
-    stays = decided[0].result.T_world_lidar
-    later = [k for k in range(initial_scans, len(decided)) if _is_placed(decided[k])]
-    is_linked = any(tracked.sweep.link is not None for tracked in decided)
-    if is_linked or len(later) < initial_scans or not all(_is_placed(tracked) for tracked in decided[:initial_scans]):
+    stays = tracks[0].result.T_world_lidar
+    later = [k for k in range(initial_scans, len(tracks)) if _has_place(tracks[k])]
+    is_linked = any(track.sweep.link is not None for track in tracks)
+    if is_linked or len(later) < initial_scans or not all(_has_place(track) for track in tracks[:initial_scans]):
         return stays, None
-    priors, empty, target = _priors(decided), create(), create()
+    priors, empty, target = _priors(tracks), create(), create()
     # Backwards, so that a map of the last scans alone has the nearest ones.
     for k in reversed(later):
         # On an empty map a scan is not registered: it enters where it lies.
-        scan, prepared = decided[k].loaded.scan, decided[k].loaded.prepared
+        scan, prepared = tracks[k].entry.scan, tracks[k].entry.prepared
         assert scan is not None
         target.update(scan, priors[k], empty.register(scan, prepared, priors[k]))
-    first = decided[0].loaded
+    first = tracks[0].entry
     assert first.scan is not None
     result = target.register(first.scan, first.prepared, priors[0], is_near=True)
     is_better = result.is_accepted and len(result.degenerate) == 0
     return (result.T_world_lidar, result.covariance) if is_better else (stays, None)
 
 
-def _priors(decided: list[Tracked]) -> list[MotionPrior]:
+def _priors(tracks: list[TrackedScan]) -> list[MotionPrior]:
     """The motion within each sweep about its pose, without what an IMU says of that: it has had its say.
 
     A scan that was taken before the speed was known moved as the first one that knows it.
     """
-    sweeps = [tracked.sweep for tracked in decided]
+    sweeps = [track.sweep for track in tracks]
     usual = next((sweep for sweep in sweeps if len(sweep.times) > 1), sweeps[0])
     out = []
-    for tracked in decided:
-        sweep = tracked.sweep if len(tracked.sweep.times) > 1 else usual
-        change = tracked.result.T_world_lidar @ se3.inverse(sweep.pose)
+    for track in tracks:
+        sweep = track.sweep if len(track.sweep.times) > 1 else usual
+        change = track.result.T_world_lidar @ se3.inverse(sweep.pose)
         out.append(replace(sweep, poses=change @ sweep.poses, covariance=None, link=None))
     return out
 
 
-def _tied(tracked: Tracked, position: Floats, covariance: Floats) -> Tracked:
+def _tie(track: TrackedScan, position: Floats, covariance: Floats) -> TrackedScan:
     """With the covariance (6, 6) of the pose at `position` (3,), m, to which its own is relative."""
-    result = tracked.result
+    result = track.result
     spread = noise.transport(covariance, result.T_world_lidar[:3, 3] - position)
     own, by_points = (None if C is None else C + spread for C in (result.covariance, result.points_covariance))
-    return replace(tracked, result=replace(result, covariance=own, points_covariance=by_points))
+    return replace(track, result=replace(result, covariance=own, points_covariance=by_points))
 
 
-def _is_placed(tracked: Tracked) -> bool:
+def _has_place(track: TrackedScan) -> bool:
     """Whether a scan was registered, of a sensor that moved, on the first map of the run."""
-    return _is_registered(tracked) and not tracked.result.is_stationary
+    return _has_registration(track) and not track.result.is_stationary
 
 
-def _is_registered(tracked: Tracked) -> bool:
+def _has_registration(track: TrackedScan) -> bool:
     """Whether a scan was registered on the first map of the run."""
-    result = tracked.result
-    return tracked.loaded.scan is not None and result.status == "ok" and result.segment == 0
+    result = track.result
+    return track.entry.scan is not None and result.status == "ok" and result.segment == 0
 
 
 # Scans: two seconds, which are held in memory.
 WINDOW_SCANS = 20
 # Of a run that began at rest, the first scan and the pose (4, 4) of its spot.
-StartAtRest = tuple[Tracked, Floats]
+StartAtRest = tuple[TrackedScan, Floats]
 
 
 class WindowTracker(Stateful):
@@ -127,8 +126,8 @@ class WindowTracker(Stateful):
             and isinstance(tracker.present.motion, ConstantVelocity)
         )
         # Of the open window, None: the end of the recording.
-        self._scans: list[Loaded | None] = []
-        self._decided: list[Tracked] = []
+        self._scans: list[ScanInput | None] = []
+        self._decided: list[TrackedScan] = []
         self._begin: State = {}
         # Instants, ns, and poses of the last middles before the window.
         self._before: list[tuple[int, Floats]] = []
@@ -157,40 +156,40 @@ class WindowTracker(Stateful):
         return self._tracker.present
 
     @property
-    def is_settled(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether `state` is complete."""
-        return bool(self._scans) or self._tracker.is_settled
+        return bool(self._scans) or self._tracker.is_complete
 
-    def open(self, loaded: Loaded | None) -> None:
+    def open(self, entry: ScanInput | None) -> None:
         """Take the next scan, None at the end, into the window that is open or begins with it, before it is tracked."""
         if not self._scans:
-            if not self._is_begin(loaded):
+            if not self._is_begin(entry):
                 return
             self._begin = deepcopy(self._tracker.state())
-        self._scans.append(loaded)
+        self._scans.append(entry)
 
-    def decide(self, loaded: Loaded | None, result: ScanResult | None) -> list[Tracked]:
+    def decide(self, entry: ScanInput | None, result: ScanResult | None) -> list[TrackedScan]:
         """The scans that are decided with the next one, None at the end: one, none, or all of a window.
 
         result : of the present tracker
         """
-        decided = self._tracker.decide(loaded, result)
+        tracks = self._tracker.decide(entry, result)
         if not self._scans:
-            return self._moved(decided)
-        self._decided += decided
-        return self._close() if loaded is None or (self._tracker.is_settled and self._is_full()) else []
+            return self._to_world(tracks)
+        self._decided += tracks
+        return self._close() if entry is None or (self._tracker.is_complete and self._is_full()) else []
 
     def state(self) -> State:
         """What `restore` needs to go on from where the open window begins."""
         return {**super().state(), **({"_tracker": self._begin} if self._scans else {})}
 
-    def _is_begin(self, loaded: Loaded | None) -> bool:
+    def _is_begin(self, entry: ScanInput | None) -> bool:
         """Whether a window begins with the scan."""
-        scan = None if loaded is None else loaded.scan
-        if scan is None or not self._tracker.is_settled:
+        scan = None if entry is None else entry.scan
+        if scan is None or not self._tracker.is_complete:
             return False
         is_looking_back = self._world is None and (
-            self._rest is None or self._has_left(self._tracker.middle[1], self._rest)
+            self._rest is None or self._is_away(self._tracker.middle[1], self._rest)
         )
         return is_looking_back or (self.is_windowed and scan.span.seconds > 0)
 
@@ -199,7 +198,7 @@ class WindowTracker(Stateful):
         count, rest = len(self._scans), self._resting()
         if rest is None:
             return count >= WINDOW_SCANS
-        begin, end = (self._has_left(self._decided[k].result.T_world_lidar, rest) for k in (0, -1))
+        begin, end = (self._is_away(self._decided[k].result.T_world_lidar, rest) for k in (0, -1))
         if begin:
             return count >= 2 * WINDOW_SCANS or len(self._elsewhere(self._decided, rest)) >= WINDOW_SCANS
         return end or count >= WINDOW_SCANS
@@ -212,33 +211,33 @@ class WindowTracker(Stateful):
         if self._world is not None or self._rest is not None:
             return self._rest
         initial = self._decided[: self._tracker.initial_scans]
-        if len(initial) < self._tracker.initial_scans or not all(_is_registered(tracked) for tracked in initial):
+        if len(initial) < self._tracker.initial_scans or not all(_has_registration(track) for track in initial):
             return None
         rest = initial[0], initial[-1].result.T_world_lidar
-        if any(self._has_left(tracked.result.T_world_lidar, rest) for tracked in initial[1:]):
+        if any(self._is_away(track.result.T_world_lidar, rest) for track in initial[1:]):
             return None
         return replace(initial[0], sweep=_priors(initial)[0]), rest[1]
 
-    def _has_left(self, pose: Floats, rest: StartAtRest) -> bool:
+    def _is_away(self, pose: Floats, rest: StartAtRest) -> bool:
         """Whether a pose (4, 4) is so far from the first spot that a single point would tell, at three sigma."""
         return apart(rest[1], pose) ** 2 > INLIER_CHI2 * self._noise_m**2
 
-    def _elsewhere(self, decided: list[Tracked], rest: StartAtRest) -> list[Tracked]:
+    def _elsewhere(self, tracks: list[TrackedScan], rest: StartAtRest) -> list[TrackedScan]:
         """The registered scans that lie beyond the surroundings of the first spot."""
         start = rest[1][:3, 3]
-        far = [np.linalg.norm(t.result.T_world_lidar[:3, 3] - start) > self._beyond_m for t in decided]
-        return [t for t, is_far in zip(decided, far, strict=True) if is_far and _is_placed(t)]
+        far = [np.linalg.norm(t.result.T_world_lidar[:3, 3] - start) > self._beyond_m for t in tracks]
+        return [t for t, is_far in zip(tracks, far, strict=True) if is_far and _has_place(t)]
 
-    def _close(self) -> list[Tracked]:
+    def _close(self) -> list[TrackedScan]:
         """The scans of the window, the first of a run where the later ones put it."""
         is_bent = self.is_windowed and self._follow_course()
-        out = [replace(tracked, is_two_sided=is_bent) for tracked in self._decided]
+        out = [replace(track, has_both_sides=is_bent) for track in self._decided]
         self._before = self._middles()[-NEIGHBOUR_SWEEPS:]
-        here: list[Tracked] = []
+        here: list[TrackedScan] = []
         if self._world is None:
             here, out = self._look_back(out)
         self._scans, self._decided = [], []
-        return [*here, *self._moved(out)]
+        return [*here, *self._to_world(out)]
 
     def _follow_course(self) -> bool:
         """Track the window along its course where it bends and more points agree along it in most scans; whether it does."""
@@ -247,7 +246,7 @@ class WindowTracker(Stateful):
         while is_bent and is_better:
             before, passes = self._inliers(), passes + 1
             self._track_again(self._course())
-            is_whole = self._is_whole() and (self._tracker.is_settled or self._scans[-1] is None)
+            is_whole = self._is_whole() and (self._tracker.is_complete or self._scans[-1] is None)
             is_better = is_whole and _is_more(self._inliers(), before)
             is_bent = is_better or (is_whole and passes > 1)
             if not is_bent:
@@ -255,7 +254,7 @@ class WindowTracker(Stateful):
         self._set_course(None)
         return is_bent
 
-    def _look_back(self, decided: list[Tracked]) -> tuple[list[Tracked], list[Tracked]]:
+    def _look_back(self, tracks: list[TrackedScan]) -> tuple[list[TrackedScan], list[TrackedScan]]:
         """The window's scans at the spot of a start at rest, and all others, in the tracker's world.
 
         That turns with the first scan, which is put on the map of later ones.
@@ -269,18 +268,18 @@ class WindowTracker(Stateful):
             return odometry
 
         self._rest = self._resting()
-        used, initial_scans, here = decided, self._tracker.initial_scans, 0
+        used, initial_scans, here = tracks, self._tracker.initial_scans, 0
         if self._rest is not None:
-            later = self._elsewhere(decided, self._rest)
-            if len(later) < initial_scans and decided[-1].result.segment == 0:
-                return [], decided
-            left = [k for k, t in enumerate(decided) if self._has_left(t.result.T_world_lidar, self._rest)]
-            used, initial_scans, here = [self._rest[0], *later], 1, min(left, default=len(decided))
+            later = self._elsewhere(tracks, self._rest)
+            if len(later) < initial_scans and tracks[-1].result.segment == 0:
+                return [], tracks
+            left = [k for k, t in enumerate(tracks) if self._is_away(t.result.T_world_lidar, self._rest)]
+            used, initial_scans, here = [self._rest[0], *later], 1, min(left, default=len(tracks))
         pose, covariance = first_pose(used, initial_scans, create)
         before = used[0].result.T_world_lidar
         self._world = se3.normalise(before @ se3.inverse(pose))
-        stages = _sum(decided[0].result.stages, {"register": time.perf_counter() - began})
-        out = [replace(decided[0], result=replace(decided[0].result, stages=stages)), *decided[1:]]
+        stages = _sum(tracks[0].result.stages, {"register": time.perf_counter() - began})
+        out = [replace(tracks[0], result=replace(tracks[0].result, stages=stages)), *tracks[1:]]
         if self._rest is None:
             return [], [out[0].at(pose), *out[1:]]
         if covariance is not None:
@@ -288,14 +287,14 @@ class WindowTracker(Stateful):
         self._rest = None
         return out[:here], out[here:]
 
-    def _moved(self, decided: list[Tracked]) -> list[Tracked]:
+    def _to_world(self, tracks: list[TrackedScan]) -> list[TrackedScan]:
         """In the world of the first pose."""
         world, start = self._world, self._start
-        moved = decided if world is None else [tracked.moved(world) for tracked in decided]
-        return moved if start is None else [_tied(tracked, *start) for tracked in moved]
+        moved = tracks if world is None else [track.transform(world) for track in tracks]
+        return moved if start is None else [_tie(track, *start) for track in moved]
 
     def _inliers(self) -> list[int]:
-        return [tracked.result.inliers for tracked in self._decided]
+        return [track.result.inliers for track in self._decided]
 
     def _middles(self) -> list[tuple[int, Floats]]:
         """Instants and poses of the middles of registered sweeps, up to the end of the window."""
@@ -307,17 +306,17 @@ class WindowTracker(Stateful):
         return Course(np.array(instants, np.int64), np.stack(poses))
 
     def _track_again(self, course: Course | None) -> None:
-        earlier = [tracked.result for tracked in self._decided]
+        earlier = [track.result for track in self._decided]
         self._tracker.restore(deepcopy(self._begin))
         self._set_course(course)
         self._decided = []
-        for loaded in self._scans:
-            result = None if loaded is None else self.present.track(loaded)
-            self._decided += self._tracker.decide(loaded, result)
-        for k, (tracked, before) in enumerate(zip(self._decided, earlier, strict=False)):
-            now = tracked.result
+        for entry in self._scans:
+            result = None if entry is None else self.present.track(entry)
+            self._decided += self._tracker.decide(entry, result)
+        for k, (track, before) in enumerate(zip(self._decided, earlier, strict=False)):
+            now = track.result
             work = replace(now, stages=_sum(now.stages, before.stages), iterations=now.iterations + before.iterations)
-            self._decided[k] = replace(tracked, result=work)
+            self._decided[k] = replace(track, result=work)
 
     def _set_course(self, course: Course | None) -> None:
         motion = self.present.motion
@@ -325,7 +324,7 @@ class WindowTracker(Stateful):
         motion.course = course
 
     def _is_whole(self) -> bool:
-        return len({tracked.result.segment for tracked in self._decided}) == 1
+        return len({track.result.segment for track in self._decided}) == 1
 
     def _is_bent(self) -> bool:
         """Whether the window's course, in one segment, displaces the points of most sweeps by more than their noise."""
@@ -336,13 +335,13 @@ class WindowTracker(Stateful):
         return len(squares) > 0 and float(np.median(squares)) > self._noise_m**2
 
 
-def _displacement2(tracked: Tracked, course: Course) -> float | None:
+def _displacement2(track: TrackedScan, course: Course) -> float | None:
     """Mean square, m2, of the displacement of a scan's points between its sweep and the course; None where either is unknown."""
-    poses = course.at(tracked.result.stamp_ns, tracked.sweep.times)
+    poses = course.at(track.result.stamp_ns, track.sweep.times)
     if poses is None:
         return None
-    middle, source = len(poses) // 2, tracked.loaded.prepared.source
-    within, course_within = (se3.relative(sweep[middle], sweep) for sweep in (tracked.sweep.poses, poses))
+    middle, source = len(poses) // 2, track.entry.prepared.source
+    within, course_within = (se3.relative(sweep[middle], sweep) for sweep in (track.sweep.poses, poses))
     change = (se3.relative(within, course_within) - np.eye(4))[:, :3]
     points = np.column_stack([source, np.ones(len(source))])
     moments = np.einsum("na,nb->ab", points, points) / max(len(points), 1)

@@ -85,7 +85,7 @@ def check_agreement(
     bias = _mean_excess(imu_rates.rates(float(offsets[best])), scan_rates, T_lidar_imu)
     if offset_s is not None:
         return Agreement(True, correlation, offset_s, gyro_bias=bias)
-    offset, sigma = _refined(imu_rates, scan_rates, float(offsets[best]))
+    offset, sigma = _refine(imu_rates, scan_rates, float(offsets[best]))
     is_sure = abs(offset) > max(least_offset_s, SIGNIFICANT * sigma)
     return Agreement(True, correlation, offset if is_sure else 0.0, sigma, bias)
 
@@ -98,7 +98,7 @@ def turns(
     stamps_ns : (N,) of the poses (N, 4, 4) of the LiDAR; offset_s : s added to the IMU's stamps. M is 0 where the stream
     tells of less than half of the poses.
     """
-    return _centred(_scan_rates(stamps_ns, poses), _GyroRates(imu, T_lidar_imu, stamps_ns).rates(offset_s))
+    return _centre(_scan_rates(stamps_ns, poses), _GyroRates(imu, T_lidar_imu, stamps_ns).rates(offset_s))
 
 
 def _scan_rates(stamps_ns: Longs, poses: Floats, width: int = 1) -> Floats:
@@ -136,7 +136,7 @@ def _width(imu_rates: _GyroRates, scan_rates: Floats, stamps_ns: Longs, poses: F
     its sign from scan to scan. A wrong gyroscope leaves turns, which do not.
     """
     best = max(offsets, key=lambda t: _compare(scan_rates, imu_rates.rates(t))[0])
-    a, b = _centred(scan_rates, imu_rates.rates(float(best)))
+    a, b = _centre(scan_rates, imu_rates.rates(float(best)))
     if not len(a):
         return 1
     rest = a - b * (float(np.sum(a * b)) / max(float(np.sum(b * b)), 1e-12))
@@ -148,7 +148,7 @@ def _width(imu_rates: _GyroRates, scan_rates: Floats, stamps_ns: Longs, poses: F
     return None
 
 
-def _centred(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
+def _centre(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
     is_covered = np.isfinite(imu_rates).all(axis=1)
     if is_covered.sum() < max(5, len(imu_rates) // 2):
         return np.zeros((0, 3)), np.zeros((0, 3))
@@ -158,7 +158,7 @@ def _centred(scan_rates: Floats, imu_rates: Floats) -> tuple[Floats, Floats]:
 
 def _compare(scan_rates: Floats, imu_rates: Floats) -> tuple[float, float, float]:
     """Correlation of the rates about their means, how many times larger the felt ones are, and the rms of the seen ones."""
-    a, b = _centred(scan_rates, imu_rates)
+    a, b = _centre(scan_rates, imu_rates)
     if not len(a):
         return 0.0, 1.0, 0.0
     aa, bb, ab = (float(np.sum(x * y)) for x, y in ((a, a), (b, b), (a, b)))
@@ -205,11 +205,11 @@ def _refuse_axes(imu_rates: _GyroRates, scan_rates: Floats, offsets: Floats) -> 
     """
 
     def residual(axes: Floats, t: float) -> float:
-        a, b = _centred(scan_rates, imu_rates.rates(t))
+        a, b = _centre(scan_rates, imu_rates.rates(t))
         return float(np.sum((a - b @ axes.T) ** 2)) if len(a) else np.inf
 
-    best = min(offsets, key=lambda t: residual(_best_axes(*_centred(scan_rates, imu_rates.rates(t)))[1], t))
-    R, M = _best_axes(*_centred(scan_rates, imu_rates.rates(float(best))))
+    best = min(offsets, key=lambda t: residual(_best_axes(*_centre(scan_rates, imu_rates.rates(t)))[1], t))
+    R, M = _best_axes(*_centre(scan_rates, imu_rates.rates(float(best))))
     as_is, turned, mirrored = min(residual(np.eye(3), t) for t in offsets), residual(R, best), residual(M, best)
     if MUCH_WORSE * mirrored < min(as_is, turned):
         raise ImuRefusedError(
@@ -238,7 +238,7 @@ def _no_fit(imu_rates: _GyroRates, scan_rates: Floats, correlation: float) -> Im
     far, score = _best_far(imu_rates, scan_rates)
     if score > 0.9:
         return ImuRefusedError(what, f"with its stamps moved by {far:.2f} s they would, set imu.time_offset_s")
-    a, b = _centred(scan_rates, imu_rates.rates(0.0))
+    a, b = _centre(scan_rates, imu_rates.rates(0.0))
     if len(a):
         R = _best_axes(a, b)[0]
         if _compare(a, b @ R.T)[0] > 0.9:
@@ -269,11 +269,11 @@ def _best_far(imu_rates: _GyroRates, scan_rates: Floats) -> tuple[float, float]:
     return float(far[best]), scores[best]
 
 
-def _refined(imu_rates: _GyroRates, scan_rates: Floats, near: float) -> tuple[float, float]:
+def _refine(imu_rates: _GyroRates, scan_rates: Floats, near: float) -> tuple[float, float]:
     """The offset at which the rates differ least, and its standard deviation, by a parabola through the squared error."""
     costs = []
     for t in (near - STEP_S, near, near + STEP_S):
-        a, b = _centred(scan_rates, imu_rates.rates(t))
+        a, b = _centre(scan_rates, imu_rates.rates(t))
         costs.append(float(np.sum((a - b) ** 2)) if len(a) else np.inf)
     bend = (costs[0] - 2 * costs[1] + costs[2]) / STEP_S**2
     if not np.isfinite(bend) or bend <= 0:

@@ -1,4 +1,7 @@
-"""Constant velocity: the motion prior of a method that has no IMU, and the motion within a sweep."""
+"""Constant velocity: the motion prior of a method that has no IMU, and the motion within a sweep.
+
+Where later scans are known, that is the course of the sensor through poses at known instants, before and after.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,55 @@ from typing import ClassVar, Protocol
 import numpy as np
 
 from lslam.core.geometry import se3
-from lslam.core.types.arrays import Floats
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GravityDirection, ImuState
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.core.types.state import State, Stateful
-from lslam.odometry.inertial.course import Course, motion_covariance
 from lslam.registration.preprocessing.deskew import knots_over
 from lslam.registration.result import RegistrationResult
+
+# Poses on each side of those within a sweep. From one to the next its influence on a natural spline falls by 3.7.
+NEIGHBOUR_SWEEPS = 3
+# Of the motion from begin to end of a sweep.
+MOTION_SIGMA_M, MOTION_SIGMA_RAD = 0.003, 0.001
+
+
+class Course:
+    """Natural cubic splines through the poses within and around each sweep.
+
+    instants_ns : (N,); poses : (N, 4, 4). A pose no later than one before it, as of a sliver of a sweep, is left out.
+    """
+
+    def __init__(self, instants_ns: Longs, poses: Floats) -> None:
+        is_later = np.append(True, instants_ns[1:] > np.maximum.accumulate(instants_ns)[:-1])
+        self.instants_ns, self.poses = instants_ns[is_later], poses[is_later]
+
+    def at(self, stamp_ns: int, times: Floats) -> Floats | None:
+        """(K, 4, 4) poses at `times` (K,) of a sweep, s from the stamp; None where no pose lies within, or there are few."""
+        begin, end = stamp_ns + 1e9 * times[0], stamp_ns + 1e9 * times[-1]
+        first, last = np.searchsorted(self.instants_ns, begin), np.searchsorted(self.instants_ns, end, side="right")
+        if len(times) < 2 or len(self.instants_ns) < NEIGHBOUR_SWEEPS or first == last:
+            return None
+        k = int(first + np.argmin(np.abs(self.instants_ns[first:last] - (begin + end) / 2)))
+        around = slice(max(first - NEIGHBOUR_SWEEPS, 0), last + NEIGHBOUR_SWEEPS)
+        nodes = 1e-9 * (self.instants_ns[around] - stamp_ns)
+        twists = se3.log(se3.relative(self.poses[k], self.poses[around]))
+        return se3.normalise(self.poses[k] @ se3.exp(natural_spline(np.asarray(nodes), twists, times)))
+
+
+def motion_covariance() -> Floats:
+    """(6, 6) of the motion from begin to end of a sweep, m2 and rad2."""
+    return np.diag(np.repeat([MOTION_SIGMA_M, MOTION_SIGMA_RAD], 3) ** 2)
+
+
+def natural_spline(nodes: Floats, values: Floats, times: Floats) -> Floats:
+    """(K, C) cubic spline at `times` (K,) through `values` (N, C) at increasing `nodes` (N,), N > 2; beyond them straight."""
+    from scipy.interpolate import CubicSpline
+
+    spline, inside = CubicSpline(nodes, values, bc_type="natural"), np.clip(times, nodes[0], nodes[-1])
+    return np.asarray(spline(inside) + (times - inside)[:, None] * spline(inside, 1))
+
 
 # m/s2 and rad/s2, prior sigmas of the acceleration: a car brakes, a hand turns.
 USUAL_ACCELERATION = np.repeat([3.0, 1.0], 3)
@@ -41,7 +85,7 @@ class MotionModel(Protocol):
         ...
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """Update with the pose (4, 4) found at `stamp_ns`; `prior` is the motion of its sweep."""
         ...
@@ -68,7 +112,7 @@ class MotionModel(Protocol):
         """Whether an inertial sensor predicted the newest sweep: a denied or lost scan is searched near there."""
         return False
 
-    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+    def needs_comparison(self, stamp_ns: int, span: Span) -> bool:
         """Whether the scan to come is to be registered from `coasting` as well."""
         return False
 
@@ -162,11 +206,11 @@ class ConstantVelocity(Stateful, MotionModel):
         return _steady(middle @ se3.exp(-prior.times[len(prior.times) // 2] * velocity), velocity, prior.times)
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
 
-        A pose without a registration (`is_registered`) is used alike.
+        A pose without a registration (`has_registration`) is used alike.
         """
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if self._instant_ns is not None:

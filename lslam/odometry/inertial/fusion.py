@@ -15,11 +15,11 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, GravityDirection, ImuState, ImuStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
-from lslam.core.types.state import State, Stateful
+from lslam.core.types.state import Stateful
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity, middle_of
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
 from lslam.odometry.inertial.imu_cleaning import IMU_GAP_S, covers, gaps
-from lslam.odometry.inertial.imu_estimate import WORSE_RATIO, ImuEstimate
+from lslam.odometry.inertial.imu_estimate import ImuEstimate, PredictionErrors
 from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import Increments
 from lslam.odometry.kernels import kalman
@@ -36,8 +36,6 @@ class InertialMotion(Stateful):
     imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
     """
 
-    # Scans over which the IMU's median prediction error is tested against constant velocity, and the slack of the test.
-    JUDGED, SLACK_M = 30, 0.02
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
     COMPARED = 20
     # Whether it has states for the device, the rotation of its extrinsics and its clock.
@@ -52,6 +50,7 @@ class InertialMotion(Stateful):
         "_was_bridged",
         "_instant_ns",
         "_pose",
+        "errors",
     )
     TRANSIENT: ClassVar[tuple[str, ...]] = ("_taught", "_increments", "_expected")
 
@@ -76,7 +75,7 @@ class InertialMotion(Stateful):
         # Until the next `correct`: what the IMU felt since the last scan, and where it expects the LiDAR at a stamp, ns.
         self._increments: Increments | None = None
         self._expected: tuple[int, Floats] | None = None
-        self._errors: list[tuple[float, float]] = []
+        self.errors = PredictionErrors()
 
     @classmethod
     def of(cls, opening: InertialStart, config: Config) -> Self:
@@ -93,7 +92,7 @@ class InertialMotion(Stateful):
         """Whether there is a velocity: from the start on, unless the IMU is silent there."""
         return self.coasting.is_known or self.is_inertial
 
-    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+    def needs_comparison(self, stamp_ns: int, span: Span) -> bool:
         """Whether the scan to come is one of the sample that shows what constant velocity would have cost.
 
         Where constant velocity predicts it anyway, over a gap of the IMU, there is nothing to compare.
@@ -121,12 +120,12 @@ class InertialMotion(Stateful):
         # A scan that begins a new map was taken by the one before already: it teaches nothing a second time.
         if self.config.velocity == "integrated" or instant_ns <= self._instant_ns:
             return prior
-        return self._prior(self._corrected(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
+        return self._prior(self._correct_estimate(instant_ns, middle), instant_ns, middle, stamp_ns, prior.times)
 
     def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
         """The registered motion since the last scan weighed against what the IMU felt, each by its covariance.
 
-        Where they contradict each other, it stays registration's, or the scan is bridged: `_rejected`. Behind a gap nothing is
+        Where they contradict each other, it stays registration's, or the scan is bridged: `_reject`. Behind a gap nothing is
         weighed: the scan before was deskewed without the IMU, and is wrong by more than its covariance says. prior : of
         the registration, says how the sweep moved
         """
@@ -143,14 +142,14 @@ class InertialMotion(Stateful):
         R_imu = begin[:3, :3] @ step.rotations[-1]
         moved, P = self._imu_motion(step)
         rest = np.concatenate([end[:3, 3] - begin[:3, 3] - moved, R_imu @ vector_between(R_imu, end[:3, :3])])
-        gyroscope = e.taught(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
+        gyroscope = e.calibrate(step, begin[:3, :3], end[:3, :3], C[3:, 3:])
         self._taught = instant_ns, gyroscope, C[:3, :3]
         if float(kalman.square(rest, P + 2 * C)) / (len(rest) * INNOVATION_SIGMAS**2) > 1:
-            return self._rejected(stamp_ns, result, rest, P)
+            return self._reject(stamp_ns, result, rest, P)
         # A pose that is wrong moves the map by one part in its age only, the scans before hold it: random errors of both
         # then add up to the least drift when those of the IMU count as many times.
-        pose, covariance = kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age)
-        return result.moved(pose, covariance)
+        pose, covariance = kalman.fuse_poses(result.T_world_lidar, rest, C, P, result.map_age)
+        return result.with_pose(pose, covariance)
 
     def _imu_motion(self, step: Increments) -> tuple[Floats, Floats]:
         """How far, m, the IMU came over `step` from the newest pose, (3,), and the covariance (6, 6) of that and of its turn.
@@ -164,7 +163,7 @@ class InertialMotion(Stateful):
         P[:3, :3], P[3:, 3:] = spread, R_imu @ self.estimate.gyroscope.turn_covariance(step) @ R_imu.T
         return moved, P
 
-    def _rejected(
+    def _reject(
         self, stamp_ns: int, result: RegistrationResult, rest: Floats, covariance: Floats
     ) -> RegistrationResult:
         """What comes of a registration that contradicts the IMU by `rest` (6,), m and rad: constant velocity decides.
@@ -176,20 +175,20 @@ class InertialMotion(Stateful):
         if self._was_bridged or not self.coasting.is_known or self._expected is None:
             return result
         steady, (expected_ns, expected) = self.coasting.predict(stamp_ns), self._expected
-        if expected_ns != stamp_ns or _distance(steady, expected) >= _distance(steady, result.T_world_lidar):
+        if expected_ns != stamp_ns or apart(steady, expected, LEVER_M) >= apart(steady, result.T_world_lidar, LEVER_M):
             return result
         metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
         reason = f"registration is {metres:.2f} m and {degrees:.1f} deg from what the IMU felt"
-        return result.rejected(reason, expected, covariance)
+        return result.reject(reason, expected, covariance)
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved.
 
-        Where no registration stands behind it (`is_registered`), it teaches nothing; the world begins with the first that has.
+        Where no registration stands behind it (`has_registration`), it teaches nothing; the world begins with the first that has.
         """
-        if self._instant_ns is None and not is_registered:
+        if self._instant_ns is None and not has_registration:
             return
         middle, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
         if not self.refusal:
@@ -199,16 +198,16 @@ class InertialMotion(Stateful):
             if self._has_gap or is_behind_gap:
                 self._restart(instant_ns, middle)
             elif self._instant_ns is not None and instant_ns > self._instant_ns:
-                if is_registered:
+                if has_registration:
                     self._judge(stamp_ns, pose)
-                    self.estimate = self._corrected(instant_ns, middle)
+                    self.estimate = self._correct_estimate(instant_ns, middle)
                 else:
-                    self.estimate = self._propagated(instant_ns)
+                    self.estimate = self._propagate(instant_ns)
             elif self._instant_ns is None:
-                self.estimate = self._advanced(stamp_ns, instant_ns)
+                self.estimate = self._estimate_at(stamp_ns, instant_ns)
         self.coasting.correct(instant_ns, middle)
         self._instant_ns, self._pose = instant_ns, middle.copy()
-        self._was_bridged = not is_registered
+        self._was_bridged = not has_registration
         self._taught = self._increments = self._expected = None
         self._scans += 1
 
@@ -235,18 +234,9 @@ class InertialMotion(Stateful):
         self._pose, self._instant_ns = middle_of(prior, stamp_ns, pose)
         # What the second scan taught, it teaches again when it is registered on the first as that is now.
         self.estimate = self._opening
-        self.estimate = self._advanced(stamp_ns, self._instant_ns)
+        self.estimate = self._estimate_at(stamp_ns, self._instant_ns)
         self.gap_scans, self._scans, self._has_gap = 0, 1, False
         return prior
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here; not the stream."""
-        return {**super().state(), "errors": np.array(self._errors).reshape(-1, 2)}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        super().restore(state)
-        self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
 
     def turn(self, begin_ns: int, end_ns: int) -> Floats | None:
         """Rotation (3, 3) of the LiDAR from one instant to the other by the gyroscope; None over a gap or when refused."""
@@ -255,13 +245,6 @@ class InertialMotion(Stateful):
         R_lidar_imu = self.T_lidar_imu[:3, :3]
         rotation = self.estimate.over(self.imu, np.array([begin_ns, end_ns])).rotations[-1]
         return np.asarray(R_lidar_imu @ rotation @ R_lidar_imu.T)
-
-    def prior_errors(self) -> tuple[float, float] | None:
-        """Medians, m, of how wrong the IMU and constant velocity predicted the scans, turns counted at `LEVER_M`."""
-        if not self._errors:
-            return None
-        own, steady = np.median(np.array(self._errors), axis=0)
-        return float(own), float(steady)
 
     def _prior(
         self, estimate: ImuEstimate, anchor_ns: int, anchor: Floats, stamp_ns: int, times: Floats
@@ -272,10 +255,10 @@ class InertialMotion(Stateful):
         poses = step.poses(k, anchor @ self.T_lidar_imu, estimate.velocity, estimate.gravity, self.T_imu_lidar)
         return MotionPrior(times, np.concatenate([poses[:k], poses[k + 1 :]]), has_imu_motion=True)
 
-    def _corrected(self, instant_ns: int, middle: Floats) -> ImuEstimate:
+    def _correct_estimate(self, instant_ns: int, middle: Floats) -> ImuEstimate:
         """The estimate at `instant_ns`, where registration put the LiDAR at `middle` (4, 4)."""
         if self.config.velocity == "integrated":
-            return self._propagated(instant_ns)
+            return self._propagate(instant_ns)
         if self.config.velocity == "along-x":
             return self._level_along_x(instant_ns, middle)
         a, b = self._pose @ self.T_lidar_imu, middle @ self.T_lidar_imu
@@ -283,8 +266,8 @@ class InertialMotion(Stateful):
         if self._taught is not None and self._taught[0] == instant_ns:
             _, gyroscope, noise = self._taught
         else:
-            gyroscope, noise = self.estimate.taught(step, a[:3, :3], b[:3, :3]), None
-        return self.estimate.corrected(self.imu, step, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise)
+            gyroscope, noise = self.estimate.calibrate(step, a[:3, :3], b[:3, :3]), None
+        return self.estimate.correct(self.imu, step, a[:3, :3], b[:3, :3], b[:3, 3] - a[:3, 3], gyroscope, noise)
 
     def _level_along_x(self, instant_ns: int, middle: Floats) -> ImuEstimate:
         """The estimate of a LiDAR that neither slips sideways nor tilts: the speed is the way since the last scan over time."""
@@ -293,8 +276,8 @@ class InertialMotion(Stateful):
         speed = way / (1e-9 * (instant_ns - self._instant_ns))
         return replace(self.estimate, velocity=speed * middle[:3, 0], gravity=-GRAVITY * middle[:3, 2])
 
-    def _propagated(self, instant_ns: int) -> ImuEstimate:
-        return self.estimate.propagated(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
+    def _propagate(self, instant_ns: int) -> ImuEstimate:
+        return self.estimate.propagate(self._since_last(instant_ns), (self._pose @ self.T_lidar_imu)[:3, :3])
 
     def _since_last(self, instant_ns: int) -> Increments:
         """What the IMU felt since the last scan, integrated once for all who ask before the next `correct`."""
@@ -303,12 +286,12 @@ class InertialMotion(Stateful):
             self._increments = self.estimate.over(self.imu, np.array([self._instant_ns, instant_ns]))
         return self._increments
 
-    def _advanced(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
+    def _estimate_at(self, stamp_ns: int, instant_ns: int) -> ImuEstimate:
         """The estimate at the first scan's stamp at the middle of its sweep."""
         if instant_ns <= stamp_ns or not self._covers(stamp_ns, instant_ns):
             return self.estimate
         step = self.estimate.over(self.imu, np.array([stamp_ns, instant_ns]))
-        return self.estimate.propagated(step, self.T_lidar_imu[:3, :3])
+        return self.estimate.propagate(step, self.T_lidar_imu[:3, :3])
 
     def _restart(self, instant_ns: int, middle: Floats) -> None:
         """After a gap, and a scan later, the velocity is that of registration over it, with a large covariance."""
@@ -330,14 +313,11 @@ class InertialMotion(Stateful):
             mine = self._expected[1]
         else:
             mine = self._prior(self.estimate, self._instant_ns, self._pose, stamp_ns, np.zeros(1)).pose
-        self._errors.append((_distance(mine, pose), _distance(self.coasting.predict(stamp_ns), pose)))
-        if len(self._errors) < self.JUDGED or not self._is_filter:
-            return
-        newest = np.sort(np.array(self._errors[-self.JUDGED :]), axis=0)
-        own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
-        if own > WORSE_RATIO * steady + self.SLACK_M:
+        steady = self.coasting.predict(stamp_ns)
+        worse = self.errors.observe(float(apart(mine, pose, LEVER_M)), float(apart(steady, pose, LEVER_M)))
+        if worse is not None and self._is_filter:
             self.refusal = (
-                f"it predicts scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
+                f"it predicts scans {worse[0]:.3f} m wrong where constant velocity is {worse[1]:.3f} m wrong (turns counted at "
                 f"{LEVER_M:.0f} m): check its axes, T_lidar_imu and its stamps"
             )
             log.warning("the IMU is refused from here on: %s", self.refusal)
@@ -352,10 +332,6 @@ class InertialMotion(Stateful):
     def _covers(self, begin_ns: int, end_ns: int) -> bool:
         """Whether there are samples without a gap from one instant to the other."""
         return covers(self._gaps, begin_ns, end_ns)
-
-
-def _distance(a: Floats, b: Floats) -> float:
-    return float(apart(a, b, LEVER_M))
 
 
 def warm_up() -> None:

@@ -92,7 +92,7 @@ class Gyroscope:
     rate_variance: float = RATE_NOISE**2
     noise: ImuNoise = USUAL_NOISE
     offset_s: float = 0.0
-    is_mounted: bool = False
+    has_mounting: bool = False
 
     @classmethod
     def of_bias(cls, bias: Floats, sigma: float, noise: ImuNoise = USUAL_NOISE) -> Gyroscope:
@@ -100,7 +100,7 @@ class Gyroscope:
         P = np.diag(np.repeat([sigma**2, AXES_SIGMA**2], [3, 9]))
         return cls(bias, covariance=P, rate_variance=noise.rate**2, noise=noise)
 
-    def calibrated(self, mounting: bool, offset: bool) -> Gyroscope:
+    def with_calibration(self, mounting: bool, offset: bool) -> Gyroscope:
         """This prior, not certain of its mounting or its clock, where these are to be estimated."""
         P = self.covariance
         if mounting:
@@ -109,7 +109,7 @@ class Gyroscope:
         if offset:
             P = np.pad(P, (0, 1))
             P[12, 12] = OFFSET_SIGMA**2
-        return replace(self, covariance=P, is_mounted=mounting)
+        return replace(self, covariance=P, has_mounting=mounting)
 
     @property
     def has_offset(self) -> bool:
@@ -135,7 +135,7 @@ class Gyroscope:
     @property
     def mounting(self) -> Floats | None:
         """(3, 3) that turns specific forces into the given axes; None where they are taken as they are."""
-        return _nearest_rotation(self.axes) if self.is_mounted else None
+        return _nearest_rotation(self.axes) if self.has_mounting else None
 
     @property
     def tilt(self) -> tuple[float, float]:
@@ -166,14 +166,14 @@ class Gyroscope:
             self.covariance, self._variance(step), step.rotations[-1], step.velocity_arms[-1], self.axes, step.duration
         )
 
-    def learnt(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
+    def learn(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
         """After registration found the turn over `step` larger by `rest` (3,) rad, itself known to `noise` (3, 3), rad2.
 
         `rest` and `noise` are in IMU axes at the end of the step.
         """
         if self.has_offset:
             return self._learnt_with_offset(step, rest, noise)
-        x, P, excess = kalman.turned(
+        x, P, excess = kalman.correct_turn(
             np.concatenate([self.bias, self.axes.ravel()]),
             self.covariance,
             self._variance(step),
@@ -185,7 +185,7 @@ class Gyroscope:
             self.noise.gyro_walk,
             INNOVATION_SIGMAS,
         )
-        return self._moved(x, P, excess, step)
+        return self._update(x, P, excess, step)
 
     def with_bias(self, bias: Floats, covariance: Floats) -> Gyroscope:
         """After another estimate, which knows nothing of the rest, found this `bias` (3,), with its `covariance` (3, 3).
@@ -217,7 +217,7 @@ class Gyroscope:
         return np.column_stack([H, step.rotations[-1].T @ begin - end])
 
     def _learnt_with_offset(self, step: Increments, rest: Floats, noise: Floats) -> Gyroscope:
-        """As `kalman.turned`, with one state more."""
+        """As `kalman.correct_turn`, with one state more."""
         walk = np.zeros(13)
         walk[:3], walk[12] = self.noise.gyro_walk**2 * step.duration, OFFSET_WALK**2 * step.duration
         before = self.covariance + np.diag(walk)
@@ -226,12 +226,12 @@ class Gyroscope:
         allowed = float(np.trace(H @ before @ H.T + own))
         x = np.concatenate([self.bias, self.axes.ravel(), [self.offset_s]])
         x, P = kalman.update(x, before, H, rest, own, INNOVATION_SIGMAS)
-        return self._moved(x, P, min(float(rest @ rest), INNOVATION_SIGMAS**2 * allowed) - allowed, step)
+        return self._update(x, P, min(float(rest @ rest), INNOVATION_SIGMAS**2 * allowed) - allowed, step)
 
-    def _moved(self, x: Floats, P: Floats, excess: float, step: Increments) -> Gyroscope:
+    def _update(self, x: Floats, P: Floats, excess: float, step: Increments) -> Gyroscope:
         variance = max(self.rate_variance + excess / (3 * step.duration * NOISE_MEMORY_SCANS), self.noise.rate**2)
         offset = float(x[12]) if self.has_offset else self.offset_s
-        return Gyroscope(x[:3], x[3:12].reshape(3, 3), P, variance, self.noise, offset, self.is_mounted)
+        return Gyroscope(x[:3], x[3:12].reshape(3, 3), P, variance, self.noise, offset, self.has_mounting)
 
 
 def _nearest_rotation(axes: Floats) -> Floats:

@@ -13,6 +13,7 @@ import numpy as np
 
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import GRAVITY, ImuState, ImuStream
+from lslam.core.types.state import State, Stateful
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS, Gyroscope
 from lslam.odometry.inertial.integrate import Increments, integrate
 from lslam.odometry.kernels import kalman
@@ -25,6 +26,51 @@ GRAVITY_WALK = 5e-3
 GRAVITY_SIGMA_M_S2 = 0.03  # m/s2, over the Earth
 # Times that one account of the motion may miss the registered one by more than its alternative before it is refused.
 WORSE_RATIO = 2.0
+
+
+class PredictionErrors(Stateful):
+    """How wrong, m, a sensor and constant velocity predicted the scans, turns counted at `LEVER_M`."""
+
+    # Scans over which the sensor's median error is tested against constant velocity, and the slack of the test.
+    JUDGED, SLACK_M = 30, 0.02
+
+    def __init__(self) -> None:
+        self._pairs: list[tuple[float, float]] = []
+
+    def observe(self, own: float, steady: float) -> tuple[float, float] | None:
+        """Take the errors of a scan's predictions: the medians of the newest, where the sensor is clearly worse; else None."""
+        self._pairs.append((own, steady))
+        if len(self._pairs) < self.JUDGED:
+            return None
+        newest = np.sort(np.array(self._pairs[-self.JUDGED :]), axis=0)
+        own, steady = (float(v) for v in 0.5 * (newest[(self.JUDGED - 1) // 2] + newest[self.JUDGED // 2]))
+        return (own, steady) if own > WORSE_RATIO * steady + self.SLACK_M else None
+
+    @property
+    def medians(self) -> tuple[float, float] | None:
+        """Of all scans; None before the first."""
+        if not self._pairs:
+            return None
+        own, steady = np.median(np.array(self._pairs), axis=0)
+        return float(own), float(steady)
+
+    @property
+    def facts(self) -> dict[str, float | None]:
+        """The medians, for a manifest."""
+        own, steady = self.medians or (None, None)
+        return {
+            "prior_error_m": None if own is None else round(own, 5),
+            "constant_velocity_error_m": None if steady is None else round(steady, 5),
+        }
+
+    def state(self) -> State:
+        """All of them."""
+        return {"pairs": np.array(self._pairs).reshape(-1, 2)}
+
+    def restore(self, state: State) -> None:
+        """Go on where `state` was taken."""
+        self._pairs = [(float(own), float(steady)) for own, steady in state["pairs"]]
+
 
 # (3, 3) m2 and rad2, of a registration without covariance.
 PLACE_NOISE, TURN_NOISE = PLACE_SIGMA**2 * np.eye(3), TURN_SIGMA**2 * np.eye(3)
@@ -62,7 +108,7 @@ class ImuEstimate:
         values[:9] = np.concatenate([self.accel_bias, g.bias, self.gravity])
         diagonal = np.diag(self.covariance)
         variances[:9] = np.concatenate([diagonal[BIAS], np.diag(g.covariance)[:3], diagonal[DOWN]])
-        if g.is_mounted:
+        if g.has_mounting:
             values[9:12], variances[9:12] = g.rotation[0], np.diag(g.rotation_covariance)
         if g.has_offset:
             values[12], variances[12] = g.offset_s, g.covariance[12, 12]
@@ -70,9 +116,9 @@ class ImuEstimate:
 
     def over(self, imu: ImuStream, instants_ns: Longs) -> Increments:
         """What the IMU felt between increasing instants, biases taken off."""
-        return self._integrated(imu, instants_ns, self.gyroscope.bias)
+        return self._integrate(imu, instants_ns, self.gyroscope.bias)
 
-    def _integrated(self, imu: ImuStream, instants_ns: Longs, gyro_bias: Floats) -> Increments:
+    def _integrate(self, imu: ImuStream, instants_ns: Longs, gyro_bias: Floats) -> Increments:
         g = self.gyroscope
         return integrate(imu, instants_ns, gyro_bias, self.accel_bias, g.axes, g.mounting, g.offset_ns)
 
@@ -81,12 +127,12 @@ class ImuEstimate:
         x, P = _propagate(self, step, R)
         return x[:3], P[:3, :3]
 
-    def propagated(self, step: Increments, R: Floats) -> ImuEstimate:
+    def propagate(self, step: Increments, R: Floats) -> ImuEstimate:
         """The estimate at the last instant of `step`, with nothing but the IMU to go by; R (3, 3) of the IMU at the first."""
         x, P = _propagate(self, step, R)
         return self._with(x[3:], P[3:, 3:], step)
 
-    def taught(self, step: Increments, R: Floats, R_end: Floats, noise: Floats | None = None) -> Gyroscope:
+    def calibrate(self, step: Increments, R: Floats, R_end: Floats, noise: Floats | None = None) -> Gyroscope:
         """The gyroscope, now that registration turned the IMU from R to R_end (3, 3) in the course of `step`.
 
         step : as this estimate finds it `over` the two instants
@@ -95,15 +141,15 @@ class ImuEstimate:
         R_imu = R @ step.rotations[-1]
         if noise is None:
             noise = TURN_NOISE
-        return self.gyroscope.learnt(step, vector_between(R_imu, R_end), 2 * R_imu.T @ noise @ R_imu)
+        return self.gyroscope.learn(step, vector_between(R_imu, R_end), 2 * R_imu.T @ noise @ R_imu)
 
-    def corrected(
+    def correct(
         self,
         imu: ImuStream,
         step: Increments,
         R: Floats,
         R_end: Floats,
-        moved: Floats,
+        displacement: Floats,
         gyroscope: Gyroscope,
         noise: Floats | None = None,
     ) -> ImuEstimate:
@@ -111,17 +157,19 @@ class ImuEstimate:
 
         step : as this estimate finds it `over` the two instants
         R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
-        gyroscope : as the turn has `taught`
+        gyroscope : as the turn has `calibrate`
         noise : (3, 3) m2, world axes, of either place; None for a registration without covariance
         """
         rest = vector_between(R @ step.rotations[-1], R_end)
         # The shape of the turn is the gyroscope's, its sum is registration's.
         axes = self.gyroscope.axes
         bias = self.gyroscope.bias - kalman.turn_bias(step.rotations[-1], step.velocity_arms[-1], axes, rest)
-        step = self._integrated(imu, step.instants_ns, bias)
+        step = self._integrate(imu, step.instants_ns, bias)
         place = PLACE_NOISE if noise is None else PLACE_NOISE + noise
         x, P = _propagate(self, step, R)
-        x, P = kalman.placed(x, P, moved, 2 * place, GRAVITY, GRAVITY_SIGMA_M_S2, INNOVATION_SIGMAS)
+        x, P = kalman.correct_by_displacement(
+            x, P, displacement, 2 * place, GRAVITY, GRAVITY_SIGMA_M_S2, INNOVATION_SIGMAS
+        )
         return self._with(x[3:], P[3:, 3:], step, gyroscope)
 
     def _with(self, x: Floats, P: Floats, step: Increments, gyroscope: Gyroscope | None = None) -> ImuEstimate:

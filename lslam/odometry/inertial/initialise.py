@@ -71,7 +71,7 @@ class InertialStart:
     T_lidar_imu: Floats
     estimate: ImuEstimate
     offset_s: float
-    is_checked: bool
+    has_turn_check: bool
     is_static: bool
     notes: list[str]
     problems: list[str]
@@ -110,18 +110,18 @@ def start(
     _refuse_sign(usable, T_lidar_imu, part, agreement.gyro_bias)
     guess, is_static = _first_guess(usable, T_lidar_imu, part.stamps_ns, part.poses, config, agreement.gyro_bias)
     options = config.estimate_extrinsics, config.estimate_offset
-    guess = replace(guess, gyroscope=guess.gyroscope.calibrated(*options))
-    estimate = _learnt(usable, T_lidar_imu, guess, part, opening, config)
+    guess = replace(guess, gyroscope=guess.gyroscope.with_calibration(*options))
+    estimate = _learn(usable, T_lidar_imu, guess, part, opening, config)
     if any(options):
         # Once more, with forces about the axes that the turns showed and at their time: what was learnt is no prior.
         device = replace(estimate.gyroscope, covariance=guess.gyroscope.covariance)
-        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
+        estimate = _learn(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
     if config.gyro_bias is not None:
         bias = np.array(config.gyro_bias)
-        device = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope), ImuNoise.of(config)).calibrated(
+        device = Gyroscope.of_bias(bias, _bias_sigma(bias, estimate.gyroscope), ImuNoise.of(config)).with_calibration(
             *options
         )
-        estimate = _learnt(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
+        estimate = _learn(usable, T_lidar_imu, replace(guess, gyroscope=device), part, opening, config)
     notes.append("IMU aligned " + ("while standing" if is_static else "while moving"))
     return InertialStart(usable, T_lidar_imu, estimate, offset, agreement.is_judged, is_static, notes, problems)
 
@@ -234,7 +234,7 @@ def _farthest(poses: Floats) -> float:
     return float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
 
 
-def _learnt(
+def _learn(
     imu: ImuStream, T_lidar_imu: Floats, guess: ImuEstimate, part: FirstPoses, opening: FirstPoses, config: ImuConfig
 ) -> ImuEstimate:
     """The guess after all the sweeps, with the velocity at the first pose."""
@@ -243,8 +243,8 @@ def _learnt(
     for k in range(len(T) - 1):
         step, R, R_end = learnt.over(imu, part.instants_ns[k : k + 2]), T[k, :3, :3], T[k + 1, :3, :3]
         noise = None if part.covariances is None else part.covariances[k + 1, 3:, 3:]
-        gyroscope = learnt.taught(step, R, R_end, noise)
-        learnt = learnt.corrected(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
+        gyroscope = learnt.calibrate(step, R, R_end, noise)
+        learnt = learnt.correct(imu, step, R, R_end, T[k + 1, :3, 3] - T[k, :3, 3], gyroscope)
     covariance = learnt.covariance.copy()
     covariance[:3, :] = covariance[:, :3] = 0.0
     velocity, _, spread = _path_of_force(imu, opening.poses @ T_lidar_imu, opening.stamps_ns, learnt, SPEED_S)

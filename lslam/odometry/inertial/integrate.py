@@ -109,7 +109,7 @@ def integrate(
         stamps, gyro, first = stamps[used], gyro[used], first - used.start
         accel, accel_bias = accel[used] @ mounting.T, mounting @ accel_bias
     increments = strapdown.integrate(stamps, gyro, accel, first, at, gyro_bias, accel_bias, axes)
-    return Increments(instants_ns, *increments, imu, offset_ns, _hidden(imu, int(at[0]), int(at[-1])))
+    return Increments(instants_ns, *increments, imu, offset_ns, _hidden_sigmas(imu, int(at[0]), int(at[-1])))
 
 
 def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:
@@ -121,7 +121,7 @@ def _readings(imu: ImuStream, instants_ns: Longs) -> Floats:
     return np.asarray(imu.gyro[before] + share * (imu.gyro[after] - imu.gyro[before]))
 
 
-def _hidden(imu: ImuStream, begin_ns: int, end_ns: int) -> Floats | None:
+def _hidden_sigmas(imu: ImuStream, begin_ns: int, end_ns: int) -> Floats | None:
     """(6,) the mean of what the samples between two instants lack; of one cut as a whole, so it does not average out."""
     if imu.clipping_sigma is None:
         return None

@@ -7,26 +7,25 @@ from typing import ClassVar
 
 import numpy as np
 
-from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
-from lslam.core.types.imu import ImuStream, MotionState, PreintegratedStep, SweepLink
+from lslam.core.types.imu import MotionState, PreintegratedStep, SweepLink
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import middle_of
-from lslam.odometry.inertial.filter import FilterMotion
-from lslam.odometry.inertial.gyroscope import Gyroscope
-from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.integrate import Increments
-from lslam.odometry.inertial.navigation_state import (
+from lslam.odometry.inertial.filter import (
     GYRO,
     OWN,
     REST,
+    FilterMotion,
     NavigationState,
     cut_noise,
     process_noise,
     transition,
 )
+from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
+from lslam.odometry.inertial.integrate import Increments
 from lslam.registration.acceptance import PRIOR_COVARIANCE
 from lslam.registration.result import RegistrationResult
 
@@ -38,12 +37,9 @@ class LinkedMotion(FilterMotion):
     """Predicts and deskews as the filter does; the estimate itself is the smoother's, of all states it holds."""
 
     HAS_DEVICE: ClassVar[bool] = False
-    STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "_linked")
-
-    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
-        super().__init__(imu, T_lidar_imu, estimate, config)
-        # Instant, ns, and pose of the LiDAR of the newest state in the smoother: a scan that nobody could read has none.
-        self._linked: tuple[int, Floats] | None = None
+    STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "_last_link")
+    # Instant, ns, and pose of the LiDAR of the newest state in the smoother: a scan that nobody could read has none.
+    _last_link: tuple[int, Floats] | None = None
 
     def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
         """The motion, with what joins it to the last scan."""
@@ -58,7 +54,7 @@ class LinkedMotion(FilterMotion):
         within = se3.relative(refined.pose, middle_of(refined, stamp_ns, refined.pose)[0])
         return replace(refined, link=replace(prior.link, within=within))
 
-    def is_compared(self, stamp_ns: int, span: Span) -> bool:
+    def needs_comparison(self, stamp_ns: int, span: Span) -> bool:
         """Never: without the IMU there is nothing to estimate the states from."""
         return False
 
@@ -68,23 +64,23 @@ class LinkedMotion(FilterMotion):
         if result.inertial is not None and prior.link is not None:
             middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
             self._posterior = instant_ns, self._state_of(result.inertial)
-            self._linked = instant_ns, middle
+            self._last_link = instant_ns, middle
         return replace(result, inertial=None)
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """As of the filter; a scan that was denied has its state in the smoother where it was put in the end."""
-        super().correct(stamp_ns, pose, prior, is_registered)
-        if self._linked is not None and self._linked[0] == self._instant_ns:
-            self._linked = self._linked[0], self._pose.copy()
+        super().correct(stamp_ns, pose, prior, has_registration)
+        if self._last_link is not None and self._last_link[0] == self._instant_ns:
+            self._last_link = self._last_link[0], self._pose.copy()
 
     def rewind(self, stamp_ns: int, pose: Floats, span: Span) -> MotionPrior:
         """As of any IMU; the smoother begins anew, too."""
         self._now = self._next = self._posterior = None
         prior = super().rewind(stamp_ns, pose, span)
         assert self._instant_ns is not None
-        self._linked = self._instant_ns, self._pose.copy()
+        self._last_link = self._instant_ns, self._pose.copy()
         state = NavigationState.begin(self._pose @ self.T_lidar_imu, self.estimate)
         return replace(prior, link=SweepLink(self.T_lidar_imu, se3.relative(pose, self._pose), _plain(state)))
 
@@ -94,16 +90,16 @@ class LinkedMotion(FilterMotion):
         # Where a smoother begins; no filter had a state there.
         state = NavigationState.begin(T_world_imu, self.estimate) if self._next is None else self._next[1]
         link = SweepLink(self.T_lidar_imu, se3.relative(prior.pose, middle), _plain(state))
-        if self._linked is None or self._instant_ns is None or self._linked[0] >= instant_ns:
+        if self._last_link is None or self._instant_ns is None or self._last_link[0] >= instant_ns:
             return link
-        before_ns, before = self._linked
+        before_ns, before = self._last_link
         # Since then it stood, in no state of the smoother: its pose is known, forces over minutes lead anywhere.
         has_stood = self._instant_ns != before_ns and not self._was_bridged
         if not self.refusal and not has_stood and self._covers(before_ns, instant_ns):
             increments = self.estimate.over(self.imu, np.array([before_ns, instant_ns]))
             return replace(link, step=_from_imu(self.estimate, increments, (before @ self.T_lidar_imu)[:3, :3]))
-        moved = se3.relative(before @ self.T_lidar_imu, T_world_imu)
-        return replace(link, step=_coasted(self.estimate, moved, 1e-9 * (instant_ns - before_ns)))
+        motion = se3.relative(before @ self.T_lidar_imu, T_world_imu)
+        return replace(link, step=_coast(self.estimate, motion, 1e-9 * (instant_ns - before_ns)))
 
     def _state_of(self, state: MotionState) -> NavigationState:
         P, before = state.covariance, self.estimate.gyroscope
@@ -140,7 +136,7 @@ def _from_imu(e: ImuEstimate, step: Increments, R: Floats) -> PreintegratedStep:
     )
 
 
-def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep:
+def _coast(e: ImuEstimate, motion: Floats, seconds: float) -> PreintegratedStep:
     """The motion (4, 4) of the IMU that is expected over a gap, after it stood, or after the IMU was refused."""
     walk = e.gyroscope.noise
     sigmas = BRAKING_M_S2 * seconds, walk.accel_walk * seconds**0.5, walk.gyro_walk * seconds**0.5
@@ -149,9 +145,9 @@ def _coasted(e: ImuEstimate, moved: Floats, seconds: float) -> PreintegratedStep
     none = np.zeros((3, 3))
     return PreintegratedStep(
         0.0,
-        moved[:3, :3],
+        motion[:3, :3],
         np.zeros(3),
-        moved[:3, 3],
+        motion[:3, 3],
         none,
         none,
         np.zeros((3, 12)),

@@ -18,11 +18,11 @@ from lslam.core.types.imu import ImuStream, InertialChain, InertialLink, Inertia
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import middle_of
+from lslam.odometry.inertial.filter import BEGIN_SIGMA
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import ImuNoise
 from lslam.odometry.inertial.imu_estimate import GRAVITY_WALK, ImuEstimate
 from lslam.odometry.inertial.integrate import Increments
-from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA
 from lslam.registration.result import RegistrationResult
 
 log = logging.getLogger("lslam")
@@ -74,35 +74,35 @@ class SmootherMotion(InertialMotion):
         T_world_imu = middle @ self.T_lidar_imu
         there = noise.transport(C, T_world_imu[:3, 3] - result.T_world_lidar[:3, 3])
         begin = (self._pose @ self.T_lidar_imu)[:3, :3]
-        self._taught = instant_ns, self.estimate.taught(step, begin, T_world_imu[:3, :3], C[3:, 3:]), C[:3, :3]
+        self._taught = instant_ns, self.estimate.calibrate(step, begin, T_world_imu[:3, :3], C[3:, 3:]), C[:3, :3]
         try:
-            state = self.smoother.add(self._measured(step, T_world_imu, there))
+            state = self.smoother.add(self._measurement(step, T_world_imu, there))
         except GraphError as error:
             self._is_begun = False
             # The IMU's pose is as sure as the IMU, whatever registration said of its own.
             lever = prior.pose[:3, 3] - (prior.pose @ self.T_lidar_imu)[:3, 3]
             covariance = noise.transport(self._imu_motion(step)[1], lever)
-            return result.rejected(str(error), prior.pose, covariance)
+            return result.reject(str(error), prior.pose, covariance)
         self._added = instant_ns, state
         within = se3.relative(result.T_world_lidar, middle)
         pose = se3.normalise(state.T_world_imu @ self.T_imu_lidar @ se3.inverse(within))
         covariance = noise.transport(state.covariance[:6, :6], pose[:3, 3] - state.T_world_imu[:3, 3])
-        return result.moved(pose, covariance)
+        return result.with_pose(pose, covariance)
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """As of any IMU; velocity, gravity and biases are the smoother's."""
-        if not is_registered:
+        if not has_registration:
             self._withdraw()
         added, self._added = self._added, None
         before = self.estimate
         step = (
             None
-            if is_registered
+            if has_registration
             else self._increments_until(stamp_ns if prior is None else middle_of(prior, stamp_ns, pose)[1])
         )
-        super().correct(stamp_ns, pose, prior, is_registered)
+        super().correct(stamp_ns, pose, prior, has_registration)
         if self._instant_ns is None or self._has_gap or self.refusal:
             self._is_begun = False
             self.estimate = before if self.refusal else self.estimate
@@ -123,7 +123,7 @@ class SmootherMotion(InertialMotion):
     def _propagated_by_smoother(self, step: Increments) -> InertialState | None:
         """The state at the end of `step` by the IMU alone; None where the graph has no solution."""
         try:
-            return self.smoother.add(self._measured(step))
+            return self.smoother.add(self._measurement(step))
         except GraphError as error:
             log.warning("%s: the graph begins anew", error)
             return None
@@ -133,7 +133,7 @@ class SmootherMotion(InertialMotion):
         links = []
         for (a, begin_ns), (b, end_ns) in pairwise(keyframes):
             if end_ns > begin_ns and self._covers(begin_ns, end_ns):
-                step = self._measured(self.estimate.over(self.imu, np.array([begin_ns, end_ns])))
+                step = self._measurement(self.estimate.over(self.imu, np.array([begin_ns, end_ns])))
                 links.append(InertialLink(a, b, self._at_lidar(step)))
         if not links:
             return None
@@ -170,7 +170,9 @@ class SmootherMotion(InertialMotion):
             self.smoother.withdraw()
             self._added = None
 
-    def _measured(self, step: Increments, T_world_imu: Floats | None = None, C: Floats | None = None) -> InertialStep:
+    def _measurement(
+        self, step: Increments, T_world_imu: Floats | None = None, C: Floats | None = None
+    ) -> InertialStep:
         """The readings of `step` between their samples, linear there, and the registered pose at its end."""
         begin_ns, end_ns = int(step.instants_ns[0]), int(step.instants_ns[-1])
         stamps = self.imu.stamps_ns

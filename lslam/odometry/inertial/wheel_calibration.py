@@ -133,11 +133,11 @@ class WheelCalibration:
         late = step.jacobian[:, OFFSET_S] * JITTER_S
         return np.asarray(out + np.outer(late, late))
 
-    def spread(self, step: WheelStep) -> Floats:
+    def state_covariance(self, step: WheelStep) -> Floats:
         """(4, 4) covariance of a step by that of the states."""
         return np.asarray(step.jacobian @ self.covariance @ step.jacobian.T)
 
-    def corrected(self, step: WheelStep, rest: Floats, C: Floats) -> WheelCalibration:
+    def correct(self, step: WheelStep, rest: Floats, C: Floats) -> WheelCalibration:
         """After registration found a step longer by `rest` (4,), m and rad about `up`, with the covariance C (4, 4)."""
         P, J, size = self.covariance.copy(), step.jacobian.copy(), 4 if self.has_yaw else 3
         # By the registered turn: the noise of the measured one would be taken for a scale that is too large.
@@ -147,9 +147,9 @@ class WheelCalibration:
         noise = (self.step_noise(step) + C)[:size, :size]
         # Slip has no usual size: what is larger than expected counts accordingly less.
         states, covariance = kalman.update(self.states, P, J[:size], rest[:size], noise, 1.0)
-        squares, known = split(rest, J @ P @ J.T + C, self.direction)
+        squares, others = squares_along(rest, J @ P @ J.T + C, self.direction)
         per = np.array([step.way, step.way, step.seconds])
-        left, counts = learnt(self.noise, self.counts, squares, known, per, LEAST_NOISE)
+        left, counts = learn_noise(self.noise, self.counts, squares, others, per, LEAST_NOISE)
         return replace(self, states=states, covariance=covariance, noise=left, counts=counts)
 
 
@@ -158,7 +158,7 @@ def by_axis(along: float, across: float, direction: Floats) -> Floats:
     return np.asarray(across * np.eye(3) + (along - across) * np.outer(direction, direction))
 
 
-def split(rest: Floats, C: Floats, direction: Floats) -> tuple[Floats, Floats]:
+def squares_along(rest: Floats, C: Floats, direction: Floats) -> tuple[Floats, Floats]:
     """Squares (3,) of an innovation (4,) along a unit vector, across it, the mean of both, and of the turn; those C expects."""
 
     def parts(S: Floats) -> Floats:
@@ -168,19 +168,19 @@ def split(rest: Floats, C: Floats, direction: Floats) -> tuple[Floats, Floats]:
     return parts(np.outer(rest, rest)), parts(C)
 
 
-def learnt(
-    noise: Floats, counts: Floats, squares: Floats, known: Floats, per: Floats, least: Floats
+def learn_noise(
+    noise: Floats, counts: Floats, squares: Floats, others: Floats, per: Floats, least: Floats
 ) -> tuple[Floats, Floats]:
     """Densities of noise (N,), and the counts behind them, after squared innovations (N,) over so much each, `per` (N,).
 
-    known : (N,) part of the squares that is not this noise's. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
+    others : (N,) part of the squares that is not this noise's. Half of the squares of a normal error lie below `MEDIAN_SQUARE` of
     its variance: a density grows with each one above, and shrinks with each below, so that slip, however much, counts as one
     innovation. One counts by the share that is not known: along a direction that registration leaves open it tells nothing. What
     neither explains, beyond `INNOVATION_SIGMAS`, counts in full.
     """
     own = noise * per
-    is_beyond = squares > INNOVATION_SIGMAS**2 * (own + known)
-    share = np.where(is_beyond, 1.0, np.square(own / np.maximum(own + known, 1e-300)))
+    is_beyond = squares > INNOVATION_SIGMAS**2 * (own + others)
+    share = np.where(is_beyond, 1.0, np.square(own / np.maximum(own + others, 1e-300)))
     counts = np.minimum(counts + share, NOISE_MEMORY_SCANS)
-    side = np.where(squares > MEDIAN_SQUARE * (own + known), 1.0, -1.0)
+    side = np.where(squares > MEDIAN_SQUARE * (own + others), 1.0, -1.0)
     return np.maximum(noise * np.exp(share / counts * side), least), counts

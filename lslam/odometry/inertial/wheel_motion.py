@@ -13,13 +13,17 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, WheelStream
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import LEVER_M, Span
-from lslam.core.types.state import State
 from lslam.odometry.inertial.constant_velocity import USUAL_ACCELERATION, ConstantVelocity, middle_of
-from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import INNOVATION_SIGMAS
 from lslam.odometry.inertial.imu_cleaning import WHEEL_GAP_S, covers, gaps
-from lslam.odometry.inertial.imu_estimate import WORSE_RATIO
-from lslam.odometry.inertial.wheel_calibration import WheelCalibration, WheelStep, by_axis, learnt, split
+from lslam.odometry.inertial.imu_estimate import PredictionErrors
+from lslam.odometry.inertial.wheel_calibration import (
+    WheelCalibration,
+    WheelStep,
+    by_axis,
+    learn_noise,
+    squares_along,
+)
 from lslam.odometry.kernels import kalman
 from lslam.odometry.kernels.rotation import apart
 from lslam.registration.result import RegistrationResult
@@ -79,6 +83,7 @@ class WheelMotion(ConstantVelocity):
         "_counts",
         "_agreed_ns",
         "_was_bridged",
+        "errors",
     )
     TRANSIENT: ClassVar[tuple[str, ...]] = (*ConstantVelocity.TRANSIENT, "_reckoned", "_learnt")
 
@@ -98,7 +103,7 @@ class WheelMotion(ConstantVelocity):
         # Until the next `correct`: the step to the scan, and what its registration told.
         self._reckoned: ReckonedStep | None = None
         self._learnt: LearntFromScan | None = None
-        self._errors: list[tuple[float, float]] = []
+        self.errors = PredictionErrors()
 
     def fresh(self, pose: Floats) -> WheelMotion:
         """One that has learnt as much, and expects the first scan at `pose` (4, 4)."""
@@ -128,83 +133,64 @@ class WheelMotion(ConstantVelocity):
         middle, instant_ns = middle_of(prior, stamp_ns, result.T_world_lidar)
         if result.covariance is None or not result.is_accepted:
             return result
-        reckoned = self._reckoned = self._reckon(instant_ns)
-        if reckoned is None:
+        reckoning = self._reckoned = self._reckon(instant_ns)
+        if reckoning is None:
             return result
         C = result.covariance
-        self._learnt = self._learn_from(reckoned, instant_ns, middle, C + _open(result))
+        self._learnt = self._learn_from(reckoning, instant_ns, middle, C + _open(result))
         up = self._pose[:3, :3] @ self.calibration.up
         G = np.zeros((6, 4))
         G[:3, :3], G[3:, 3] = self._pose[:3, :3], up
-        P = G @ reckoned.covariance @ G.T
+        P = G @ reckoning.covariance @ G.T
         P[3:, 3:] += UNTOLD * (np.eye(3) - np.outer(up, up))
-        turn = so3.log(middle[:3, :3] @ reckoned.pose[:3, :3].T)
-        rest = np.concatenate([middle[:3, 3] - reckoned.pose[:3, 3], turn])
+        turn = so3.log(middle[:3, :3] @ reckoning.pose[:3, :3].T)
+        rest = np.concatenate([middle[:3, 3] - reckoning.pose[:3, 3], turn])
         excess = kalman.square(rest, P + 2 * C) / INNOVATION_SIGMAS**2
-        if excess > len(G.T) and self._is_denied(reckoned, middle):
-            pose = reckoned.pose @ se3.relative(middle, result.T_world_lidar)
+        if excess > len(G.T) and self._is_contrary(reckoning, middle):
+            pose = reckoning.pose @ se3.relative(middle, result.T_world_lidar)
             metres, degrees = float(np.linalg.norm(rest[:3])), float(np.rad2deg(np.linalg.norm(rest[3:])))
             reason = f"registration is {metres:.2f} m and {degrees:.1f} deg from what the wheels told"
-            return result.rejected(reason, pose, C + G @ reckoned.covariance @ G.T)
+            return result.reject(reason, pose, C + G @ reckoning.covariance @ G.T)
         # Beyond so many sigma one of both is wrong, and nothing tells which.
         P *= max(1.0, excess)
-        return result.moved(*kalman.weighed(result.T_world_lidar, rest, C, P, result.map_age))
+        return result.with_pose(*kalman.fuse_poses(result.T_world_lidar, rest, C, P, result.map_age))
 
     def correct(
-        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, is_registered: bool = True
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
     ) -> None:
         """Take the pose (4, 4) found at `stamp_ns` as the newest; `prior` says how its sweep moved."""
         _, instant_ns = (pose, stamp_ns) if prior is None else middle_of(prior, stamp_ns, pose)
-        reckoned, learnt_now = self._reckoned, self._learnt
-        if reckoned is not None:
-            self.slip_scans += reckoned.is_slip
-            self._agreed_ns = self._agreed_ns if reckoned.is_slip else instant_ns
+        reckoning, learnt_now = self._reckoned, self._learnt
+        if reckoning is not None:
+            self.slip_scans += reckoning.is_slip
+            self._agreed_ns = self._agreed_ns if reckoning.is_slip else instant_ns
         elif not self.refusal and self._instant_ns is not None and not covers(self._gaps, self._instant_ns, instant_ns):
             self.gap_scans += 1
-        if is_registered and learnt_now is not None and learnt_now.instant_ns == instant_ns:
+        if has_registration and learnt_now is not None and learnt_now.instant_ns == instant_ns:
             self.calibration = learnt_now.calibration
             self._acceleration, self._counts = learnt_now.acceleration, learnt_now.counts
             if learnt_now.errors is not None:
-                self._errors.append(learnt_now.errors)
-                self._judge()
+                self._judge(*learnt_now.errors)
         self._reckoned = self._learnt = None
-        self._was_bridged = not is_registered
-        super().correct(stamp_ns, pose, prior, is_registered)
+        self._was_bridged = not has_registration
+        super().correct(stamp_ns, pose, prior, has_registration)
 
-    def prior_errors(self) -> tuple[float, float] | None:
-        """Medians, m, of how wrong wheels and constant velocity predicted the scans, turns counted at `LEVER_M`."""
-        if not self._errors:
-            return None
-        own, steady = np.median(np.array(self._errors), axis=0)
-        return float(own), float(steady)
-
-    def state(self) -> State:
-        """What `restore` needs to go on from here; not the stream."""
-        return {**super().state(), "errors": np.array(self._errors).reshape(-1, 2)}
-
-    def restore(self, state: State) -> None:
-        """Go on where `state` was taken."""
-        super().restore(state)
-        self._errors = [(float(own), float(steady)) for own, steady in state["errors"]]
-
-    def _is_denied(self, reckoned: ReckonedStep, middle: Floats) -> bool:
+    def _is_contrary(self, reckoning: ReckonedStep, middle: Floats) -> bool:
         """Whether constant velocity is nearer to the wheels than to a registration that contradicts them.
 
         Never twice in a row, as with an IMU: a registration that insists is right.
         """
         if self._was_bridged or self._step_s <= 0:
             return False
-        steady, registered = reckoned.steady, se3.relative(self._pose, middle)
-        return bool(apart(steady, reckoned.wheels.pose, LEVER_M) < apart(steady, registered, LEVER_M))
+        steady, registered = reckoning.steady, se3.relative(self._pose, middle)
+        return bool(apart(steady, reckoning.wheels.pose, LEVER_M) < apart(steady, registered, LEVER_M))
 
-    def _judge(self) -> None:
+    def _judge(self, own: float, steady: float) -> None:
         """Refuse wheels that predict scans clearly worse than constant velocity does, as an IMU is refused."""
-        if self.refusal or len(self._errors) < InertialMotion.JUDGED:
-            return
-        own, steady = np.median(np.array(self._errors[-InertialMotion.JUDGED :]), axis=0)
-        if own > WORSE_RATIO * steady + InertialMotion.SLACK_M:
+        worse = self.errors.observe(own, steady)
+        if worse is not None and not self.refusal:
             self.refusal = (
-                f"they predict scans {own:.3f} m wrong where constant velocity is {steady:.3f} m wrong (turns counted at "
+                f"they predict scans {worse[0]:.3f} m wrong where constant velocity is {worse[1]:.3f} m wrong (turns counted at "
                 f"{LEVER_M:.0f} m): are they this robot's, in m/s and rad/s, on the clock of the scans?"
             )
             log.warning("the wheels are refused from here on: %s", self.refusal)
@@ -237,9 +223,9 @@ class WheelMotion(ConstantVelocity):
         part = gain @ more
         twist = before + np.concatenate([part[:3], part[3] * up])
         pose = se3.normalise(self._pose @ se3.exp(twist))
-        return ReckonedStep(pose, self.calibration.spread(wheels) + noise + lost, wheels, steady, is_slip)
+        return ReckonedStep(pose, self.calibration.state_covariance(wheels) + noise + lost, wheels, steady, is_slip)
 
-    def _learn_from(self, reckoned: ReckonedStep, instant_ns: int, middle: Floats, C: Floats) -> LearntFromScan:
+    def _learn_from(self, reckoning: ReckonedStep, instant_ns: int, middle: Floats, C: Floats) -> LearntFromScan:
         """What the registered `middle` (4, 4) with covariance C (6, 6) tells of the wheels and of constant velocity."""
         up, B = self.calibration.up, np.zeros((4, 6))
         B[:3, :3], B[3, 3:] = self._pose[:3, :3].T, self._pose[:3, :3] @ up
@@ -251,13 +237,13 @@ class WheelMotion(ConstantVelocity):
             turn = so3.log(registered[:3, :3] @ expected[:3, :3].T)
             return np.append(registered[:3, 3] - expected[:3, 3], up @ turn)
 
-        rest, off = rest_of(reckoned.wheels.pose), rest_of(reckoned.steady)
-        calibration = self.calibration.corrected(reckoned.wheels, rest, both)
+        rest, off = rest_of(reckoning.wheels.pose), rest_of(reckoning.steady)
+        calibration = self.calibration.correct(reckoning.wheels, rest, both)
         acceleration, counts = self._acceleration, self._counts
         if self._step_s > 0:
-            per = np.full(3, reckoned.wheels.seconds**4)
-            squares, known = split(off, both, self.calibration.direction)
-            acceleration, counts = learnt(acceleration, counts, squares, known, per, LEAST_ACCELERATION)
+            per = np.full(3, reckoning.wheels.seconds**4)
+            squares, others = squares_along(off, both, self.calibration.direction)
+            acceleration, counts = learn_noise(acceleration, counts, squares, others, per, LEAST_ACCELERATION)
         is_open = np.trace(C[:3, :3]) > UNTOLD
         return LearntFromScan(
             instant_ns, calibration, acceleration, counts, None if is_open else (_size(rest), _size(off))

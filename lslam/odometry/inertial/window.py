@@ -1,34 +1,44 @@
-"""A sliding window of IMU states, estimated jointly from preintegrated increments, scans and a marginalised past.
+"""The sliding window of LIO-mapping as a motion model: scans and IMU in one estimate of all that is not long past.
 
-After Ye, Chen and Liu 2019, section IV; the error states and the noise are those of the filter (`navigation_state`).
+IMU states are estimated jointly from preintegrated increments, scans and a marginalised past. After Ye, Chen and Liu 2019,
+section IV; the error states and the noise are those of the filter (`NavigationState`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lslam.core.geometry import se3, so3
+from lslam.core.config.odometry import ImuConfig
+from lslam.core.geometry import noise, se3, so3
 from lslam.core.kernels import linalg
 from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, ImuStream
+from lslam.core.types.motion_prior import MotionPrior
+from lslam.core.types.scan import LEVER_M, Span
 from lslam.core.types.scan_result import ScanEquations
-from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
-from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, ImuEstimate
-from lslam.odometry.inertial.integrate import integrate
-from lslam.odometry.inertial.navigation_state import (
+from lslam.odometry.inertial.constant_velocity import middle_of
+from lslam.odometry.inertial.filter import (
     GYRO,
     OWN,
+    POSE,
     REST,
+    FilterMotion,
     NavigationState,
+    Normal,
     cut_noise,
     process_noise,
     transition,
 )
+from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
+from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.integrate import integrate
 from lslam.odometry.kernels.rotation import vector_between
+from lslam.registration.result import RegistrationResult
 
 # Of the filter's error state what all moments have in common: gravity and the gyroscope's axes.
 COMMON = np.r_[9:12, 18:27]
@@ -37,39 +47,6 @@ DOWN, AXES = slice(0, 3), slice(3, 12)
 # m and rad: a step of all poses below ends the iteration; what it leaves is its square.
 LEAST_STEP = 1e-3
 MOST_STEPS = 5
-
-
-@dataclass(frozen=True)
-class Normal:
-    """H (N, N) and gradient g (N,) at some values; the cost decreases along -H^-1 g."""
-
-    H: Floats
-    g: Floats
-
-    def step(self) -> Floats:
-        """(N,) the update to the minimum; NaN where H is not positive definite."""
-        return -linalg.solve(self.H, self.g)
-
-    def without(self, out: NDArray[np.bool_]) -> Normal:
-        """The Schur complement: the variables `out` (N,) are marginalised."""
-        if not out.any():
-            return self
-        kept = ~out
-        # The gradient rides along as one more column.
-        across = np.column_stack([self.H[np.ix_(out, kept)], self.g[out]])
-        n = len(across[0])
-        rest = np.zeros((n, n))
-        rest[:-1, :-1], rest[:-1, -1], rest[-1, :-1] = self.H[np.ix_(kept, kept)], self.g[kept], self.g[kept]
-        left = linalg.complement(self.H[np.ix_(out, out)], across, rest)
-        return Normal(0.5 * (left[:-1, :-1] + left[:-1, :-1].T), left[:-1, -1].copy())
-
-
-def warm_up_solver() -> None:
-    """Compile or load what an estimate over a window is solved, marginalised and given a covariance with."""
-    normal = Normal(np.eye(2), np.zeros(2))
-    normal.step()
-    normal.without(np.array([True, False]))
-    linalg.inverse(normal.H)
 
 
 @dataclass(frozen=True)
@@ -93,7 +70,7 @@ class Moment:
         """(4, 4) at the scan's stamp."""
         return np.asarray(self.T_world_imu @ self.T_imu_scan)
 
-    def moved(self, d: Floats) -> Moment:
+    def retract(self, d: Floats) -> Moment:
         """After an error d (15,)."""
         T = se3.make(so3.exp(d[3:6]) @ self.T_world_imu[:3, :3], self.T_world_imu[:3, 3] + d[:3])
         return replace(
@@ -154,7 +131,7 @@ class Window:
         past = Past(information, np.zeros(len(order)), e.gravity, e.gyroscope.axes, moment)
         return cls((moment,), e.gravity, e.gyroscope.axes, e.gyroscope.rate_variance, e.gyroscope.noise, past)
 
-    def extended(self, moment: Moment) -> Window:
+    def extend(self, moment: Moment) -> Window:
         """With one more moment, the newest."""
         return replace(self, moments=(*self.moments, moment))
 
@@ -164,7 +141,7 @@ class Window:
             self, moments=tuple(replace(m, equations=equations.get(m.stamp_ns, m.equations)) for m in self.moments)
         )
 
-    def solved(self, imu: ImuStream) -> tuple[Window, Floats]:
+    def solve(self, imu: ImuStream) -> tuple[Window, Floats]:
         """The joint estimate by Gauss-Newton, and its information (12 + 15 W, 12 + 15 W), common errors first.
 
         Where that is not positive definite the estimate stays, and `newest` has no finite covariance.
@@ -175,19 +152,19 @@ class Window:
             d = -linalg.solve(H, g)
             if not np.isfinite(d).all():
                 break
-            window = window.moved(d)
+            window = window.retract(d)
             if np.abs(d[SHARED:].reshape(-1, EACH)[:, :6]).max() < LEAST_STEP:
                 break
         return window, H
 
-    def moved(self, d: Floats) -> Window:
+    def retract(self, d: Floats) -> Window:
         """After an error d (12 + 15 W,)."""
         each = d[SHARED:].reshape(-1, EACH)
         return replace(
             self,
             gravity=self.gravity + d[DOWN],
             axes=self.axes + d[AXES].reshape(3, 3),
-            moments=tuple(m.moved(one) for m, one in zip(self.moments, each, strict=True)),
+            moments=tuple(m.retract(one) for m, one in zip(self.moments, each, strict=True)),
         )
 
     def equations(self, imu: ImuStream) -> tuple[Floats, Floats]:
@@ -273,7 +250,7 @@ class Window:
         is_first[SHARED : SHARED + EACH] = True
         rest = Normal(H, g).without(is_first)
         walk = GRAVITY_WALK**2 * 1e-9 * (second.instant_ns - first.instant_ns)
-        information, gradient = loosened(rest.H, rest.g, DOWN, walk)
+        information, gradient = loosen(rest.H, rest.g, DOWN, walk)
         past = Past(information, gradient, self.gravity, self.axes, second)
         return replace(self, moments=self.moments[1:], past=past)
 
@@ -310,7 +287,94 @@ def off_by(a: Floats, b: Floats) -> Floats:
     return np.concatenate([b[:3, 3] - a[:3, 3], R @ vector_between(R, b[:3, :3])])
 
 
-def loosened(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
+def loosen(H: Floats, g: Floats, part: slice, variance: float) -> tuple[Floats, Floats]:
     """Normal equations after a `part` of what they speak of walked by so much: the Schur complement of where it was."""
     K = np.linalg.inv(np.eye(part.stop - part.start) / variance + H[part, part])
     return H - H[:, part] @ K @ H[part], g - H[:, part] @ K @ g[part]
+
+
+# m, of a point at `LEVER_M`: a scan whose pose moved farther from where its points were linearised is linearised again.
+STALE_M = 0.005
+
+
+class WindowMotion(FilterMotion):
+    """Predicts as the filter does, from the newest state; a scan is taken by the joint estimate of the whole window.
+
+    size : moments in the window between two scans
+    """
+
+    HAS_DEVICE: ClassVar[bool] = False
+    STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "window")
+
+    def __init__(
+        self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, size: int
+    ) -> None:
+        super().__init__(imu, T_lidar_imu, estimate, config)
+        self.size = size
+        self.window: Window | None = None
+        # Of the scan that is being registered: equations that were taken, and the window with it.
+        self._equations: dict[int, ScanEquations] = {}
+        self._joint: Window | None = None
+
+    def sweep(self, stamp_ns: int, span: Span) -> MotionPrior:
+        """As of the filter."""
+        self._equations, self._joint = {}, None
+        return super().sweep(stamp_ns, span)
+
+    def take(self, equations: Iterable[ScanEquations]) -> None:
+        """What the points of some scans say of their poses, for the estimates to come."""
+        self._equations |= {one.stamp_ns: one for one in equations}
+
+    def fuse(self, stamp_ns: int, result: RegistrationResult, prior: MotionPrior) -> RegistrationResult:
+        """The result at the pose and with the covariance that the joint estimate gives it."""
+        self._joint = self._posterior = None
+        if not result.is_accepted or prior.covariance is None or self._next is None or self.window is None:
+            return result
+        instant_ns, state = self._next
+        middle, _ = middle_of(prior, stamp_ns, result.T_world_lidar)
+        T_world_imu = middle @ self.T_lidar_imu
+        T_imu_scan = se3.relative(T_world_imu, result.T_world_lidar)
+        moment = moment_of(replace(state, T_world_imu=T_world_imu), instant_ns, stamp_ns, T_imu_scan)
+        window, H = self.window.extend(moment).with_equations(self._equations).solve(self.imu)
+        newest = window.newest(H, state)
+        pose = se3.normalise(newest.T_world_imu @ T_imu_scan)
+        if not (np.isfinite(pose).all() and np.isfinite(newest.covariance).all()):
+            return result
+        self._joint, self._posterior = window, (instant_ns, newest)
+        lever = pose[:3, 3] - newest.T_world_imu[:3, 3]
+        covariance = noise.transport(newest.covariance[POSE, POSE], lever)
+        return result.with_pose(pose, covariance)
+
+    def stale(self) -> dict[int, Floats]:
+        """Poses (4, 4), by stamps, of the scans that the joint estimate moved away from where they were linearised."""
+        moved = {}
+        for m in () if self._joint is None else self._joint.moments:
+            if m.equations is not None:
+                off = off_by(m.equations.T_world_lidar, m.T_world_lidar)
+                if np.linalg.norm(off[:3]) + LEVER_M * np.linalg.norm(off[3:]) > STALE_M:
+                    moved[m.stamp_ns] = m.T_world_lidar
+        return moved
+
+    def poses(self) -> dict[int, Floats]:
+        """Poses (4, 4), by stamps, of the scans in the window as they are estimated now."""
+        return {} if self.window is None else {m.stamp_ns: se3.normalise(m.T_world_lidar) for m in self.window.moments}
+
+    def correct(
+        self, stamp_ns: int, pose: Floats, prior: MotionPrior | None = None, has_registration: bool = True
+    ) -> None:
+        """As of the filter; the window goes on, or begins anew where the filter does."""
+        joint, posterior, predicted = self._joint, self._posterior, self._next
+        super().correct(stamp_ns, pose, prior, has_registration)
+        self._joint, self._equations = None, {}
+        if self._now is None or self._instant_ns is None:
+            self.window = None
+            return
+        T_imu_scan = se3.relative(self._pose @ self.T_lidar_imu, pose)
+        if posterior is not None and self._now is posterior[1]:
+            self.window = joint
+        elif predicted is not None and self._now is predicted[1] and self.window is not None:
+            self.window = self.window.extend(moment_of(self._now, self._instant_ns, stamp_ns, T_imu_scan))
+        else:
+            self.window = Window.begin(self._now, self._instant_ns, stamp_ns, T_imu_scan)
+        while self.window is not None and len(self.window.moments) > self.size:
+            self.window = self.window.without_first(self.imu)

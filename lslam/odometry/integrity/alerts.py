@@ -11,8 +11,7 @@ from lslam.core.geometry import se3
 from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan_result import OPEN_M, OPEN_RAD, SAME_M, USUAL, MotionCheck
-from lslam.odometry.integrity.directions import EMPTIED_SHARE
-from lslam.odometry.integrity.pair_registration import is_within
+from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, is_within
 
 # Consistent checks in a row, two seconds of them, and least deviations, m and rad: few rings constrain tilt poorly.
 IN_A_ROW = 4
@@ -38,7 +37,7 @@ class Alert:
 
 def alerts(checks: list[MotionCheck], positions: Floats, stamps_ns: Longs) -> list[Alert]:
     """All alerts on the `positions` (N, 3), m, of scans at `stamps_ns` (N,), in their order."""
-    rules = (_unconfirmed, _inconsistent, _ambiguous, _open, _foreign)
+    rules = (_across_breaks, _inconsistent, _ambiguous, _open, _foreign)
     of_checks = [alert for rule in rules for alert in rule(checks)]
     return sorted([*of_checks, *_jumps(positions, stamps_ns)], key=lambda alert: (alert.first, alert.last))
 
@@ -100,7 +99,7 @@ def _alert(run: list[MotionCheck], apart: Floats) -> Alert:
     return Alert(run[0].first + 1, run[-1].last, why)
 
 
-def _unconfirmed(checks: list[MotionCheck]) -> list[Alert]:
+def _across_breaks(checks: list[MotionCheck]) -> list[Alert]:
     """Where scans are missing or failed, and a check rejects the motion of the poses before and after."""
     out = []
     for check in checks:

@@ -14,11 +14,18 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import STILL_M, MotionCheck, ScanResult
 from lslam.core.types.state import Stateful
-from lslam.odometry.integrity.directions import emptied, filled_directions
-from lslam.odometry.integrity.pair_registration import PairRegistration, best_of, is_near, is_within, median_range
+from lslam.odometry.integrity.pair_registration import (
+    PairRegistration,
+    best_of,
+    empty_share,
+    filled_directions,
+    is_near,
+    is_within,
+    median_range,
+)
+from lslam.registration.history import UsualAgreement
 from lslam.registration.preprocessing.deskew import deskew_points
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room, thin
-from lslam.registration.robust import UsualAgreement
 
 # A pair of scans is so long apart, s, and the sensor moves by less than this part of the median range between them, where
 # scans lie closer.
@@ -34,7 +41,7 @@ MORE_POINTS_RATIO = 1.1
 
 
 @dataclass(frozen=True)
-class Seen:
+class ReferenceScan:
     """A scan as the monitor keeps it: when and where, and its points (S, 3) with their scatter, deskewed; median range, m."""
 
     position: int
@@ -71,7 +78,7 @@ class IntegrityMonitor(Stateful):
         self._is_prepared = preprocess == self._preprocess
         self._pair = PairRegistration()
         self.checks: list[MotionCheck] = []
-        self._reference: Seen | None = None
+        self._reference: ReferenceScan | None = None
         self._is_broken = False
         self._last_ns = 0
         # The motion (4, 4) that the last conclusive check found, and the seconds it took.
@@ -95,7 +102,7 @@ class IntegrityMonitor(Stateful):
             return
         now = self._view(position, scan, prepared, result, sweep)
         if self._reference is not None:
-            self._compare(self._reference, now, self._emptied(self._reference, now, scan))
+            self._compare(self._reference, now, self._empty_share(self._reference, now, scan))
         self._reference, self._is_broken = now, False
 
     def warm_up(self) -> None:
@@ -123,29 +130,33 @@ class IntegrityMonitor(Stateful):
         """m/s; of the last conclusive check."""
         return 0.0 if self._motion is None else float(np.linalg.norm(self._motion[0][:3, 3])) / self._motion[1]
 
-    def _expected(self, seconds: float) -> Floats | None:
+    def _extrapolate(self, seconds: float) -> Floats | None:
         """The motion (4, 4) over so many seconds if it goes on as before; None where nobody knows."""
         if self._motion is None or seconds > MAX_EXTRAPOLATION_S:
             return None
         motion, before = self._motion
         return np.asarray(se3.exp(seconds / before * se3.log(motion)))
 
-    def _view(self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior) -> Seen:
+    def _view(
+        self, position: int, scan: Scan, prepared: object, result: ScanResult, sweep: MotionPrior
+    ) -> ReferenceScan:
         if not (self._is_prepared and isinstance(prepared, PreparedPoints)):
             prepared = prepare_points(scan.points, self._preprocess, scan.index, scan.times)
         points = thin(prepared, 1 + len(prepared.source) // PLANE_POINTS)
         source = deskew_points(points.source, points.source_times, sweep)
-        return Seen(position, result.stamp_ns, result.T_world_lidar, source, points.scatter, median_range(source))
+        return ReferenceScan(
+            position, result.stamp_ns, result.T_world_lidar, source, points.scatter, median_range(source)
+        )
 
-    def _emptied(self, first: Seen, last: Seen, scan: Scan) -> float:
+    def _empty_share(self, first: ReferenceScan, last: ReferenceScan, scan: Scan) -> float:
         """Share of directions that were filled when the poses came to a stand, and are empty now that they still stand."""
         if self._stand is not None and is_still(se3.relative(self._stand[0], last.pose)):
-            return emptied(self._stand[1], filled_directions(scan.points))
+            return empty_share(self._stand[1], filled_directions(scan.points))
         stands = is_still(se3.relative(first.pose, last.pose))
         self._stand = (last.pose, filled_directions(scan.points)) if stands else None
         return 0.0
 
-    def _compare(self, first: Seen, last: Seen, emptied_share: float) -> None:
+    def _compare(self, first: ReferenceScan, last: ReferenceScan, emptied_share: float) -> None:
         """Test the motion of the poses between two scans."""
         claimed = se3.relative(first.pose, last.pose)
         seconds = (last.stamp_ns - first.stamp_ns) * 1e-9
@@ -159,7 +170,7 @@ class IntegrityMonitor(Stateful):
             hypotheses.append(pair.at_rest())
         if self._motion is None:
             hypotheses.append(pair.far(np.eye(4)))
-        elif (expected := self._expected(seconds)) is not None:
+        elif (expected := self._extrapolate(seconds)) is not None:
             change = float(np.linalg.norm(expected[:3, 3] - claimed[:3, 3])) / seconds**2
             if (is_odd or change > GRAVITY) and not is_near(near_claim.motion, expected):
                 hypotheses.append(pair.near(expected))

@@ -1,4 +1,7 @@
-"""Registers a scan on an earlier one from several starts, by fixed settings: none of the run's configuration."""
+"""Registers a scan on an earlier one from several starts, by fixed settings: none of the run's configuration.
+
+A sensor that stands goes on seeing something in the same directions.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3
@@ -14,22 +18,65 @@ from lslam.core.kernels.linearisation import OUTLIER_SIGMAS
 from lslam.core.types.arrays import Bools, Floats, Longs
 from lslam.core.types.scan import LEVER_M
 from lslam.core.types.scan_result import SAME_M, motion_apart
-from lslam.odometry.integrity.directions import directions, filled_directions
+from lslam.registration.alignment import voxel_terms
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR, LEAST_BREADTH, WIDE_FACTORS
-from lslam.registration.optimiser import Correspondences, Limits, Term, optimise
-from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.residuals import PLANE
-from lslam.registration.result import RegistrationResult
-from lslam.registration.robust import (
+from lslam.registration.optimiser import (
     COARSE_DECAY,
     COARSE_KERNEL_M,
     KERNEL_DECAY,
     KERNEL_MIN_M,
     START_ITERATIONS,
     Annealing,
+    Correspondences,
+    Limits,
+    Term,
+    optimise,
 )
-from lslam.registration.solver import voxel_terms
+from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.residuals import PLANE
+from lslam.registration.result import RegistrationResult
+
+# Edge of a cell of directions, rad: two rings of sixteen beams, a hundred shots.
+CELL_RAD = float(np.deg2rad(5.0))
+# Points that tell the directions of a scan, and that fill a cell.
+POINTS, FILLING = 20_000, 3
+# Share of the directions that empty: far from the few per cent of dropouts, and from the half and more of a cloud that leaves.
+EMPTIED_SHARE = 0.25
+# Cells are numbered by row, from the pole below upwards.
+_ROWS = round(np.pi / CELL_RAD)
+_COLUMNS = 2 * _ROWS
+
+
+def directions(points: Floats) -> Longs:
+    """(N,) numbers of the cells of directions, of about the same size, in which points (N, 3), m, lie as seen from 0."""
+    ranges = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
+    row = np.minimum((np.arcsin(points[:, 2] / ranges) + np.pi / 2) / CELL_RAD, _ROWS - 1).astype(np.int64)
+    count = np.maximum(np.round(_COLUMNS * np.cos((row + 0.5) * CELL_RAD - np.pi / 2)), 1)
+    column = np.minimum((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5) * count, count - 1).astype(
+        np.int64
+    )
+    return np.asarray(row * _COLUMNS + column)
+
+
+def filled_directions(points: NDArray[np.floating]) -> Longs:
+    """Numbers of the cells of `directions` that hold some of the points (N, 3), m."""
+    few = points[:: 1 + len(points) // POINTS, :3].astype(np.float64)
+    ranges = np.linalg.norm(few, axis=1)
+    cells, filling = np.unique(directions(few[np.isfinite(ranges) & (ranges > 0)]), return_counts=True)
+    return np.asarray(cells[filling >= FILLING])
+
+
+def empty_share(before: Longs, now: Longs) -> float:
+    """Share of the directions that were filled before and are empty now, in that half of them, lower or upper, where it is less.
+
+    What leaves in front of the sky empties directions, what leaves in front of the ground, or below a ceiling, does not.
+    """
+    is_lower = before < _ROWS // 2 * _COLUMNS
+    is_empty = ~np.isin(before, now)
+    halves = [is_empty[half] for half in (is_lower, ~is_lower) if half.any()]
+    return min((float(half.mean()) for half in halves), default=0.0)
+
 
 SETTINGS = RegistrationConfig(blob_weight=0.0)
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
@@ -87,12 +134,7 @@ class PairRegistration:
     def __init__(self) -> None:
         # One scan has no fine planes.
         self._planes = tuple(
-            GaussianMap(
-                LARGEST_M * wider,
-                reach=1e4,
-                capacity=1 << 13,
-                breadth=LEAST_BREADTH,
-            )
+            GaussianMap(LARGEST_M * wider, reach=1e4, capacity=1 << 13, breadth=LEAST_BREADTH)
             for wider in (1, *WIDE_FACTORS)
         )
         self._edge = LARGEST_M

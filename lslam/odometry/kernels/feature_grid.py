@@ -93,7 +93,7 @@ def nearest(
     limit: float,
     ring: int | np.int64,
     nearby: int,
-    skipped: int,
+    own: int,
     points: Floats,
     rings: Rings,
     starts: Ints,
@@ -139,7 +139,7 @@ def nearest(
                             above = np.int64(rings[j]) - ring
                             if above > nearby:
                                 break
-                            if above < -nearby or (j == skipped if nearby == 0 else above == 0):
+                            if above < -nearby or (j == own if nearby == 0 else above == 0):
                                 continue
                         dx, dy, dz = points[j, 0] - x, points[j, 1] - y, points[j, 2] - z
                         d = dx * dx + dy * dy + dz * dz

@@ -53,7 +53,7 @@ def _product(A: Floats, B: Floats) -> Floats:
 
 
 @kernel
-def _transposed(A: Floats) -> Floats:
+def _transpose(A: Floats) -> Floats:
     out = np.empty((A.shape[1], A.shape[0]))
     for i in range(A.shape[0]):
         for j in range(A.shape[1]):
@@ -83,7 +83,7 @@ def _copy(A: Floats) -> Floats:
 @kernel
 def _in_axes_of(H: Floats, P: Floats) -> Floats:
     """H P H^T."""
-    return _product(_product(H, P), _transposed(H))
+    return _product(_product(H, P), _transpose(H))
 
 
 @kernel
@@ -110,7 +110,7 @@ def update(x: Floats, P: Floats, H: Floats, rest: Floats, noise: Floats, outlier
     beyond = square(rest, _sum(S, noise, 1.0)) / (m * outlier * outlier)
     factor = beyond if beyond > 1.0 else 1.0
     _eliminate(_sum(S, noise, factor), gain)
-    K = _transposed(gain)
+    K = _transpose(gain)
     left, mean = _product(K, H), np.empty(n)
     for i in range(n):
         for j in range(n):
@@ -126,8 +126,8 @@ def propagate(
     x: Floats,
     covariance: Floats,
     t: float,
-    gained: Floats,
-    moved: Floats,
+    velocity_gain: Floats,
+    displacement: Floats,
     velocity_arm: Floats,
     position_arm: Floats,
     R: Floats,
@@ -136,7 +136,7 @@ def propagate(
     """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias after `t` seconds.
 
     x (9,), covariance (9, 9) : velocity, m/s, gravity and accelerometer bias, m/s2, at the beginning
-    gained (3,), moved (3,), velocity_arm (3, 3), position_arm (3, 3) : velocity, position and their arms at the end, as in
+    gained (3,), displacement (3,), velocity_arm (3, 3), position_arm (3, 3) : velocity, position and their arms at the end, as in
         `Increments`
     R : (3, 3) world from IMU at the beginning; force_noise : m/s2 per sqrt(Hz)
     """
@@ -149,8 +149,8 @@ def propagate(
         F[3 + i, i], F[3 + i, 3 + i] = 1.0, t
         F[6 + i, 3 + i] = F[9 + i, 6 + i] = 1.0
         for k in range(3):
-            mean[i] += R[i, k] * moved[k]
-            mean[3 + i] += R[i, k] * gained[k]
+            mean[i] += R[i, k] * displacement[k]
+            mean[3 + i] += R[i, k] * velocity_gain[k]
             for j in range(3):
                 F[i, 6 + j] -= R[i, k] * position_arm[k, j]
                 F[3 + i, 6 + j] -= R[i, k] * velocity_arm[k, j]
@@ -165,8 +165,8 @@ def propagate(
 
 
 @kernel
-def placed(
-    x: Floats, P: Floats, moved: Floats, noise: Floats, gravity: float, gravity_sigma: float, outlier: float
+def correct_by_displacement(
+    x: Floats, P: Floats, displacement: Floats, noise: Floats, gravity: float, gravity_sigma: float, outlier: float
 ) -> tuple[Floats, Floats]:
     """Mean (12,) and covariance (12, 12) of `propagate` after the update by the displacement `moved` (3,), m, of registration.
 
@@ -175,7 +175,7 @@ def placed(
     H, rest = np.zeros((3, 12)), np.empty(3)
     for i in range(3):
         H[i, i] = 1.0
-        rest[i] = moved[i] - x[i]
+        rest[i] = displacement[i] - x[i]
     mean, covariance = update(x, P, H, rest, noise, outlier)
     norm = math.sqrt(mean[6] * mean[6] + mean[7] * mean[7] + mean[8] * mean[8])
     along, less, sigma = np.zeros((1, 12)), np.empty(1), np.empty((1, 1))
@@ -194,7 +194,7 @@ def turn_bias(rotation: Floats, velocity_arm: Floats, axes: Floats, rest: Floats
     less, out = np.empty((3, 1)), np.empty(3)
     for i in range(3):
         less[i, 0] = rest[i]
-    _eliminate(_product(_product(_transposed(rotation), velocity_arm), axes), less)
+    _eliminate(_product(_product(_transpose(rotation), velocity_arm), axes), less)
     for i in range(3):
         out[i] = less[i, 0]
     return out
@@ -208,7 +208,7 @@ def turn_columns(rotation: Floats, velocity_arm: Floats, axes: Floats, seconds: 
     for i in range(3):
         reading[i, 0] = turn[i]
     _eliminate(_copy(axes), reading)
-    arm = _product(_transposed(rotation), velocity_arm)
+    arm = _product(_transpose(rotation), velocity_arm)
     scaled = _product(arm, axes)
     for i in range(3):
         for j in range(3):
@@ -235,7 +235,7 @@ def turn_covariance(
 
 
 @kernel
-def turned(
+def correct_turn(
     x: Floats,
     covariance: Floats,
     rate_variance: float,
@@ -271,7 +271,7 @@ def turned(
 
 
 @kernel
-def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[Floats, Floats]:
+def fuse_poses(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[Floats, Floats]:
     """Weighted mean of the pose T (4, 4) with covariance C (6, 6) and of one with covariance P (6, 6), and its covariance.
 
     Poses on one map share its error, as large as their own, all but one part in `age`. The other pose starts at one of them and
@@ -282,7 +282,7 @@ def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[
     """
     gain = _copy(C)
     _eliminate(_sum(C, P, age), gain)
-    K = _transposed(gain)
+    K = _transpose(gain)
     white = _sum(C, _product(K, C), -1.0)
     d, share = np.zeros(6), np.empty((6, 6))
     for i in range(6):
@@ -297,4 +297,4 @@ def weighed(T: Floats, rest: Floats, C: Floats, P: Floats, age: float) -> tuple[
         pose[i, 3] += d[i]
         for j in range(3):
             pose[i, j] = R[i, j]
-    return pose, _sum(white, _product(white, _transposed(share)), 1.0 - 1.0 / age)
+    return pose, _sum(white, _product(white, _transpose(share)), 1.0 - 1.0 / age)

@@ -25,13 +25,13 @@ from lslam.io.formats.stamped_csv import write_gnss_csv, write_imu_csv
 from lslam.io.formats.trajectory_files import write_kitti, write_tum
 from lslam.io.readers.labels import labelled
 from lslam.odometry.frontend.register_scans import sweep_of
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.constant_velocity import Course
 from lslam.pipeline.convert import bag_messages, check_beside, check_output, staged
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.convert.convert_trajectory import change_frame
 from lslam.pipeline.map_pass import motion_within
 from lslam.registration.preprocessing.deskew import deskew_points
-from lslam.registration.preprocessing.merged_lidars import MergedLidars
+from lslam.registration.preprocessing.views import MergedLidars
 
 log = logging.getLogger("lslam")
 

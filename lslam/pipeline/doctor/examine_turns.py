@@ -16,7 +16,7 @@ from lslam.core.types.sequence import Sequence
 from lslam.odometry.frontend.inertial_start import first_poses
 from lslam.odometry.inertial.agreement import FAR_S, LEAST_TURNING, NEAR_S, STEP_S, Agreement, check_agreement, turns
 from lslam.odometry.inertial.fusion import InertialMotion
-from lslam.odometry.inertial.imu_cleaning import Cleaned, ImuFault, ImuRefusedError, clean
+from lslam.odometry.inertial.imu_cleaning import CleanStream, ImuFault, ImuRefusedError, clean
 from lslam.odometry.inertial.initialise import FirstPoses, start, told_poses
 from lslam.pipeline.doctor import Facts, Finding
 
@@ -80,7 +80,9 @@ def _swept_by_imu(
     return again if len(again.instants_ns) >= _FEWEST else first
 
 
-def compare(cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, findings: list[Finding]) -> Facts:
+def compare(
+    cleaned: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, findings: list[Finding]
+) -> Facts:
     """Compare the gyroscope with the LiDAR's poses (N, 4, 4) at `stamps_ns` (N,)."""
     agreement = Agreement(False)
     refusal: ImuRefusedError | None = None
@@ -113,7 +115,7 @@ def compare(cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floa
     }
 
 
-def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
+def _with_axes(cleaned: CleanStream, R: Floats, stamps_ns: Longs, poses: Floats) -> Agreement:
     """Agreement after correcting the axes by R, which may be a reflection; before, the clock offset is unobservable."""
     T = np.eye(4)
     T[:3, :3] = R
@@ -124,7 +126,7 @@ def _with_axes(cleaned: Cleaned, R: Floats, stamps_ns: Longs, poses: Floats) -> 
 
 
 def _far_off(
-    cleaned: Cleaned, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, near: Agreement
+    cleaned: CleanStream, T_lidar_imu: Floats, stamps_ns: Longs, poses: Floats, near: Agreement
 ) -> Agreement | None:
     """Agreement at an offset beyond those that a run tries, if clearly better than `near`; else None."""
     best, at = 0.0, 0.0

@@ -21,7 +21,7 @@ from lslam.io.formats.text_tables import utc_of
 from lslam.io.readers import bag as bag_reader
 from lslam.io.readers.lookup import find_folder
 from lslam.odometry.frontend.point_times import with_point_times
-from lslam.odometry.integrity.directions import EMPTIED_SHARE, emptied, filled_directions
+from lslam.odometry.integrity.pair_registration import EMPTIED_SHARE, empty_share, filled_directions
 from lslam.pipeline.doctor import Facts, Finding, plural
 from lslam.pipeline.doctor.examine_cameras import examine_cameras
 from lslam.pipeline.doctor.examine_imu import examine_imu
@@ -259,7 +259,7 @@ def examine_points(sequence: Sequence, indices: NDArray[Any], findings: list[Fin
 
 def _examine_frame(directions: list[Longs], findings: list[Finding]) -> None:
     """Check that scans are in their sensor's frame: then the ground is always at one height below (or above) the origin."""
-    shares = [emptied(directions[0], later) for later in directions[1:]]
+    shares = [empty_share(directions[0], later) for later in directions[1:]]
     if len(shares) > 1 and np.median(shares) > EMPTIED_SHARE:
         findings.append(
             Finding(

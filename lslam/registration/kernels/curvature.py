@@ -22,21 +22,23 @@ _BINS = round(2 * WIDEST_STEP / _BIN)
 
 
 @kernel
-def into_rings(rings: NDArray[np.uint16], kept: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Order (K,) of the points `kept` by ring, in their own order within each, and starts (max ring + 2,)."""
+def into_rings(
+    rings: NDArray[np.uint16], chosen_points: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Order (K,) of the `chosen_points` by ring, in their own order within each, and starts (max ring + 2,)."""
     count = np.int64(0)
-    for i in kept:
+    for i in chosen_points:
         ring = np.int64(rings[i])
         if ring >= count:
             count = ring + 1
     starts = np.zeros(count + 1, np.int64)
-    for i in kept:
+    for i in chosen_points:
         starts[rings[i] + 1] += 1
     for k in range(count):
         starts[k + 1] += starts[k]
     fill = starts.copy()
-    order = np.empty(kept.shape[0], np.int64)
-    for i in kept:
+    order = np.empty(chosen_points.shape[0], np.int64)
+    for i in chosen_points:
         k = rings[i]
         order[fill[k]] = i
         fill[k] += 1
@@ -179,7 +181,7 @@ def pick(
     bend: NDArray[np.float64],
     ranges: NDArray[np.float64],
     breaks: NDArray[np.bool_],
-    allowed: NDArray[np.uint8],
+    may_be: NDArray[np.uint8],
     starts: NDArray[np.int64],
     regions: int,
     limits: tuple[int, int, int],
@@ -194,7 +196,7 @@ def pick(
     those of smallest curvature planes. The `SIDE_POINTS` neighbours on either side of a picked point, up to a
     break, are not picked.
 
-    allowed : (K,) bit 0: may be an edge, bit 1: less planar, bit 2: planar
+    may_be : (K,) bit 0: may be an edge, bit 1: less planar, bit 2: planar
     limits : largest number of edges, of edges and less sharp edges together, and of planes in a part
     edge_curvature, edge_noise : an edge's bend exceeds `edge_curvature`, and its bend times range, m, exceeds `edge_noise`
     plane_curvature, plane_noise : a plane's curvature is below `plane_curvature`, or times its range, m, below `plane_noise`
@@ -213,14 +215,12 @@ def pick(
                 for j in range(low, high):
                     c = curvature[j]
                     if sign > 0:
-                        fits = bend[j] > edge_curvature and bend[j] * ranges[j] > edge_noise and allowed[j] & 1
+                        fits = bend[j] > edge_curvature and bend[j] * ranges[j] > edge_noise and may_be[j] & 1
                     else:
-                        fits = (
-                            (c < plane_curvature or c * ranges[j] < plane_noise) and allowed[j] & 2 and labels[j] == 0
-                        )
+                        fits = (c < plane_curvature or c * ranges[j] < plane_noise) and may_be[j] & 2 and labels[j] == 0
                         if fits:
                             labels[j] = LESS_PLANE
-                            fits = allowed[j] & 4 != 0
+                            fits = may_be[j] & 4 != 0
                     if fits and not taken[j]:
                         candidates[used] = j
                         used += 1

@@ -1,4 +1,7 @@
-"""Discs: Gaussians that are thin along a normal and wide in the plane, as G-ICP gives them to every point."""
+"""Discs, Gaussians that are thin along a normal and wide in the plane, as G-ICP gives them to every point; matches of several.
+
+A point may have several matches: what it may match stands first among its slots.
+"""
 
 from __future__ import annotations
 
@@ -53,3 +56,15 @@ def source_discs(
         out[i, 3], out[i, 4], out[i, 5] = yy, yz, zz
         count += 1
     return count
+
+
+@inline
+def keep(i: int, slots: Ints, rows: Floats, column: int, least: float) -> None:
+    """Of the slots (8,) of point i leave those whose entry in a `column` of `rows` (C, N) is above `least`, before all -1."""
+    used = 0
+    for k in range(8):
+        s = slots[i, k]
+        slots[i, k] = -1
+        if s >= 0 and rows[s, column] > least:
+            slots[i, used] = s
+            used += 1

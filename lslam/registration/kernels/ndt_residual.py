@@ -24,8 +24,7 @@ from lslam.core.kernels.linearisation import (
     Width,
 )
 from lslam.core.kernels.residuals import Voxels, octant_slots, place
-from lslam.registration.kernels.discs import disc
-from lslam.registration.kernels.point_sums import keep
+from lslam.registration.kernels.discs import disc, keep
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -54,8 +53,8 @@ def describe(
     moments: Floats,
     planes: Floats,
     keys: Longs,
-    refreshed: Floats,
-    used: int,
+    counts: Floats,
+    end: int,
     floor: float,
     extent2: float,
     shapes: Floats,
@@ -66,12 +65,12 @@ def describe(
     The variance within the plane of a plane voxel is `extent2`, m2: that of its points tells where the beams of earlier scans
     were, not where the surface is. Voxels that hold too few points, a line, or one ring have a smallest eigenvalue of 0.
     """
-    for slot in range(used):
+    for slot in range(end):
         p, q = planes[slot], shapes[slot]
-        if keys[slot] == FREE or (q[10] == refreshed[slot] and q[0] == p[0] and q[1] == p[1] and q[2] == p[2]):
+        if keys[slot] == FREE or (q[10] == counts[slot] and q[0] == p[0] and q[1] == p[1] and q[2] == p[2]):
             continue
         q[0], q[1], q[2] = p[0], p[1], p[2]
-        q[10] = refreshed[slot]
+        q[10] = counts[slot]
         q[9] = 0.0
         if p[7] < BLOB:
             continue

@@ -19,7 +19,7 @@ PETAL_SIDE = 2  # neighbours on each side
 
 
 @kernel
-def cut(xyz: Floats, steps: Floats, starts: NDArray[np.int64], gap: float, turn: float) -> NDArray[np.int64]:
+def cut_lines(xyz: Floats, steps: Floats, starts: NDArray[np.int64], gap: float, turn: float) -> NDArray[np.int64]:
     """Index of the first point of each line, and the number of points at the end (lines + 1,), among points (K, 3).
 
     A line ends where the next point is more than `gap`, rad, away. It also ends where its angle to the sensor's x axis is

@@ -108,7 +108,7 @@ def find_ground(
 
 
 @inline
-def _joined(a: float, b: float, sine: float, cosine: float, tangent: float) -> bool:
+def _is_one_surface(a: float, b: float, sine: float, cosine: float, tangent: float) -> bool:
     """Whether the points at ranges a and b, m, lie on one object: the line through both makes a large angle with the beam.
 
     sine, cosine : of the angle between the beams; tangent : of the least angle of the line with the beam of the farther point
@@ -186,7 +186,9 @@ def cluster(
                     q = other * columns + column
                     if image[q] == 0.0:
                         continue
-                    if not seen[q] and _joined(here, image[q], sines[angles, step], cosines[angles, step], tangent):
+                    if not seen[q] and _is_one_surface(
+                        here, image[q], sines[angles, step], cosines[angles, step], tangent
+                    ):
                         seen[q] = True
                         queue[tail] = q
                         tail += 1

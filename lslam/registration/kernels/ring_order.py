@@ -54,7 +54,7 @@ def follow(
                 right += 1
         before_x, before_y = ahead_x, ahead_y
     sense = 1.0 if left >= right else -1.0
-    turned = np.empty(n)
+    angles = np.empty(n)
     jumps = np.empty(n, np.int64)
     used = 0
     at = 0.0
@@ -68,26 +68,26 @@ def follow(
                     jumps[used] = i
                     used += 1
             last = i
-        turned[i] = at
-    return turned, slope, jumps[:used], max(left, right) / max(total, 1)
+        angles[i] = at
+    return angles, slope, jumps[:used], max(left, right) / max(total, 1)
 
 
 @kernel
-def cut(
-    turned: NDArray[np.float64], slope: NDArray[np.float32], seam: float
+def cut_rings(
+    angles: NDArray[np.float64], slope: NDArray[np.float32], seam: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float64], NDArray[np.int64]]:
     """Ring (N,) of each point, counted from 0: a new ring begins whenever the angle `turned` (N,), rad, passes the `seam`, rad.
 
     Returns also the mean slope (rings,) of each ring, and the number of its points with a slope (rings,).
     """
-    n = turned.shape[0]
+    n = angles.shape[0]
     rings = np.empty(n, np.uint16)
     sums = np.zeros(65536)
     counts = np.zeros(65536, np.int64)
     ring = 0
-    highest = np.floor((turned[0] - seam) / _FULL) if n else 0.0
+    highest = np.floor((angles[0] - seam) / _FULL) if n else 0.0
     for i in range(n):
-        turn = np.floor((turned[i] - seam) / _FULL)
+        turn = np.floor((angles[i] - seam) / _FULL)
         if turn > highest:
             highest = turn
             ring = min(ring + 1, 65535)

@@ -68,14 +68,14 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         slope * walk.step,
         np.sin(np.radians(PARALLEL_DEG)),
     )
-    allowed, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.PETAL_SIDE)
+    may_be, noise = np.full(len(walk.order), 7, np.uint8), curvature_noise(walk.ranges, petals.PETAL_SIDE)
     limits, usual = (config.max_edge_points, config.max_less_edge_points), _SHORTER * walk.step
     labels = curvature.pick(
         curved,
         bend,
         walk.ranges,
         breaks,
-        allowed,
+        may_be,
         walk.starts,
         1,
         (*limits, config.max_planar_points),
@@ -85,9 +85,9 @@ def petal_features(scan: Scan, config: LoamConfig | None = None, gate: Preproces
         SIGNIFICANT_SIGMAS * noise,
     )
     if len(brightness):
-        allowed.fill(MAY_BE_EDGE)
+        may_be.fill(MAY_BE_EDGE)
         painted = curvature.pick(
-            contrast, contrast, walk.ranges, breaks, allowed, walk.starts, 1, (*limits, 0), _CONTRAST, 0.0, 0.0, 0.0
+            contrast, contrast, walk.ranges, breaks, may_be, walk.starts, 1, (*limits, 0), _CONTRAST, 0.0, 0.0, 0.0
         )
         labels = np.where(painted > 0, np.maximum(labels, painted), labels)
     lines = np.zeros(len(scan), np.uint16)
@@ -110,7 +110,7 @@ def walk_lines(scan: Scan, gate: PreprocessConfig) -> RingWalk:
             "apart, or --method icp"
         )
     step = min(step, WIDEST_STEP)
-    lines = petals.cut(points, steps, starts, _GAP_STEPS * step, _TURN_STEPS * step)
+    lines = petals.cut_lines(points, steps, starts, _GAP_STEPS * step, _TURN_STEPS * step)
     return RingWalk(order, lines, points, ranges, steps, step)
 
 

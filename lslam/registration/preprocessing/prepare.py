@@ -84,7 +84,7 @@ class PreparedPoints:
 
     map_points : (M, 3) float32, m, one centroid per small voxel
     source : (S, 3) float64, m; scatter : (S, 6) float64, m2, covariance xx xy xz yy yz zz of the points behind each
-    used : points that passed the range gate
+    in_range : points that passed the range gate
     map_times (M,), source_times (S,) : float32, s from the scan's stamp, mean over the points behind each; None when the scan
         has no times
     covariance : (S, 6) float64, m2, likewise, of the surface round each source point; None where no method asked for it
@@ -94,7 +94,7 @@ class PreparedPoints:
     map_points: NDArray[np.float32]
     source: Floats
     scatter: Floats
-    used: int
+    in_range: int
     map_times: NDArray[np.float32] | None = None
     source_times: NDArray[np.float32] | None = None
     covariance: Floats | None = None
@@ -113,7 +113,7 @@ def prepare_points(
     Further columns are ignored. Raises InputError for arrays of another shape.
     """
     times_of = NO_TIMES if times is None else np.ascontiguousarray(times, np.float32)
-    cloud, cloud_times = _gated(as_cloud(points), times_of, config)
+    cloud, cloud_times = _gate_cloud(as_cloud(points), times_of, config)
     map_points, map_times, counts = voxel.means(cloud, cloud_times, config.map_leaf)
     if config.least_line > 0:
         solid = on_surfaces(map_points, counts, config.map_leaf, config.least_line)
@@ -193,7 +193,7 @@ def _gate_of(config: PreprocessConfig) -> tuple[float, float, bool, Floats]:
     return config.range_min, config.range_max, config.range_shape == "cylinder", box
 
 
-def _gated(
+def _gate_cloud(
     cloud: NDArray[np.float32], times: NDArray[np.float32], config: PreprocessConfig
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The points that `gate_points` keeps, and their times: in one pass where only the gate asks."""

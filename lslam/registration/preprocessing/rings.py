@@ -1,4 +1,7 @@
-"""Which beam each point belongs to, where the recording does not say: rows, order in the file, or elevation."""
+"""Which beam each point belongs to, where the recording does not say: rows, order in the file, or elevation.
+
+Beams are clusters among the elevations of points.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,6 @@ from lslam.core.errors import InputError, UsageError
 from lslam.core.types.arrays import Floats
 from lslam.core.types.scan import NO_RING, Scan
 from lslam.registration.kernels import ring_order
-from lslam.registration.preprocessing.beams import elevation_borders
 
 Kind = Literal["field", "rows", "order", "elevation"]
 
@@ -73,28 +75,28 @@ class RingRule:
         return (self.count - 1 - np.searchsorted(self.borders, elevation)).astype(np.uint16)
 
 
-def decide_rings(scans: list[Scan], wanted: str = "auto", known: int | None = None) -> RingRule:
+def decide_rings(scans: list[Scan], choice: str = "auto", beams: int | None = None) -> RingRule:
     """The rule for a recording, from a few of its scans.
 
     Parameters
     ----------
-    wanted : auto, field, rows[:N], order or elevation[:N], what `input.rings` may be
-    known : number of beams, where the recording says it
+    choice : auto, field, rows[:N], order or elevation[:N], what `input.rings` may be
+    beams : number of beams, where the recording says it
 
     Raises
     ------
     UsageError : `wanted` is none of these. InputError : the scans do not have such rings, or none at all.
     """
-    kind, count = parse_rings(wanted)
+    kind, count = parse_rings(choice)
     # The end of a sweep, which a driver may begin with, says nothing of its order.
     usual = np.median([len(scan) for scan in scans])
     whole = [scan for scan in scans if 2 * len(scan) >= usual]
     first = whole[0]
     rules = {
         "field": lambda: _decide_field(scans),
-        "rows": lambda: _decide_rows(whole, count or known),
+        "rows": lambda: _decide_rows(whole, count or beams),
         "order": lambda: _decide_order(first),
-        "elevation": lambda: _decide_elevation(scans, count, known),
+        "elevation": lambda: _decide_elevation(scans, count, beams),
     }
     for name in rules if kind == "auto" else [kind]:
         rule = rules[name]()
@@ -143,7 +145,7 @@ def _cut_rings(points: NDArray[Any]) -> tuple[NDArray[np.uint16] | None, float]:
         return None, 0.0
     before = np.maximum(jumps - 1, 0)
     seam = _stab(turned[before], turned[jumps])
-    rings, slopes, counts = ring_order.cut(turned, slope, seam)
+    rings, slopes, counts = ring_order.cut_rings(turned, slope, seam)
     if not FEWEST <= len(counts) <= MOST or counts.mean() < _LEAST_PER_RING or not _is_staircase(slopes):
         return None, seam
     return rings, seam
@@ -194,12 +196,12 @@ def organised_rows(scan: Scan, count: int | None = None) -> RingRule | None:
         if len(scan) % rows or len(scan) // rows < _LEAST_PER_RING or rows < FEWEST:
             continue
         for columns in (False, True):
-            if _is_organised(scan.points, rows, columns):
+            if _has_rows(scan.points, rows, columns):
                 return RingRule("rows", rows, columns)
     return None
 
 
-def _is_organised(points: NDArray[np.float32], rows: int, columns: bool) -> bool:
+def _has_rows(points: NDArray[np.float32], rows: int, columns: bool) -> bool:
     """Whether each row keeps its elevation and lies below (or above) the one before."""
     table = elevations(points).reshape((-1, rows) if columns else (rows, -1))
     table = table.T if columns else table
@@ -223,10 +225,10 @@ def _decide_order(scan: Scan) -> RingRule | None:
     return None if rings is None else RingRule("order", int(rings.max()) + 1)
 
 
-def _decide_elevation(scans: list[Scan], count: int | None, known: int | None) -> RingRule | None:
+def _decide_elevation(scans: list[Scan], count: int | None, beams: int | None) -> RingRule | None:
     pooled = np.concatenate([elevations(s.points) for s in scans])
     borders = elevation_borders(pooled[np.isfinite(pooled)].astype(np.float64), count)
-    if borders is None or (known is not None and count is None and len(borders) + 1 > known):
+    if borders is None or (beams is not None and count is None and len(borders) + 1 > beams):
         return None
     return RingRule("elevation", len(borders) + 1, borders=tuple(borders.tolist()))
 
@@ -247,3 +249,85 @@ def _refusal(kind: str, count: int | None, scan: Scan) -> str:
         else "try --rings auto, or"
     )
     return f"--rings {kind}: the scans {why}; {way} use --method loam-livox or icp, which need no rings"
+
+
+_BIN_DEG = 0.01
+_WIDTHS_DEG = (0.02, 0.04, 0.08, 0.16, 0.32)  # smoothing that is tried, the finest first
+_VALLEY = 0.3  # between two beams the density falls below this share of the smaller one
+_LEAST_POINTS = 5  # of a beam
+_SMALL = 0.05  # of the points of a usual beam: fewer are strays
+_TIGHT = 0.15  # median distance from the beam over the distance between beams; 0.25 is no clustering at all
+
+
+def elevation_borders(elevation: Floats, count: int | None = None) -> Floats | None:
+    """Borders (beams - 1,) rad, increasing, between the beams that elevations (N,), rad, cluster round.
+
+    Beams may be unevenly spaced and differ much in their points. With `count` exactly so many are found. None when the
+    elevations do not cluster.
+    """
+    for width in _WIDTHS_DEG:
+        borders = _borders(elevation, width)
+        n = len(borders) + 1
+        if (count is not None and n == count) or (
+            count is None and FEWEST <= n <= MOST and _is_tight(elevation, borders)
+        ):
+            return borders
+    return None
+
+
+def ring_gap(points: NDArray[np.float32]) -> float:
+    """The usual angle, rad, between neighbouring rings of points (N, 3), LiDAR frame; 0 where elevations do not cluster."""
+    p = points.astype(np.float64)
+    borders = elevation_borders(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+    return 0.0 if borders is None else float(np.median(np.diff(borders)))
+
+
+def _borders(elevation: Floats, width_deg: float) -> Floats:
+    edges = np.radians(np.arange(-90.0, 90.0 + _BIN_DEG, _BIN_DEG))
+    counts = np.histogram(elevation, edges)[0].astype(np.float64)
+    reach = round(3 * width_deg / _BIN_DEG)
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) * _BIN_DEG / width_deg) ** 2)
+    density = np.convolve(counts, weights, mode="same")
+    centres = (edges[:-1] + edges[1:]) / 2
+    valleys = _valleys(density)
+    return np.asarray(centres[_without_small(valleys, np.concatenate([[0.0], np.cumsum(counts)]))])
+
+
+def _valleys(density: Floats) -> list[int]:
+    """Where the density falls far enough between two peaks."""
+    rising = np.diff(density, prepend=0.0) > 0
+    peaks = np.flatnonzero(rising & (np.diff(density, append=0.0) <= 0))
+    heights: list[float] = []
+    borders: list[int] = []
+    for k, peak in enumerate(peaks):
+        if k:
+            low = peaks[k - 1] + density[peaks[k - 1] : peak + 1].argmin()
+            flat = np.flatnonzero(density[low:peak] > density[low])
+            borders.append(int(low + (flat[0] if len(flat) else 0) // 2))
+        heights.append(float(density[peak]))
+        while borders and density[borders[-1]] >= _VALLEY * min(heights[-2:]):
+            heights[-2:] = [max(heights[-2:])]
+            borders.pop()
+    return borders
+
+
+def _without_small(borders: list[int], total: Floats) -> list[int]:
+    """Leave out stray points: a cluster of next to none joins the neighbour that has less. `total` counts points up to a bin."""
+    while borders:
+        mass = np.diff(total[[0, *borders, len(total) - 1]])
+        least = int(mass.argmin())
+        if mass[least] >= max(_LEAST_POINTS, _SMALL * float(np.median(mass))):
+            break
+        left, right = (mass[k] if 0 <= k < len(mass) else np.inf for k in (least - 1, least + 1))
+        borders = [b for k, b in enumerate(borders) if k != (least - 1 if left < right else least)]
+    return borders
+
+
+def _is_tight(elevation: Floats, borders: Floats) -> bool:
+    """Whether points lie near the middle of their cluster, measured by the distance to the next one."""
+    beam = np.searchsorted(borders, elevation)
+    order = np.lexsort((elevation, beam))
+    parts = np.split(elevation[order], np.flatnonzero(np.diff(beam[order])) + 1)
+    middles = np.array([np.median(part) for part in parts])
+    spread = np.median(np.concatenate([np.abs(part - middle) for part, middle in zip(parts, middles, strict=True)]))
+    return bool(spread < _TIGHT * np.median(np.diff(middles)))

@@ -12,8 +12,7 @@ from lslam.backend.keyframes.submaps import GROUND_KEYFRAMES, mounted_up
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.trajectory import Keyframe
-from lslam.registration.preprocessing.ground import Z
-from lslam.registration.preprocessing.up import AXIS, find_up
+from lslam.registration.preprocessing.ground import AXIS, Z, find_up
 
 # Of a sensor of 16 rings.
 HALF_FIELD = np.deg2rad(15.0)

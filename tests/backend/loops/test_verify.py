@@ -13,10 +13,10 @@ from lslam.backend.loops.verify import LARGE, NARROWEST, WIDEST, Verification, V
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
+from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.registration.result import RegistrationResult
-from lslam.registration.solver import solve
 
 Floats = NDArray[np.float64]
 YAWS = np.deg2rad(np.arange(-10, 11, 2.0))

@@ -45,7 +45,7 @@ def test_the_slope_of_a_narrow_strip_stays_uncertain_however_many_points_it_has(
     """Its points may all be a centimetre too high at one end: more of them do not tell."""
     rng = np.random.default_rng(4)
     strip = np.column_stack([rng.uniform(0.2, 0.7, 2000), rng.uniform(0.1, 0.9, 2000), rng.normal(0.5, 0.002, 2000)])
-    m = GaussianMap(1.0, count_cap=1e9, shared=FLOOR)
+    m = GaussianMap(1.0, count_cap=1e9, scan_variance=FLOOR)
     tilts = []
     for points in np.array_split(strip.astype(np.float32), 10):
         m.insert(points, at(0.0, 0.0, 0.0))

@@ -127,7 +127,7 @@ def test_a_rotation_updates_the_gyroscope_as_the_full_update() -> None:
     x, before, own = np.concatenate([bias, axes.ravel()]), P.copy(), noise + 0.3 * t * np.eye(3)
     before[:3, :3] += 0.2**2 * t * np.eye(3)
     expected, after = kalman.update(x, before, H, rest, own, OUTLIER)
-    mean, found, excess = kalman.turned(x, P, 0.3, R, V, t, rest, noise, 0.2, OUTLIER)
+    mean, found, excess = kalman.correct_turn(x, P, 0.3, R, V, t, rest, noise, 0.2, OUTLIER)
     np.testing.assert_allclose(mean, expected, rtol=1e-10)
     np.testing.assert_allclose(found, after, atol=1e-10)
     assert excess == pytest.approx(rest @ rest - np.trace(H @ before @ H.T + own))
@@ -142,7 +142,7 @@ def test_a_displacement_and_the_strength_of_gravity_are_two_updates() -> None:
     along = np.zeros((1, 12))
     along[0, 6:9] = mean[6:9] / norm
     mean, after = kalman.update(mean, after, along, np.array([9.8 - norm]), np.array([[0.03**2]]), OUTLIER)
-    found, found_P = kalman.placed(x, P, moved, noise, 9.8, 0.03, OUTLIER)
+    found, found_P = kalman.correct_by_displacement(x, P, moved, noise, 9.8, 0.03, OUTLIER)
     np.testing.assert_allclose(found, mean, rtol=1e-10)
     np.testing.assert_allclose(found_P, after, atol=1e-10)
 
@@ -161,7 +161,7 @@ def test_a_pose_is_weighed_against_another_by_both_covariances() -> None:
     T, rest, C, P = se3.exp(rng.normal(size=6)), 0.01 * rng.normal(size=6), covariance(6, rng), covariance(6, rng)
     K = np.linalg.solve(C + 5.0 * P, C).T
     d = -K @ rest
-    pose, left = kalman.weighed(T, rest, C, P, 5.0)
+    pose, left = kalman.fuse_poses(T, rest, C, P, 5.0)
     np.testing.assert_allclose(pose[:3, :3], so3.exp(d[3:]) @ T[:3, :3], atol=1e-14)
     np.testing.assert_allclose(pose[:3, 3], T[:3, 3] + d[:3], atol=1e-14)
     L = np.eye(6) - K

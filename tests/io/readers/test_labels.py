@@ -22,7 +22,7 @@ from lslam.io.readers.labels import labelled
 from lslam.odometry import create_odometry
 from lslam.pipeline.convert.convert_sequence import convert_sequence
 from lslam.pipeline.job import choose_scans
-from lslam.registration.preprocessing.merged_lidars import FurtherLidar, MergedLidars
+from lslam.registration.preprocessing.views import FurtherLidar, MergedLidars
 
 POINTS = 300
 CLASS_OF = np.tile(np.array([10, 40, 50, 252, 259], np.uint16), POINTS // 5)

@@ -14,7 +14,7 @@ from two_lidars import WAYS, merged, two_lidars
 import lslam
 from lslam.core.config import load_config
 from lslam.core.types.sequence import Sequence
-from lslam.registration.preprocessing.merged_lidars import RINGS_APART
+from lslam.registration.preprocessing.views import RINGS_APART
 from lslam.simulation.scenarios import SimulatedDrive
 
 SHARES_TOWNS = True

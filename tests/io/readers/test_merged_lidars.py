@@ -27,8 +27,7 @@ from lslam.odometry.frontend.point_times import with_point_times
 from lslam.pipeline.convert import bag_messages
 from lslam.pipeline.convert.bag_writer import BagWriter
 from lslam.pipeline.resume import input_digest
-from lslam.registration.preprocessing.merged_lidars import RINGS_APART, FurtherLidar, MergedLidars
-from lslam.registration.preprocessing.views import with_rings
+from lslam.registration.preprocessing.views import RINGS_APART, FurtherLidar, MergedLidars, with_rings
 
 T_FRONT_REAR = se3.exp(np.array([-1.6, 0.4, -0.2, 0.0, 0.05, 2.9]))
 TREE = {("base", "front"): se3.exp(np.array([1.0, 0, 2, 0, 0.1, 0])),

@@ -18,9 +18,8 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import SequenceView, StatedTimes
 from lslam.odometry.frontend.clock_choice import ClockChoice
 from lslam.odometry.frontend.point_times import later_choices, with_point_times
-from lslam.registration.preprocessing.clock_proposals import Proposal
-from lslam.registration.preprocessing.merged_lidars import MergedLidars
-from lslam.registration.preprocessing.sweep_clock import SweepClock
+from lslam.registration.preprocessing.sweep_clock import Proposal, SweepClock
+from lslam.registration.preprocessing.views import MergedLidars
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 

@@ -25,8 +25,8 @@ from lslam.odometry import create_odometry
 from lslam.odometry.base import Deskewing
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.segments import SegmentTracker, TrackedScan
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.frontend.windows import WINDOW_SCANS, WindowTracker, first_pose
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
 from lslam.simulation.lidar_models import LIDARS
@@ -47,7 +47,7 @@ def configured(method: str) -> Config:
 
 
 @cache
-def scans(method: str, seed: int) -> tuple[Loaded, ...]:
+def scans(method: str, seed: int) -> tuple[ScanInput, ...]:
     made = drive(seed)
     stub = Stub([made.scan(i) for i in range(COUNT)], None, made.calibration, motion_compensated=True)  # type: ignore
     return tuple(read_ahead(stub, create_odometry(configured(method)).prepare, 1))
@@ -62,21 +62,21 @@ def windows_of(method: str, initial_scans: int = FIRST) -> WindowTracker:
     return WindowTracker(SegmentTracker(Tracker(create_odometry(config)), begin, initial_scans), None, 0.02, 4.8)
 
 
-def decided(windows: WindowTracker, loaded: tuple[Loaded, ...]) -> list[list[Tracked]]:
+def decided(windows: WindowTracker, loaded: tuple[ScanInput, ...]) -> list[list[TrackedScan]]:
     return list(decided_by(windows, chain(loaded, (None,))))
 
 
 @cache
-def tracked(method: str, seed: int, initial_scans: int = FIRST) -> tuple[Tracked, ...]:
+def tracked(method: str, seed: int, initial_scans: int = FIRST) -> tuple[TrackedScan, ...]:
     now = decided(windows_of(method, initial_scans), scans(method, seed))
     return tuple(t for together in now for t in together)
 
 
-def poses_of(run: tuple[Tracked, ...] | list[Tracked]) -> Floats:
+def poses_of(run: tuple[TrackedScan, ...] | list[TrackedScan]) -> Floats:
     return np.stack([t.result.T_world_lidar for t in run])
 
 
-def tilt_error_deg(run: tuple[Tracked, ...], seed: int, scan: int) -> float:
+def tilt_error_deg(run: tuple[TrackedScan, ...], seed: int, scan: int) -> float:
     """How far a scan is turned against the second half of the run."""
     made, poses = drive(seed), poses_of(run)
     true = made.vehicle.poses(np.array([made.scan(i).stamp_ns for i in range(COUNT)]) * 1e-9)
@@ -121,7 +121,7 @@ def create() -> Deskewing:
     return method
 
 
-def off_by_5_cm() -> list[Tracked]:
+def off_by_5_cm() -> list[TrackedScan]:
     """The scans of a window, the first of which lies beside its place."""
     run = list(tracked("icp", 0, 1))[:WINDOW_SCANS]
     run[0] = run[0].at(se3.exp(np.array([0, 0.05, 0, 0, 0, 0])))
@@ -164,15 +164,15 @@ def test_it_stays_where_the_later_scans_leave_a_direction_open() -> None:
     """Two walls without an end."""
     rng = np.random.default_rng(0)
 
-    def scan(index: int) -> Loaded:
+    def scan(index: int) -> ScanInput:
         points = rng.uniform([-40, -3, -2], [40, 3, 2], (6000, 3))
         points[:, 1] = np.where(points[:, 1] > 0, 3.0, -3.0)
         points[:1000, 2] = -2.0
         made = Scan(points.astype(np.float32), index, 100_000_000 * index)
-        return Loaded(index, made.stamp_ns, made, create().prepare(made))
+        return ScanInput(index, made.stamp_ns, made, create().prepare(made))
 
     run = [
-        Tracked(loaded, ScanResult(k, loaded.stamp_ns, pose), MotionPrior.at_once(pose), (loaded.stamp_ns, pose))
+        TrackedScan(loaded, ScanResult(k, loaded.stamp_ns, pose), MotionPrior.at_once(pose), (loaded.stamp_ns, pose))
         for k in range(WINDOW_SCANS)
         for loaded, pose in [(scan(k), se3.exp(np.array([0.5 * k, 0, 0, 0, 0, 0])))]
     ]
@@ -191,23 +191,23 @@ def standing_drive(seed: int) -> SimulatedDrive:
 
 
 @cache
-def standing_scans(seed: int) -> tuple[Loaded, ...]:
+def standing_scans(seed: int) -> tuple[ScanInput, ...]:
     made = standing_drive(seed)
     stub = Stub([made.scan(i) for i in range(STARTED)], None, made.calibration, motion_compensated=True)  # type: ignore
     return tuple(read_ahead(stub, create_odometry(configured("icp")).prepare, 1))
 
 
 @cache
-def standing(seed: int, initial_scans: int = FIRST) -> tuple[tuple[Tracked, ...], ...]:
+def standing(seed: int, initial_scans: int = FIRST) -> tuple[tuple[TrackedScan, ...], ...]:
     """The scans of a start at rest, as they are decided."""
     return tuple(tuple(now) for now in decided(windows_of("icp", initial_scans), standing_scans(seed)))
 
 
-def in_order(run: tuple[tuple[Tracked, ...], ...]) -> list[Tracked]:
+def in_order(run: tuple[tuple[TrackedScan, ...], ...]) -> list[TrackedScan]:
     return [tracked for now in run for tracked in now]
 
 
-def start_tilt_deg(run: list[Tracked], seed: int) -> float:
+def start_tilt_deg(run: list[TrackedScan], seed: int) -> float:
     """How far the first scan of a start at rest is turned against those 5 m away and farther."""
     found, truth = poses_of(run), standing_drive(seed).ground_truth
     assert truth is not None

@@ -14,8 +14,7 @@ from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.core.geometry import so3
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.odometry import METHODS
-from lslam.odometry.frontend.inertial_start import mounting_problem
-from lslam.odometry.frontend.motion_models import motion_of
+from lslam.odometry.frontend.inertial_start import motion_of, mounting_problem
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import AXES_SIGMA, Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate

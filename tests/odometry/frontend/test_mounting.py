@@ -13,7 +13,7 @@ from lslam.core.types.imu import ImuStream
 from lslam.core.types.scan import Scan
 from lslam.core.types.sequence import Calibration
 from lslam.io.readers import open_sequence
-from lslam.odometry.frontend.mounting import with_up
+from lslam.odometry.frontend.scene_scale import with_up
 
 G = 9.81
 

@@ -16,7 +16,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult, Status
 from lslam.core.types.sequence import select
 from lslam.odometry import create_odometry
-from lslam.odometry.frontend.register_scans import PRIOR_COVARIANCE, estimate, is_diverged, read_ahead, to_trajectory
+from lslam.odometry.frontend.register_scans import PRIOR_COVARIANCE, diverges, estimate, read_ahead, to_trajectory
 from lslam.simulation.scenarios import simulate
 
 
@@ -113,13 +113,13 @@ def test_stops_when_asked_and_otherwise_after_the_last_scan() -> None:
 
 
 def test_diverged_means_that_no_frame_holds_half_of_the_scans() -> None:
-    assert not is_diverged(outcomes(("ok", 2), ("skipped", 1), ("bridged", 1)))
-    assert is_diverged(outcomes(("ok", 1), ("skipped", 3), ("bridged", 1)))
-    assert not is_diverged(outcomes(("ok", 30), ("bridged", 25))), "however many fail in a row"
-    assert is_diverged(outcomes(("skipped", 1)))
+    assert not diverges(outcomes(("ok", 2), ("skipped", 1), ("bridged", 1)))
+    assert diverges(outcomes(("ok", 1), ("skipped", 3), ("bridged", 1)))
+    assert not diverges(outcomes(("ok", 30), ("bridged", 25))), "however many fail in a row"
+    assert diverges(outcomes(("skipped", 1)))
     elsewhere = [replace(r, frame=1) for r in outcomes(("ok", 6))]
-    assert is_diverged([*outcomes(("ok", 4)), *elsewhere])
-    assert not is_diverged([*outcomes(("ok", 6)), *elsewhere])
+    assert diverges([*outcomes(("ok", 4)), *elsewhere])
+    assert not diverges([*outcomes(("ok", 6)), *elsewhere])
 
 
 def test_a_skipped_scan_is_more_doubtful_than_the_one_before() -> None:

@@ -8,8 +8,8 @@ from lslam.core.config import Config
 from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry import create_odometry
-from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.segments import SegmentTracker, TrackedScan
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 
 INITIAL = 3
 
@@ -21,7 +21,7 @@ class Scripted(Tracker):
         super().__init__(create_odometry(Config()))
         self.shares, self.x = shares, x
 
-    def track(self, loaded: Loaded) -> ScanResult:
+    def track(self, loaded: ScanInput) -> ScanResult:
         share = self.shares.get(loaded.index)
         pose = np.eye(4)
         pose[0, 3] = self.x
@@ -29,17 +29,19 @@ class Scripted(Tracker):
         return ScanResult(loaded.index, loaded.stamp_ns, pose, status, source_points=100, inliers=share or 0)  # type: ignore[arg-type]
 
 
-def tracked(old: dict[int, int], *new: dict[int, int], count: int, unread: tuple[int, ...] = ()) -> list[list[Tracked]]:
+def tracked(
+    old: dict[int, int], *new: dict[int, int], count: int, unread: tuple[int, ...] = ()
+) -> list[list[TrackedScan]]:
     """What is decided with each scan, and at the end; `new` are the maps that are begun, in turn."""
     begun = iter(new)
     tracker = SegmentTracker(Scripted(old), lambda pose: Scripted(next(begun), pose[0, 3] + 1), INITIAL)
     scan = Scan(np.ones((3, 3), np.float32), 0, 0)
-    every = [Loaded(i, i, None if i in unread else scan) for i in range(count)]
+    every = [ScanInput(i, i, None if i in unread else scan) for i in range(count)]
     out = [tracker.decide(loaded, tracker.present.track(loaded)) for loaded in every]
     return [*out, tracker.decide(None, None)]
 
 
-def outcomes(decided: list[list[Tracked]]) -> list[tuple[int, str, int]]:
+def outcomes(decided: list[list[TrackedScan]]) -> list[tuple[int, str, int]]:
     return [(t.result.index, t.result.status, t.result.segment) for now in decided for t in now]
 
 

@@ -15,11 +15,11 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan, Span
 from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import Traits
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.scan_outcome import recorded
+from lslam.odometry.scan_outcome import to_scan_result
 from lslam.registration.result import RegistrationResult
 
 SPAN_S, NO_SPAN = 0.1, Span()
@@ -43,7 +43,7 @@ class Oracle(Traits):
         return RegistrationResult(self.poses[scan.index], iterations=3, stages=stages)
 
     def update(self, scan: Scan, prior: MotionPrior, result: RegistrationResult) -> ScanResult:
-        return recorded(scan, result, result.covariance, result.covariance)
+        return to_scan_result(scan, result, result.covariance, result.covariance)
 
     def restart(self) -> None:
         pass
@@ -63,7 +63,7 @@ def drive(speeds: list[float]) -> tuple[Oracle, list[ScanResult]]:
     results = []
     for k in range(len(poses)):
         scan = Scan(points, k * 100_000_000, k, times=times)
-        results.append(tracker.track(Loaded(k, scan.stamp_ns, scan, scan)))
+        results.append(tracker.track(ScanInput(k, scan.stamp_ns, scan, scan)))
     return oracle, results
 
 
@@ -157,7 +157,7 @@ def braked(
     tracker = Tracker(oracle, motion=InertialMotion(imu, np.eye(4), known, ImuConfig(use=True)))
     times = np.linspace(*span, 3, dtype=np.float32)
     scans = [Scan(np.ones((3, 3), np.float32), int(1e9 * k * 0.1), k, times=times) for k in range(count)]
-    return oracle, [tracker.track(Loaded(k, scan.stamp_ns, scan, scan)) for k, scan in enumerate(scans)]
+    return oracle, [tracker.track(ScanInput(k, scan.stamp_ns, scan, scan)) for k, scan in enumerate(scans)]
 
 
 WHY = "registration is 3.00 m and 0.0 deg from what the IMU felt"
@@ -274,7 +274,7 @@ def test_the_first_motion_is_told_by_one_of_several_lidars() -> None:
     times, lidars = np.linspace(0, SPAN_S, 7, dtype=np.float32), np.array([0, 0, 0, 0, 1, 1, 1], np.uint8)
     for k in range(5):
         scan = Scan(np.ones((7, 3), np.float32), k * 100_000_000, k, times=times, lidars=lidars)
-        tracker.track(Loaded(k, scan.stamp_ns, scan, scan))
+        tracker.track(ScanInput(k, scan.stamp_ns, scan, scan))
     alone, whole = [points for points in oracle.points if points[1] == 4], oracle.points
     assert [index for index, _ in alone] == [0, 1]
     assert whole[2:4] == [(0, 7), (1, 7)], "both again, with all points"

@@ -20,11 +20,10 @@ from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry import create_odometry
 from lslam.odometry.frontend.checkpoints import STATE_CLASSES
 from lslam.odometry.frontend.register_scans import read_ahead
-from lslam.odometry.frontend.segments import SegmentTracker, Tracked
-from lslam.odometry.frontend.tracker import Loaded, Tracker
+from lslam.odometry.frontend.segments import SegmentTracker, TrackedScan
+from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.frontend.windows import WINDOW_SCANS, WindowTracker
-from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.odometry.inertial.course import Course
+from lslam.odometry.inertial.constant_velocity import ConstantVelocity, Course
 from lslam.registration.local_map import surroundings_m
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import SimulatedDrive, simulate
@@ -44,7 +43,7 @@ def drive(scenario: str) -> SimulatedDrive:
 
 
 @cache
-def scans(scenario: str, method: str = "icp") -> tuple[Loaded, ...]:
+def scans(scenario: str, method: str = "icp") -> tuple[ScanInput, ...]:
     made = drive(scenario)
     loaded = [made.scan(i) for i in range(COUNT)]
     stub = Stub(loaded, None, made.calibration, motion_compensated=False)  # type: ignore[arg-type]
@@ -62,16 +61,16 @@ def windows_of(config: Config, *, is_windowed: bool = True) -> WindowTracker:
     return windows
 
 
-def tracked(windows: WindowTracker, loaded: tuple[Loaded, ...]) -> Iterator[list[Tracked]]:
+def tracked(windows: WindowTracker, loaded: tuple[ScanInput, ...]) -> Iterator[list[TrackedScan]]:
     yield from decided_by(windows, chain(loaded, (None,)))
 
 
-def poses_of(decided: list[list[Tracked]]) -> Floats:
+def poses_of(decided: list[list[TrackedScan]]) -> Floats:
     return np.stack([t.result.T_world_lidar for now in decided for t in now])
 
 
 @cache
-def walked(*, is_windowed: bool) -> list[list[Tracked]]:
+def walked(*, is_windowed: bool) -> list[list[TrackedScan]]:
     return list(tracked(windows_of(configured(), is_windowed=is_windowed), scans("walk")))
 
 
@@ -87,7 +86,7 @@ def test_each_scan_is_decided_once_and_in_order_with_its_window() -> None:
     decided = walked(is_windowed=True)
     assert [len(now) for now in decided] == [*[0] * (WINDOW_SCANS - 1), WINDOW_SCANS, *[0] * 8, 8]
     assert [t.result.index for now in decided for t in now] == list(range(COUNT))
-    assert all(t.is_two_sided for now in decided for t in now)
+    assert all(t.has_both_sides for now in decided for t in now)
 
 
 def test_a_walk_turns_as_it_did() -> None:
@@ -103,7 +102,7 @@ def test_what_moves_evenly_or_cannot_follow_keeps_its_bytes(method: str) -> None
     along, alone = (
         list(tracked(windows_of(configured(method), is_windowed=on), scans(scenario, method))) for on in (True, False)
     )
-    assert not any(t.is_two_sided for now in along for t in now)
+    assert not any(t.has_both_sides for now in along for t in now)
     np.testing.assert_array_equal(poses_of(along), poses_of(alone))
 
 
@@ -130,7 +129,7 @@ def test_a_window_stays_as_it_was_where_fewer_points_agree_along_its_course(monk
     monkeypatch.setattr(Course, "at", wrong)
     decided = list(tracked(windows_of(configured()), scans("walk")))
     assert [t.result.index for now in decided for t in now] == list(range(COUNT))
-    assert not any(t.is_two_sided for now in decided for t in now)
+    assert not any(t.has_both_sides for now in decided for t in now)
     np.testing.assert_array_equal(poses_of(decided), alone)
 
 
@@ -138,11 +137,11 @@ def test_scans_that_cannot_be_read_are_no_part_of_the_course() -> None:
     """One of them stamped so near the scan before that the middle of that one's sweep lies within its own."""
     good, k = scans("walk"), 9
     stamp_ns = good[k].stamp_ns - 60_000_000
-    unread = Loaded(good[k].index, stamp_ns, None)
+    unread = ScanInput(good[k].index, stamp_ns, None)
     decided = list(tracked(windows_of(configured()), (*good[:k], unread, *good[k + 1 :])))
     results = [t.result for now in decided for t in now]
     assert [r.status for r in results] == ["skipped" if i == k else "ok" for i in range(COUNT)]
-    assert [t.is_two_sided for now in decided for t in now] == [True] * COUNT
+    assert [t.has_both_sides for now in decided for t in now] == [True] * COUNT
 
 
 def test_scans_of_one_instant_are_decided_as_they_come() -> None:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
-from lslam.odometry.inertial.course import Course, natural_spline
+from lslam.odometry.inertial.constant_velocity import Course, natural_spline
 
 TENTH_S, TENTH_NS = 0.1, 100_000_000
 KNOTS = np.linspace(0.0, TENTH_S, 33)

@@ -193,7 +193,7 @@ def test_the_integration_of_another_scan_is_not_reused(why: str) -> None:
         one.correct(int(stamps[4]), poses[4])
     np.testing.assert_array_equal(motion.estimate.velocity, other.estimate.velocity)
     np.testing.assert_array_equal(motion.estimate.gyroscope.bias, other.estimate.gyroscope.bias)
-    assert motion.prior_errors() == other.prior_errors()
+    assert motion.errors.medians == other.errors.medians
 
 
 def test_registration_on_an_older_map_has_more_weight() -> None:
@@ -229,7 +229,7 @@ def test_what_poses_on_one_map_share_stays_in_the_covariance(ratio: float) -> No
         of_map = (1 - 1 / age) * of_map + drawn(1 - (1 - 1 / age) ** 2)
         registered, felt = of_map + drawn(1.0), fused + drawn(ratio)
         T = se3.make(so3.exp(registered[3:]), registered[:3])
-        pose, covariance = kalman.weighed(T, registered - felt, C, ratio * C, age)
+        pose, covariance = kalman.fuse_poses(T, registered - felt, C, ratio * C, age)
         fused = np.concatenate([pose[:3, 3], so3.log(pose[:3, :3])])
         squares.append(float(fused @ np.linalg.solve(covariance, fused)) / 6)
     assert 0.7 < np.mean(squares) < 1.6

@@ -58,7 +58,7 @@ def taught(noise_of_rates: float, steps: int = 150, seen_to: float = 1e-4) -> tu
         step = integrate(read, np.array([k, k + 1]) * STEP_NS, gyroscope.bias, np.zeros(3), gyroscope.axes)
         seen = truth.rotations[-1] @ so3.exp(rng.normal(0, seen_to, 3))
         rest = np.asarray(so3.log(step.rotations[-1].T @ seen))
-        gyroscope = gyroscope.learnt(step, rest, seen_to**2 * np.eye(3))
+        gyroscope = gyroscope.learn(step, rest, seen_to**2 * np.eye(3))
     return gyroscope, read, true
 
 
@@ -109,7 +109,7 @@ def test_the_covariance_of_a_rotation_equals_its_finite_differences() -> None:
 def test_a_rotation_without_information_changes_nothing() -> None:
     gyroscope, read, _ = taught(RATE_NOISE, steps=20)
     step = turns(read, gyroscope, 1)[0]
-    again = gyroscope.learnt(step, np.array([0.01, 0.0, -0.01]), 1e6 * np.eye(3))
+    again = gyroscope.learn(step, np.array([0.01, 0.0, -0.01]), 1e6 * np.eye(3))
     np.testing.assert_allclose(again.axes, gyroscope.axes, atol=1e-8)
     np.testing.assert_allclose(again.bias, gyroscope.bias, atol=1e-8)
 
@@ -118,14 +118,14 @@ def test_without_information_the_bias_walks_and_the_axes_do_not() -> None:
     still = integrate(stream(np.zeros((41, 3))), np.array([0, STEP_NS]), np.zeros(3), np.zeros(3))
     gyroscope = Gyroscope(np.zeros(3))
     for _ in range(3):
-        gyroscope = gyroscope.learnt(still, np.zeros(3), 1e6 * np.eye(3))
+        gyroscope = gyroscope.learn(still, np.zeros(3), 1e6 * np.eye(3))
     expected = np.diag(np.repeat([BIAS_WALK**2 * 3 * 0.2, 0.0], [3, 9]))
     np.testing.assert_allclose(gyroscope.covariance, expected, rtol=1e-6, atol=1e-18)
 
 
 def test_an_outlier_rotation_has_a_bounded_effect_on_the_rate_variance() -> None:
     still = integrate(stream(np.zeros((41, 3))), np.array([0, STEP_NS]), np.zeros(3), np.zeros(3))
-    found = [Gyroscope(np.zeros(3)).learnt(still, np.array([turn, 0, 0]), 1e-8 * np.eye(3)) for turn in (0.1, 2.0)]
+    found = [Gyroscope(np.zeros(3)).learn(still, np.array([turn, 0, 0]), 1e-8 * np.eye(3)) for turn in (0.1, 2.0)]
     assert RATE_NOISE**2 < found[0].rate_variance == found[1].rate_variance
 
 
@@ -157,7 +157,7 @@ def test_the_bias_does_not_follow_the_noise_of_registration_over_many_steps(seed
     for step in turns(read, Gyroscope(BIAS), 300):
         errors.append(gyroscope.bias - BIAS)
         off = (gyroscope.bias - BIAS) * step.seconds[-1]
-        gyroscope = gyroscope.learnt(step, rng.normal(0, seen_to, 3) + off, seen_to**2 * np.eye(3))
+        gyroscope = gyroscope.learn(step, rng.normal(0, seen_to, 3) + off, seen_to**2 * np.eye(3))
     assert np.sqrt(np.mean(np.square(errors))) < np.deg2rad(0.01)
 
 
@@ -168,7 +168,7 @@ def test_the_covariance_of_the_axes_follows_a_bias_of_another_estimate() -> None
     prior = Gyroscope.of_bias(np.zeros(3), 0.01)
     learnt = prior
     for _ in range(20):
-        learnt = learnt.learnt(step, np.zeros(3), 1e-10 * np.eye(3))
+        learnt = learnt.learn(step, np.zeros(3), 1e-10 * np.eye(3))
     sure = learnt.with_bias(np.array([0.0, 0.0, 0.004]), 1e-8 * np.eye(3))
     np.testing.assert_allclose(sure.covariance[:3, :3], 1e-8 * np.eye(3), atol=1e-12)
     assert np.linalg.eigvalsh(sure.covariance)[0] > 0

@@ -56,7 +56,7 @@ def test_a_displacement_updates_the_velocity_as_a_scalar_kalman_filter(
     moved = np.array([3.0, -0.6, 0.3])
     noise = None if sigmas is None else np.diag(np.square(sigmas))
     step = before.over(imu, stamps[[0, -1]])
-    after = before.corrected(imu, step, np.eye(3), np.eye(3), moved, before.gyroscope, noise)
+    after = before.correct(imu, step, np.eye(3), np.eye(3), moved, before.gyroscope, noise)
     places = 2 * (PLACE_SIGMA**2 + np.square(np.zeros(3) if sigmas is None else sigmas))
     shared = 1e4 * t + FORCE_NOISE**2 * t**2 / 2
     gain = shared / (1e4 * t**2 + FORCE_NOISE**2 * t**3 / 3 + places)
@@ -81,8 +81,8 @@ def test_instants_within_a_step_do_not_change_the_update() -> None:
     for instants in (stamps[[0, -1]], stamps[[0, 10, 15, -1]]):
         step = before.over(imu, instants)
         R_end = R @ step.rotations[-1] @ so3.exp(np.array([0.02, -0.01, 0.03]))
-        taught.append(before.taught(step, R, R_end))
-        found.append(before.corrected(imu, step, R, R_end, np.array([1.0, 0.2, -0.1]), before.gyroscope))
+        taught.append(before.calibrate(step, R, R_end))
+        found.append(before.correct(imu, step, R, R_end, np.array([1.0, 0.2, -0.1]), before.gyroscope))
     whole, parted = found
     for name in ("velocity", "gravity", "accel_bias", "covariance"):
         np.testing.assert_allclose(getattr(parted, name), getattr(whole, name), atol=1e-9)

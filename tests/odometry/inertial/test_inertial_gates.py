@@ -39,7 +39,7 @@ def test_without_measurements_gravity_and_bias_walk_as_configured() -> None:
         stamps = np.arange(0, seconds * 1_000_000_000 + 1, IMU_NS)
         imu = ImuStream(stamps, np.tile([0.0, 0.0, 9.8], (len(stamps), 1)), np.zeros((len(stamps), 3)))
         before = ImuEstimate(np.zeros(3), np.array([0, 0, -9.8]), np.zeros(3), Gyroscope(np.zeros(3)), np.zeros((9, 9)))
-        after = before.propagated(before.over(imu, stamps[[0, -1]]), np.eye(3))
+        after = before.propagate(before.over(imu, stamps[[0, -1]]), np.eye(3))
         sigmas = np.sqrt(np.diag(after.covariance) / seconds)
         np.testing.assert_allclose(sigmas, np.repeat([0.05, 5e-3, 2e-3], 3), rtol=1e-6)
 
@@ -197,7 +197,7 @@ def test_the_sigma_of_gravity_covers_the_earth() -> None:
     unknown = np.diag(np.repeat([0.0, 1.0, 0.0], 3))
     before = ImuEstimate(np.zeros(3), np.array([0, 0, -9.8]), np.zeros(3), Gyroscope(np.zeros(3)), unknown)
     step = before.over(imu, stamps[[0, -1]])
-    after = before.corrected(imu, step, np.eye(3), np.eye(3), np.zeros(3), before.gyroscope, 1e9 * np.eye(3))
+    after = before.correct(imu, step, np.eye(3), np.eye(3), np.zeros(3), before.gyroscope, 1e9 * np.eye(3))
     sigmas = np.sqrt(np.diag(after.covariance)[3:6])
     np.testing.assert_allclose(sigmas[:2], 1.0, rtol=1e-3)
     assert sigmas[2] < 9.80665 - 9.764 < 2 * sigmas[2]

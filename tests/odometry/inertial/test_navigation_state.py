@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import ImuStream
-from lslam.odometry.inertial.gyroscope import Gyroscope
-from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.navigation_state import (
+from lslam.odometry.inertial.filter import (
     DOWN,
     FORCE,
     GYRO,
@@ -23,6 +21,8 @@ from lslam.odometry.inertial.navigation_state import (
     TURN,
     NavigationState,
 )
+from lslam.odometry.inertial.gyroscope import Gyroscope
+from lslam.odometry.inertial.imu_estimate import ImuEstimate
 
 Floats = NDArray[np.float64]
 STAMPS = np.arange(0, 100_000_001, 10_000_000)
@@ -68,7 +68,7 @@ def difference(a: NavigationState, b: NavigationState) -> Floats:
 
 
 def ahead(known: NavigationState, imu: ImuStream) -> NavigationState:
-    return known.propagated(known.estimate.over(imu, ENDS))
+    return known.propagate(known.estimate.over(imu, ENDS))
 
 
 @pytest.mark.parametrize("direction", range(STATE_SIZE))

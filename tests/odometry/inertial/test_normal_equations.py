@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lslam.core.kernels import linalg
-from lslam.odometry.inertial.window import Normal
+from lslam.odometry.inertial.filter import Normal
 
 
 def test_marginalising_a_linear_problem_leaves_its_solution_and_covariance() -> None:

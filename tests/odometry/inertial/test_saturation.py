@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from lslam.core.config import load_config
 from lslam.core.types.imu import GRAVITY, ImuStream
+from lslam.odometry.inertial.filter import PLACE, SPEED, TURN, NavigationState
 from lslam.odometry.inertial.gyroscope import Gyroscope
-from lslam.odometry.inertial.imu_cleaning import clean
+from lslam.odometry.inertial.imu_cleaning import clean, fill_saturation
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.navigation_state import PLACE, SPEED, TURN, NavigationState
-from lslam.odometry.inertial.saturation import with_hidden
 from lslam.pipeline.run import run
 from lslam.simulation.scenarios import simulate
 
@@ -36,7 +35,7 @@ def turning(peak_deg: float, limit: float = LIMIT, noise: float = 1e-4) -> tuple
 def test_saturated_readings_are_filled_in_within_their_sigma(peak_deg: float) -> None:
     whole, read = turning(peak_deg)
     notes: list[str] = []
-    filled = with_hidden(read, notes)
+    filled = fill_saturation(read, notes)
     assert filled.clipping_sigma is not None
     cut = np.abs(read.gyro[:, 1]) >= LIMIT
     np.testing.assert_array_equal(filled.clipping_sigma[:, 4] > 0, cut)
@@ -52,7 +51,7 @@ def test_saturated_readings_are_filled_in_within_their_sigma(peak_deg: float) ->
 def test_an_extreme_of_noise_is_not_the_end_of_the_range() -> None:
     whole, _ = turning(360.0)
     notes: list[str] = []
-    assert with_hidden(whole, notes) is whole
+    assert fill_saturation(whole, notes) is whole
     assert not notes
 
 
@@ -67,7 +66,7 @@ def of_16_bits(rates: Floats, scales: tuple[float, float, float] = (1.0, 1.0, 1.
 def test_both_ends_of_an_asymmetric_range_are_filled_in() -> None:
     whole, _ = turning(360.0)
     read = replace(whole, gyro=of_16_bits(whole.gyro))
-    filled = with_hidden(read, [])
+    filled = fill_saturation(read, [])
     assert filled.clipping_sigma is not None
     upper, lower = read.gyro[:, 1] >= LIMIT - BIT, read.gyro[:, 1] <= -LIMIT
     np.testing.assert_array_equal(filled.clipping_sigma[:, 4] > 0, upper | lower)
@@ -81,7 +80,7 @@ def test_every_axis_has_its_own_range() -> None:
     rates[:, 2] = 0.0
     rates[7::50, 2] = 2 * LIMIT
     read = replace(turning(360.0)[0], gyro=of_16_bits(rates, (1.0, 0.99, 1.0)))
-    filled = with_hidden(read, [])
+    filled = fill_saturation(read, [])
     assert filled.clipping_sigma is not None
     np.testing.assert_array_equal(filled.clipping_sigma[:, 3:] > 0, (rates >= LIMIT - BIT) | (rates <= -LIMIT))
 
@@ -97,19 +96,19 @@ def resting(coarse: float) -> Floats:
 @pytest.mark.parametrize("coarse", [BIT, np.deg2rad(1.0), np.deg2rad(20.0)])
 def test_an_axis_at_rest_and_one_of_nothing_are_at_no_end(coarse: float) -> None:
     whole, _ = turning(360.0)
-    filled = with_hidden(replace(whole, gyro=resting(coarse)), [])
+    filled = fill_saturation(replace(whole, gyro=resting(coarse)), [])
     assert filled.clipping_sigma is not None
     assert filled.clipping_sigma[:, 3].any()
     assert not filled.clipping_sigma[:, 4:].any()
     alone = replace(whole, gyro=resting(coarse) * np.array([0.0, 1.0, 1.0]))
-    assert with_hidden(alone, []) is alone
+    assert fill_saturation(alone, []) is alone
 
 
 def test_a_steady_turn_is_no_end_where_another_axis_reads_more() -> None:
     whole, read = turning(360.0)
     gyro = read.gyro.copy()
     gyro[:, 2] = np.clip(np.arange(600) * BIT * 100, 0.0, 0.7 * LIMIT)
-    filled = with_hidden(replace(whole, gyro=gyro), [])
+    filled = fill_saturation(replace(whole, gyro=gyro), [])
     assert filled.clipping_sigma is not None
     assert filled.clipping_sigma[:, 4].any()
     assert not filled.clipping_sigma[:, 5].any()
@@ -123,7 +122,7 @@ def test_the_smooth_top_of_a_coarse_reading_is_no_end_of_the_range() -> None:
     accel = np.tile([0.0, 0.0, GRAVITY], (5000, 1))
     smooth = ImuStream(np.round(1e9 * t).astype(np.int64), accel, np.round(rates / step) * step)
     assert np.count_nonzero(smooth.gyro == smooth.gyro.max()) > 50
-    assert with_hidden(smooth, []) is smooth
+    assert fill_saturation(smooth, []) is smooth
 
 
 def test_filled_in_readings_do_not_define_a_range() -> None:
@@ -138,7 +137,7 @@ def test_filled_in_readings_do_not_define_a_range() -> None:
 
 def test_only_a_step_over_saturated_readings_has_a_larger_covariance() -> None:
     _, read = turning(400.0)
-    filled = with_hidden(read, [])
+    filled = fill_saturation(read, [])
     none = np.zeros(3)
     estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
     state = NavigationState.begin(np.eye(4), estimate)
@@ -147,7 +146,7 @@ def test_only_a_step_over_saturated_readings_has_a_larger_covariance() -> None:
     calm, blind = ((int(read.stamps_ns[k]), int(read.stamps_ns[k + 10])) for k in (cut - 20, cut))
     sigmas = []
     for stream, span in ((read, calm), (filled, calm), (read, blind), (filled, blind)):
-        P = state.propagated(estimate.over(stream, np.array(span))).covariance
+        P = state.propagate(estimate.over(stream, np.array(span))).covariance
         sigmas.append([np.sqrt(np.diag(P[part, part])) for part in (PLACE, TURN, SPEED)])
     np.testing.assert_array_equal(sigmas[0], sigmas[1])
     assert filled.clipping_sigma is not None
@@ -167,7 +166,7 @@ def test_one_wrong_position_rings_in_no_later_velocity() -> None:
         T = np.eye(4)
         T[0, 3] = 0.01 if k == 5 else 0.0
         step = state.estimate.over(blind, stamps[[10 * k, 10 * k + 10]])
-        state = state.propagated(step).moved_to(T, sure)
+        state = state.propagate(step).moved_to(T, sure)
         speeds.append(float(np.linalg.norm(state.estimate.velocity)))
     assert speeds[5] > 0.1
     assert speeds[-1] < 0.01 * speeds[5]
@@ -186,7 +185,7 @@ def test_white_noise_of_a_cut_is_that_of_many_short_steps() -> None:
         for k in range(parts):
             at = stamps[[k * n // parts, (k + 1) * n // parts]]
             states = [
-                state.propagated(state.estimate.over(ImuStream(stamps, accel, np.zeros((101, 3)), lacks), at))
+                state.propagate(state.estimate.over(ImuStream(stamps, accel, np.zeros((101, 3)), lacks), at))
                 for state, lacks in zip(states, (None, hidden), strict=True)
             ]
         found.append((states[1].covariance - states[0].covariance)[:9, :9])
@@ -202,7 +201,7 @@ def test_saturation_adds_its_sigma_to_velocity_and_rotation() -> None:
     blind = replace(seen, clipping_sigma=np.tile([0.0, 3.0, 0.0, 0.0, 0.0, 0.5], (11, 1)))
     estimate = ImuEstimate(none, np.array([0, 0, -GRAVITY]), none, Gyroscope.of_bias(none, 1e-3), 1e-4 * np.eye(9))
     steps = [estimate.over(stream, stamps[[0, -1]]) for stream in (seen, blind)]
-    speeds = [estimate.propagated(step, np.eye(3)).covariance[:3, :3] for step in steps]
+    speeds = [estimate.propagate(step, np.eye(3)).covariance[:3, :3] for step in steps]
     turns = [estimate.gyroscope.turn_covariance(step) for step in steps]
     np.testing.assert_allclose(speeds[1] - speeds[0], (0.1 * 3.0) ** 2 * np.eye(3), atol=1e-9)
     np.testing.assert_allclose(turns[1] - turns[0], (0.1 * 0.5) ** 2 * np.eye(3), atol=1e-9)

@@ -142,7 +142,7 @@ def test_the_graph_restarts_after_a_scan_that_it_cannot_solve() -> None:
     unsolvable(motion)
     stamp = int(stamps()[10])
     prior = motion.sweep(stamp, Span())
-    motion.correct(stamp, prior.pose, prior, is_registered=False)
+    motion.correct(stamp, prior.pose, prior, has_registration=False)
     newest = motion.smoother.state()["begun"]
     assert newest is not None
     np.testing.assert_allclose(newest.T_world_imu, prior.pose @ extrinsics_of(drone()), atol=1e-9)

@@ -12,7 +12,7 @@ from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.imu import WheelStream
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import ConstantVelocity
-from lslam.odometry.inertial.wheel_calibration import OFFSET_S, YAW_OFFSET, YAW_SCALE, WheelCalibration, learnt
+from lslam.odometry.inertial.wheel_calibration import OFFSET_S, YAW_OFFSET, YAW_SCALE, WheelCalibration, learn_noise
 from lslam.odometry.inertial.wheel_motion import WheelMotion
 from lslam.registration.result import RegistrationResult
 
@@ -106,7 +106,7 @@ def test_the_jacobian_is_that_of_the_step() -> None:
 def noise_after(squares: Floats, known: float) -> float:
     noise, counts = np.array([1e-4]), np.ones(1)
     for square in squares:
-        noise, counts = learnt(noise, counts, np.array([square]), np.array([known]), np.ones(1), np.array([1e-8]))
+        noise, counts = learn_noise(noise, counts, np.array([square]), np.array([known]), np.ones(1), np.array([1e-8]))
     return float(noise[0])
 
 
@@ -180,7 +180,7 @@ def test_wheels_of_another_robot_get_no_weight() -> None:
     np.testing.assert_allclose(np.median(errors[40:]), np.median(steady[40:]), rtol=0.2)
     off, usual = (float(np.sqrt(np.mean((p[40:, :3, 3] - poses[40:, :3, 3]) ** 2))) for p in (found, without))
     assert off < 1.1 * usual
-    own, constant = motion.prior_errors() or (0.0, 0.0)
+    own, constant = motion.errors.medians or (0.0, 0.0)
     assert own > 5 * constant
 
 

@@ -12,15 +12,15 @@ from lslam.core.geometry import se3, so3
 from lslam.core.kernels import linalg
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan_result import ScanEquations
+from lslam.odometry.inertial.filter import BEGIN_SIGMA, STATE_SIZE, NavigationState
 from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.navigation_state import BEGIN_SIGMA, STATE_SIZE, NavigationState
 from lslam.odometry.inertial.window import (
     EACH,
     SHARED,
     Moment,
     Window,
-    loosened,
+    loosen,
     off_by,
 )
 
@@ -68,7 +68,7 @@ def begun(moment: Moment, sigma: float = 0.1) -> Window:
 def true_window(count: int) -> Window:
     window = begun(true_moment(0))
     for k in range(1, count):
-        window = window.extended(true_moment(k))
+        window = window.extend(true_moment(k))
     return window
 
 
@@ -78,7 +78,7 @@ def disturbed(window: Window, seed: int = 3) -> Window:
     size = SHARED + EACH * len(window.moments)
     d = rng.normal(0, 1, size) * 1e-3
     d[SHARED : SHARED + 6] = 0.0
-    return window.moved(d)
+    return window.retract(d)
 
 
 def test_increments_agree_with_the_truth() -> None:
@@ -101,7 +101,7 @@ def test_jacobians_are_derivatives() -> None:
         d[i] = step
         ends = []
         for sign in (1, -1):
-            there = window.moved(sign * d)
+            there = window.retract(sign * d)
             ends.append(there.residual(*there.moments, imu)[0])
         numerical[:, i] = (ends[0] - ends[1]) / (2 * step)
     turns, rates = slice(3, 6), np.r_[3:SHARED, SHARED + 12 : SHARED + 15]
@@ -121,7 +121,7 @@ def test_the_factor_of_a_scan_includes_the_lever_arm() -> None:
     assert moment.equations is not None
 
     def cost(d: Floats) -> float:
-        e = off_by(true_pose(0.0) @ T_IMU_SCAN, moment.moved(d).T_world_lidar)
+        e = off_by(true_pose(0.0) @ T_IMU_SCAN, moment.retract(d).T_world_lidar)
         return float(0.5 * e @ POINTS @ e)
 
     steps = 1e-6 * np.eye(EACH)
@@ -133,7 +133,7 @@ def test_a_walk_widens_the_covariance_of_what_walks_and_keeps_the_mean() -> None
     rng = np.random.default_rng(2)
     J = rng.normal(size=(30, 8))
     H, g = J.T @ J, rng.normal(size=8)
-    wider, gradient = loosened(H, g, slice(0, 3), 0.5)
+    wider, gradient = loosen(H, g, slice(0, 3), 0.5)
     expected = np.linalg.inv(H) + np.diag(np.repeat([0.5, 0.0], [3, 5]))
     np.testing.assert_allclose(np.linalg.inv(wider), expected, atol=1e-10)
     np.testing.assert_allclose(np.linalg.solve(wider, gradient), np.linalg.solve(H, g), atol=1e-10)
@@ -143,11 +143,11 @@ def test_a_marginalised_window_has_the_estimate_of_the_whole(monkeypatch: pytest
     """The batch of all moments, against one that marginalised half of them on the way, where gravity does not walk."""
     monkeypatch.setattr("lslam.odometry.inertial.window.GRAVITY_WALK", 1e-9)
     imu, batch = stream(), disturbed(true_window(8))
-    whole, H = batch.solved(imu)
+    whole, H = batch.solve(imu)
     slid = replace(batch, moments=batch.moments[:4])
     for k in range(4, 8):
-        slid = slid.solved(imu)[0].without_first(imu).extended(batch.moments[k])
-    part, H_part = slid.solved(imu)
+        slid = slid.solve(imu)[0].without_first(imu).extend(batch.moments[k])
+    part, H_part = slid.solve(imu)
     assert len(part.moments) == 4
     tail = np.r_[0:SHARED, len(H) - 4 * EACH : len(H)]
     sigma = np.sqrt(np.diag(linalg.inverse(H))[tail])
@@ -169,7 +169,7 @@ def test_biases_and_velocity_are_found() -> None:
     for k in range(1, 25):
         m = window.moments[-1]
         guess = replace(true_moment(k), velocity=m.velocity, accel_bias=m.accel_bias, gyro_bias=m.gyro_bias)
-        window, H = window.extended(guess).solved(imu)
+        window, H = window.extend(guess).solve(imu)
         if len(window.moments) > 5:
             window = window.without_first(imu)
     newest = window.moments[-1]
@@ -193,7 +193,7 @@ def like() -> ImuEstimate:
 def test_an_unsolvable_window_is_unchanged_and_has_no_covariance() -> None:
     window = begun(true_moment(0))
     window = replace(window, past=replace(window.past, information=-window.past.information))
-    found, H = window.solved(stream())
+    found, H = window.solve(stream())
     np.testing.assert_array_equal(found.moments[0].T_world_imu, window.moments[0].T_world_imu)
     newest = found.newest(H, NavigationState(np.eye(4), like(), np.zeros((STATE_SIZE, STATE_SIZE))))
     assert not np.isfinite(newest.covariance).all()

@@ -17,7 +17,7 @@ from lslam.core.types.scan import Scan
 from lslam.core.types.scan_result import MotionCheck, ScanResult
 from lslam.io.formats.state_files import read_state, write_state
 from lslam.odometry.integrity.alerts import alerts
-from lslam.odometry.integrity.monitor import IntegrityMonitor, Seen
+from lslam.odometry.integrity.monitor import IntegrityMonitor, ReferenceScan
 from lslam.registration.preprocessing.prepare import PreparedPoints
 from lslam.simulation.lidar_models import LIDARS
 from lslam.simulation.scenarios import simulate
@@ -83,7 +83,7 @@ def test_the_monitor_resumes_to_the_last_bit(tmp_path: Path) -> None:
     whole, again, (_, true) = new_monitor(), new_monitor(), street()
     see(whole, true, end=13)
     write_state(tmp_path / "monitor.npz", whole.state())
-    again.restore(read_state(tmp_path / "monitor.npz", (MotionCheck, PreparedPoints, Seen)))
+    again.restore(read_state(tmp_path / "monitor.npz", (MotionCheck, PreparedPoints, ReferenceScan)))
     for monitor in (whole, again):
         see(monitor, true, begin=13)
     assert len(again.checks) == len(whole.checks) == 6

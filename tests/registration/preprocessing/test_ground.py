@@ -123,4 +123,4 @@ def test_the_option_reaches_every_methods_points_and_is_off_by_default() -> None
     in_range = set(gate_points(points, PreprocessConfig()).tolist())
     assert set(gate_points(points, config).tolist()) == expected & in_range
     assert len(in_range) > 0.9 * len(points)
-    assert prepare_points(points, config).used < 0.7 * prepare_points(points, PreprocessConfig()).used
+    assert prepare_points(points, config).in_range < 0.7 * prepare_points(points, PreprocessConfig()).in_range

@@ -48,13 +48,13 @@ def test_a_line_ends_where_it_turns_and_where_it_has_a_gap() -> None:
     xyz = np.stack([np.cos(off), np.sin(off), np.zeros(len(off))], axis=1) * 7.0
     steps = np.append(np.linalg.norm(np.diff(xyz / 7.0, axis=0), axis=1), np.inf)
     starts = np.array([0, len(off)], np.int64)
-    found = petals.cut(xyz, steps, starts, np.radians(4.0), np.radians(2.0))
+    found = petals.cut_lines(xyz, steps, starts, np.radians(4.0), np.radians(2.0))
     assert found.tolist() == [0, 28, 54, 70, 75]
     # What wavers by less than a turn is one line.
     wavering = xyz[:20].copy()
     wavering[7] = xyz[6]
     steps = np.append(np.linalg.norm(np.diff(wavering / 7.0, axis=0), axis=1), np.inf)
-    assert petals.cut(wavering, steps, np.array([0, 20]), np.radians(4.0), np.radians(2.0)).tolist() == [0, 20]
+    assert petals.cut_lines(wavering, steps, np.array([0, 20]), np.radians(4.0), np.radians(2.0)).tolist() == [0, 20]
 
 
 def test_edges_lie_where_walls_meet_and_planes_do_not() -> None:

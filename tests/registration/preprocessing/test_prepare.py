@@ -26,7 +26,7 @@ def street(n: int, seed: int = 0, length: float = 60.0) -> NDArray[np.float32]:
 
 def same(a: PreparedPoints, b: PreparedPoints) -> bool:
     fields = ("map_points", "source", "scatter")
-    return a.used == b.used and all(getattr(a, f).tobytes() == getattr(b, f).tobytes() for f in fields)
+    return a.in_range == b.in_range and all(getattr(a, f).tobytes() == getattr(b, f).tobytes() for f in fields)
 
 
 def test_map_points_are_centroids_and_source_points_centroids_of_these() -> None:
@@ -39,7 +39,7 @@ def test_map_points_are_centroids_and_source_points_centroids_of_these() -> None
     np.testing.assert_array_equal(out.map_points, map_points)
     np.testing.assert_array_equal(out.source, source)
     np.testing.assert_array_equal(out.scatter, scatter)
-    assert out.used == len(kept) < len(points)
+    assert out.in_range == len(kept) < len(points)
     assert [a.dtype.name for a in (out.map_points, out.source, out.scatter)] == ["float32", "float64", "float64"]
 
 
@@ -66,7 +66,7 @@ def test_the_random_share_is_seeded_scan_by_scan() -> None:
     assert same(a, b)
     assert not same(a, other)
     assert not same(a, prepare_points(points, PreprocessConfig(downsample="random", random_share=0.2, seed=1), 3))
-    assert len(a.source) == round(0.2 * a.used)
+    assert len(a.source) == round(0.2 * a.in_range)
     kept = points[gate_points(points, config)].astype(np.float64)
     rows = {tuple(p) for p in kept.tolist()}
     assert all(tuple(p) in rows for p in a.source.tolist())
@@ -106,7 +106,7 @@ def test_bad_points_change_nothing_but_themselves() -> None:
 def test_a_scan_without_usable_points_prepares_to_nothing(points: NDArray[Any]) -> None:
     for kind in ("target", "grid", "first", "random", "none"):
         out = prepare_points(points, PreprocessConfig(downsample=kind))
-        assert out.used == len(out.map_points) == len(out.source) == len(out.scatter) == 0
+        assert out.in_range == len(out.map_points) == len(out.source) == len(out.scatter) == 0
         assert out.source.shape[1:] == (3,)
 
 
@@ -116,7 +116,7 @@ def test_other_types_columns_and_layouts_are_taken_as_they_are() -> None:
     wide = np.column_stack([points, np.ones(len(points))])
     for variant in (points.astype(np.float64), wide, np.asfortranarray(points), wide.astype(np.float32)[:, :3]):
         assert same(prepare_points(variant, PreprocessConfig()), expected)
-    assert prepare_points(np.array([[3, 4, 5], [6, 7, 8]]), PreprocessConfig()).used == 2
+    assert prepare_points(np.array([[3, 4, 5], [6, 7, 8]]), PreprocessConfig()).in_range == 2
 
 
 def test_the_callers_points_are_left_alone() -> None:

@@ -17,8 +17,15 @@ from lslam.core.config import load_config
 from lslam.core.errors import ConfigError, InputError, UsageError
 from lslam.core.types.scan import Scan
 from lslam.io.readers import open_sequence
-from lslam.registration.preprocessing.beams import elevation_borders, ring_gap
-from lslam.registration.preprocessing.rings import RingRule, decide_rings, elevations, organised_rows, rings_by_order
+from lslam.registration.preprocessing.rings import (
+    RingRule,
+    decide_rings,
+    elevation_borders,
+    elevations,
+    organised_rows,
+    ring_gap,
+    rings_by_order,
+)
 from lslam.simulation.scenarios import simulate
 
 

@@ -9,9 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from lslam.core.types.scan import Scan
-from lslam.registration.preprocessing.clock_proposals import azimuth_proposal, propose_clock
-from lslam.registration.preprocessing.firing_order import follow_rings, follow_sweep
-from lslam.registration.preprocessing.sweep_clock import SweepClock, is_same_motion
+from lslam.registration.preprocessing.sweep_clock import (
+    SweepClock,
+    azimuth_proposal,
+    follow_rings,
+    follow_sweep,
+    is_same_motion,
+    propose_clock,
+)
 
 ROWS, COLUMNS, SECONDS = 16, 512, 0.1
 NOMINAL = SweepClock("order", SECONDS)
