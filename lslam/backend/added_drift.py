@@ -43,7 +43,7 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_
         astray = [poses[0]]
         for step, error in zip(steps, errors, strict=True):
             astray.append(se3.normalise(astray[-1] @ step @ error))
-        return _moved(results, np.stack(astray))
+        return _move(results, np.stack(astray))
     directions, sides = _courses(way, config)
     # The horizon sinks towards the direction.
     across = np.stack([-directions[:, 1], directions[:, 0]], axis=1)
@@ -57,7 +57,7 @@ def with_drift(results: Sequence[ScanResult], config: DebugConfig, tilt_deg_per_
         pose[:3, :3] = turn @ pose[:3, :3]
         pose[:3, 3] += shift
         drifted.append(se3.normalise(pose))
-    return _moved(results, np.stack(drifted))
+    return _move(results, np.stack(drifted))
 
 
 def _courses(way: Floats, config: DebugConfig) -> tuple[Floats, Floats]:
@@ -134,19 +134,19 @@ def describe(config: DebugConfig) -> str:
     )
 
 
-def _moved(results: Sequence[ScanResult], poses: Floats) -> list[ScanResult]:
+def _move(results: Sequence[ScanResult], poses: Floats) -> list[ScanResult]:
     turns = so3.normalise(poses[:, :3, :3] @ np.stack([r.T_world_lidar[:3, :3].T for r in results]))
 
-    def turned(covariance: Floats | None, R: Floats) -> Floats | None:
+    def rotate(covariance: Floats | None, R: Floats) -> Floats | None:
         return None if covariance is None else noise.rotate(covariance, R)
 
     return [
         replace(
             result,
             T_world_lidar=pose,
-            covariance=turned(result.covariance, R),
-            registration_covariance=turned(result.registration_covariance, R),
-            points_covariance=turned(result.points_covariance, R),
+            covariance=rotate(result.covariance, R),
+            registration_covariance=rotate(result.registration_covariance, R),
+            points_covariance=rotate(result.points_covariance, R),
         )
         for result, pose, R in zip(results, poses, turns, strict=True)
     ]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lslam.backend.graph.pose_prior import PosePrior
+from lslam.backend.graph.marginals import PosePrior
 from lslam.backend.kernels import plane_adjustment
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.stopping import checking
@@ -86,7 +86,7 @@ class SweptPoints:
         gap = np.maximum(knots[after] - knots[at], 1)
         return SweptPoints(self.points, at, (place - knots[at]) / gap)
 
-    def moved(self, poses: Floats, corrections: Floats) -> Floats:
+    def move(self, poses: Floats, corrections: Floats) -> Floats:
         """The points (N, 3) after `corrections` (K, 6) of the `poses` (K, 4, 4)."""
         origins, turns = np.ascontiguousarray(poses[:, :3, 3]), so3.exp(corrections[:, 3:])
         points = np.ascontiguousarray(self.points)
@@ -94,7 +94,7 @@ class SweptPoints:
 
 
 @dataclass(frozen=True)
-class Adjusted:
+class Adjustment:
     """poses : (K, 4, 4); points : (N, 3) m, moved with them; rounds : how often planes were looked for."""
 
     poses: Floats
@@ -103,9 +103,9 @@ class Adjusted:
 
 
 def adjust(
-    poses: Floats, swept: SweptPoints, used: Bools, prior: PosePrior | None = None, numbers: Longs = NO_NUMBERS
-) -> Adjusted:
-    """Correct the `poses` (K, 4, 4) for the planes in the `used` (N,) part of the points; the rest moves with them.
+    poses: Floats, sweep: SweptPoints, mask: Bools, prior: PosePrior | None = None, numbers: Longs = NO_NUMBERS
+) -> Adjustment:
+    """Correct the `poses` (K, 4, 4) for the planes in the `mask` (N,) part of the points; the rest moves with them.
 
     prior : what else is known of some poses, of which these are the `numbers`, -1 for none
     Where nothing holds the run as a whole, the mean correction is about zero.
@@ -116,27 +116,27 @@ def adjust(
         places = SweptPoints(poses[:, :3, 3], np.arange(len(poses)), np.zeros(len(poses))).on_knots(knots)
         total = np.zeros((len(knots), 6))
         for _ in checking(range(level.rounds)):
-            seen = swept.on_knots(knots)
+            seen = sweep.on_knots(knots)
             on_knots = None if prior is None else _knot_prior(prior, numbers, poses, places, poses[knots])
-            corrections = _corrections(poses[knots], seen.select(used), level, total, on_knots)
+            corrections = _corrections(poses[knots], seen.select(mask), level, total, on_knots)
             if corrections is None:
                 break
             if not level.is_free:
                 total += corrections
-            swept = replace(swept, points=seen.moved(poses[knots], corrections))
-            poses = _moved(poses, places, poses[knots], corrections)
+            sweep = replace(sweep, points=seen.move(poses[knots], corrections))
+            poses = _move_poses(poses, places, poses[knots], corrections)
             places = replace(places, points=poses[:, :3, 3])
             rounds += 1
             if float(np.sqrt(np.mean(np.sum(corrections[:, :3] ** 2, axis=1)))) < level.settled_m:
                 break
-    return Adjusted(poses, swept.points, rounds)
+    return Adjustment(poses, sweep.points, rounds)
 
 
-def _moved(poses: Floats, places: SweptPoints, knots: Floats, corrections: Floats) -> Floats:
+def _move_poses(poses: Floats, places: SweptPoints, knots: Floats, corrections: Floats) -> Floats:
     """The `poses` (K, 4, 4) at `places` after `corrections` (M, 6) of the poses `knots` (M, 4, 4)."""
     after, share = np.minimum(places.poses + 1, len(knots) - 1), places.shares[:, None]
     turns = (1.0 - share) * corrections[places.poses, 3:] + share * corrections[after, 3:]
-    return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], places.moved(knots, corrections)))
+    return se3.normalise(se3.make(so3.exp(turns) @ poses[:, :3, :3], places.move(knots, corrections)))
 
 
 @dataclass(frozen=True)
@@ -189,20 +189,20 @@ def _knot_prior(prior: PosePrior, numbers: Longs, poses: Floats, places: SweptPo
 
 
 def _corrections(
-    poses: Floats, swept: SweptPoints, level: AdjustmentLevel, total: Floats, prior: _KnotPrior | None
+    poses: Floats, sweep: SweptPoints, level: AdjustmentLevel, total: Floats, prior: _KnotPrior | None
 ) -> Floats | None:
     """(K, 6) corrections of one Gauss-Newton step; None without planes."""
-    planes = find_planes(swept.points, swept.poses, level.flatness)
+    planes = find_planes(sweep.points, sweep.poses, level.flatness)
     on_plane = planes >= 0
     if not on_plane.any():
         return None
-    planes, swept = planes[on_plane], swept.select(on_plane)
+    planes, sweep = planes[on_plane], sweep.select(on_plane)
     order = np.argsort(planes, kind="stable")
-    planes, at = planes[order], swept.poses[order]
+    planes, at = planes[order], sweep.poses[order]
     is_first = np.append(True, (np.diff(planes) != 0) | (np.diff(at) != 0))
     sighting = np.cumsum(is_first) - 1
-    numbers, means, covariances = plane_adjustment.sums(sighting, int(sighting[-1]) + 1, swept.points[order])
-    shares = np.bincount(sighting, swept.shares[order]) / numbers
+    numbers, means, covariances = plane_adjustment.sums(sighting, int(sighting[-1]) + 1, sweep.points[order])
+    shares = np.bincount(sighting, sweep.shares[order]) / numbers
     seen = planes[is_first]
     starts, first = np.searchsorted(seen, np.arange(int(seen[-1]) + 2)), at[is_first]
     H, beside, g, coupling, own = plane_adjustment.equations(

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from lslam.backend.fix_faults import fit_pose
 from lslam.backend.georeferencing import LEVELLED, UNLEVELLED, Placement, on_earth
-from lslam.backend.graph.consistency import Drift, judge_loops
-from lslam.backend.graph.gnss_alignment import fit_pose
+from lslam.backend.graph.fix_errors import heading_change
 from lslam.backend.graph.odometry_constraints import odometry_constraints
-from lslam.backend.graph.pose_graph import from_held
+from lslam.backend.graph.pose_graph import Drift, apply_manual, judge_loops
 from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.backend.manual import stamp_of
 from lslam.core.config import Config
@@ -21,7 +21,7 @@ from lslam.core.geometry import geodesy, noise, se3, so3
 from lslam.core.geometry.noise import quantile
 from lslam.core.geometry.se3 import poses_at
 from lslam.core.printable import count_of
-from lslam.core.types.arrays import Floats, Longs
+from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import Constraint, ControlPoint, ControlResidual, KnownPair, LoopCandidate
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult
@@ -51,16 +51,15 @@ def with_control(
 
     Raises UsageError for coordinates that PROJ does not know or that are none of a place.
     """
-    on_earth = _on_earth(points, config.gnss.geoid)
-    stamps = np.array([stamp_of(point.at, results) for point in points])
-    own = _seen(points, stamps, results)
+    survey = _Survey(points, results, config.gnss.geoid)
+    on_earth, own = survey.on_earth, survey.own
     sigmas = np.stack([point.sigma for point in points])
     reference = placement.georeference
     if reference is None:
         direction = world_up_of(config.preprocess, results[0].T_world_lidar) if up is None else up
         level = so3.least_rotation(direction, np.array([0.0, 0.0, 1.0]))
         enu = geodesy.to_local(on_earth, on_earth[0])
-        T = _aligned(own @ level.T, enu, sigmas)
+        T = _align_level(own @ level.T, enu, sigmas)
         if T is None:
             return replace(
                 placement,
@@ -75,13 +74,13 @@ def with_control(
         enu, tilt = geodesy.to_local(on_earth, reference.origin), placement.tilt_sigma
         reference = reference if reference.epsg else _in_crs(reference, points, config)
     fixes = [
-        _held(position, sigma, place, int(stamp), results, keyframes)
-        for position, sigma, place, stamp in zip(enu, sigmas, own, stamps, strict=True)
+        _position_fix(position, sigma, place, int(stamp), results, keyframes)
+        for position, sigma, place, stamp in zip(enu, sigmas, own, survey.stamps, strict=True)
     ]
     return replace(placement, georeference=reference, fixes=(*placement.fixes, *fixes), tilt_sigma=tilt)
 
 
-def _held(
+def _position_fix(
     position: Floats, sigma: Floats, own: Floats, stamp_ns: int, results: Many[ScanResult], keyframes: Many[Keyframe]
 ) -> PositionFix:
     """The factor, between the keyframes around the instant."""
@@ -96,12 +95,10 @@ def control_residuals(
     points: Many[ControlPoint], results: Many[ScanResult], georeference: Georeference, geoid: str = ""
 ) -> list[ControlResidual]:
     """What is left of the points at the final poses."""
-    on_earth = _on_earth(points, geoid)
-    stamps = np.array([stamp_of(point.at, results) for point in points])
-    off = geodesy.to_local(on_earth, georeference.origin) - se3.apply(
-        georeference.T_enu_world, _seen(points, stamps, results)
-    )
-    return [ControlResidual(*one) for one in zip(points, stamps.tolist(), off, on_earth, strict=True)]
+    survey = _Survey(points, results, geoid)
+    there = geodesy.to_local(survey.on_earth, georeference.origin)
+    off = there - se3.apply(georeference.T_enu_world, survey.own)
+    return [ControlResidual(*one) for one in zip(points, survey.stamps.tolist(), off, survey.on_earth, strict=True)]
 
 
 def against_odometry(
@@ -118,11 +115,11 @@ def against_odometry(
     """
     if len(points) < 2 or len(keyframes) < 2:
         return []
-    stamps = np.array([stamp_of(point.at, results) for point in points])
-    order = np.argsort(stamps, kind="stable")
-    there = _on_earth(points, geoid)[order]
-    enu, seen = geodesy.to_local(there, there[0]), _seen(points, stamps, results)[order]
-    nearest = np.abs(np.array([k.stamp_ns for k in keyframes]) - stamps[order][:, None]).argmin(1)
+    survey = _Survey(points, results, geoid)
+    order = np.argsort(survey.stamps, kind="stable")
+    there, seen = survey.on_earth[order], survey.own[order]
+    enu = geodesy.to_local(there, there[0])
+    nearest = np.abs(np.array([k.stamp_ns for k in keyframes]) - survey.stamps[order][:, None]).argmin(1)
     own = np.array([float((points[i].sigma ** 2).max()) for i in order])
     sigma = np.sqrt(drift.covariance(nearest[:-1], nearest[1:])[:, 0, 0] + own[:-1] + own[1:])
     off = np.linalg.norm(np.diff(enu, axis=0), axis=1) - np.linalg.norm(np.diff(seen, axis=0), axis=1)
@@ -137,13 +134,10 @@ def against_odometry(
     return _some(texts, "pairs of control points")
 
 
-def as_surveyed_and_seen(
-    points: Many[ControlPoint], results: Many[ScanResult], geoid: str = ""
-) -> tuple[Floats, Floats]:
+def control_positions(points: Many[ControlPoint], results: Many[ScanResult], geoid: str = "") -> tuple[Floats, Floats]:
     """(N, 3) m, of the points by their survey, east, north, up from the first, and by the results, in their world."""
-    there = _on_earth(points, geoid)
-    stamps = np.array([stamp_of(point.at, results) for point in points])
-    return geodesy.to_local(there, there[0]), _seen(points, stamps, results)
+    survey = _Survey(points, results, geoid)
+    return geodesy.to_local(survey.on_earth, survey.on_earth[0]), survey.own
 
 
 def control_facts(residuals: Many[ControlResidual]) -> dict[str, float]:
@@ -174,20 +168,21 @@ def _some(texts: list[str], what: str) -> list[str]:
     return [*texts[:MOST_SAID], f"and {more} more {what}"] if more > 0 else texts
 
 
-def _on_earth(points: Many[ControlPoint], geoid: str) -> Floats:
-    """(N, 3) lat, lon (deg), height (m)."""
-    return np.concatenate([to_wgs84(p.position[None], p.epsg, p.height_epsg, geoid) for p in points])
+class _Survey:
+    """Control points as they were surveyed, and where results have them.
+
+    on_earth : (N, 3) lat, lon (deg), height (m); stamps : (N,) ns; own : (N, 3) m, in the world of the results
+    """
+
+    def __init__(self, points: Many[ControlPoint], results: Many[ScanResult], geoid: str) -> None:
+        self.on_earth = np.concatenate([to_wgs84(p.position[None], p.epsg, p.height_epsg, geoid) for p in points])
+        self.stamps = np.array([stamp_of(point.at, results) for point in points])
+        stamps, poses = np.array([r.stamp_ns for r in results]), np.stack([r.T_world_lidar for r in results])
+        at, arms = poses_at(stamps, poses, self.stamps), np.stack([p.point_lidar for p in points])
+        self.own: Floats = np.einsum("nij,nj->ni", at[:, :3, :3], arms) + at[:, :3, 3]
 
 
-def _seen(points: Many[ControlPoint], stamps: Longs, results: Many[ScanResult]) -> Floats:
-    """(N, 3) m, where the results have the points, in their world."""
-    poses = poses_at(np.array([r.stamp_ns for r in results]), np.stack([r.T_world_lidar for r in results]), stamps)
-    return np.asarray(
-        np.einsum("nij,nj->ni", poses[:, :3, :3], np.stack([p.point_lidar for p in points])) + poses[:, :3, 3]
-    )
-
-
-def _aligned(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
+def _align_level(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
     """(4, 4) by heading and place, least squares of points (N, 3) of a level world; None where they leave the heading vague."""
     weights = 1.0 / sigmas[:, 0] ** 2
     weights /= weights.sum()
@@ -195,8 +190,7 @@ def _aligned(own: Floats, enu: Floats, sigmas: Floats) -> Floats | None:
     spread = weights @ (a[:, :2] ** 2).sum(1)
     if float(np.sqrt((weights @ sigmas[:, 0] ** 2) / len(own))) > VAGUE * float(np.sqrt(spread)):
         return None
-    across = weights @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    R = so3.exp(np.array([0.0, 0.0, np.arctan2(across, weights @ (a[:, :2] * b[:, :2]).sum(1))]))
+    R = so3.exp(np.array([0.0, 0.0, heading_change(a, b, weights)]))
     return se3.make(R, weights @ enu - R @ (weights @ own))
 
 
@@ -216,15 +210,15 @@ def _in_crs(georeference: Georeference, points: Many[ControlPoint], config: Conf
     return given
 
 
-def where_held(
+def place_keyframes(
     keyframes: list[Keyframe],
-    known: list[LoopCandidate],
+    pairs: list[LoopCandidate],
     points: Many[ControlPoint],
     results: list[ScanResult],
     config: Config,
 ) -> list[Keyframe]:
     """The keyframes where odometry, known pairs and control points put them: further loop closures are searched from there."""
-    loops = [c.constraint for c in known if c.is_accepted and c.constraint is not None]
+    loops = [c.constraint for c in pairs if c.is_accepted and c.constraint is not None]
     if len(keyframes) < 2 or not (loops or points):
         return keyframes
     graph, R = _graph_of(keyframes, loops, results, config), np.eye(3)
@@ -233,7 +227,7 @@ def where_held(
         if placement.georeference is not None:
             graph, R = on_earth(graph, placement), placement.georeference.T_enu_world[:3, :3]
     try:
-        poses = from_held(graph, config.graph).poses
+        poses = apply_manual(graph, config.graph).poses
     except (GraphError, np.linalg.LinAlgError) as error:
         log.debug("known pairs and control points alone: %s", error)  # said where all of it is solved
         return keyframes
@@ -245,7 +239,7 @@ def where_held(
 
 def doubts(
     keyframes: list[Keyframe],
-    known: list[LoopCandidate],
+    candidates: list[LoopCandidate],
     pairs: Many[KnownPair],
     results: list[ScanResult],
     config: Config,
@@ -253,10 +247,12 @@ def doubts(
     """A sentence for each known pair that does not register, and for each that odometry contradicts, which holds all the same."""
     texts = [
         f"{pair.source}: the scans of the known pair do not close a loop: {candidate.reason}"
-        for pair, candidate in zip(pairs, known, strict=True)
+        for pair, candidate in zip(pairs, candidates, strict=True)
         if not candidate.is_accepted
     ]
-    held = [(p, c.constraint) for p, c in zip(pairs, known, strict=True) if c.is_accepted and c.constraint is not None]
+    held = [
+        (p, c.constraint) for p, c in zip(pairs, candidates, strict=True) if c.is_accepted and c.constraint is not None
+    ]
     if held:
         graph = _graph_of(keyframes, [constraint for _, constraint in held], results, config)
         reasons = judge_loops(graph, config.graph)

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from lslam.backend.fix_faults import (
     Faults,
     Fixes,
-    aligned,
+    GnssAlignment,
+    align_fixes,
     clock_of,
-    clock_said,
+    describe_clock,
     on_clock_of_scans,
     with_actual_sigmas,
 )
 from lslam.backend.graph.drift import chains, drift_covariance
 from lslam.backend.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
-from lslam.backend.graph.gnss_alignment import GnssAlignment
 from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.core.config.backend import GnssConfig, GraphConfig
 from lslam.core.config.config import Config
@@ -114,8 +114,7 @@ def place(
     """
     stream = sequence.gnss
     assert stream is not None
-    T_lidar_gnss = sequence.calibration.T_lidar_gnss
-    arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
+    arm = _antenna(sequence)
     mounted = world_up_of(config.preprocess, results[0].T_world_lidar)
     direction, sigma = (mounted, UNLEVELLED) if up is None else (up, LEVELLED)
     level = so3.least_rotation(direction, np.array([0.0, 0.0, 1.0]))
@@ -123,11 +122,11 @@ def place(
     if isinstance(fixes, str):
         return Placement(problem=fixes)
     fixes, faults = with_actual_sigmas(fixes, level, config.gnss.max_sigma, RIGHT_PROBABILITY, faults)
-    alignment, fixes, faults = aligned(fixes, direction, sigma, MIN_FIXES, faults)
+    alignment, fixes, faults = align_fixes(fixes, direction, sigma, MIN_FIXES, faults)
     if alignment is None:
         return Placement(
             faults=faults,
-            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.given} fixes, and "
+            problem=f"GNSS: no place and heading on the Earth fits half of {fixes.count} fixes, and "
             f"{MIN_FIXES} at the least: all rejected",
         )
     georeference, shift = _at_first(alignment, fixes, config.gnss)
@@ -142,7 +141,7 @@ def place(
     if config.gnss.mode == "graph":
         fix_noise, walk = _fix_noise(fixes, alignment, keyframes, graph, config)
     factors = _as_factors(fixes, alignment, shift, results, keyframes, fix_noise)
-    problem = _elsewhere(alignment) or contradicted(alignment, fixes)
+    problem = _elsewhere(alignment) or describe_outliers(alignment, fixes)
     return Placement(georeference, factors, fix_noise, walk, problem, faults=faults)
 
 
@@ -168,10 +167,14 @@ def on_earth(graph: PoseGraph, placement: Placement) -> PoseGraph:
 def final_fixes(sequence: Sequence, results: Many[ScanResult], config: Config) -> Fixes | None:
     """The fixes of a recording beside its final poses, whether they were used or not; None where too few are usable."""
     assert sequence.gnss is not None
-    T_lidar_gnss = sequence.calibration.T_lidar_gnss
-    arm = np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
-    fixes = _usable(sequence.gnss, results, arm, config.gnss, config.graph)
+    fixes = _usable(sequence.gnss, results, _antenna(sequence), config.gnss, config.graph)
     return None if isinstance(fixes, str) else fixes
+
+
+def _antenna(sequence: Sequence) -> Floats:
+    """(3,) m, in the axes of the LiDAR, at its origin where the calibration does not say."""
+    T_lidar_gnss = sequence.calibration.T_lidar_gnss
+    return np.zeros(3) if T_lidar_gnss is None else T_lidar_gnss[:3, 3]
 
 
 def _on_one_clock(
@@ -189,7 +192,7 @@ def _on_one_clock(
     if offset is None or isinstance(again, str):
         return fixes, Faults()
     facts = {"seconds": round(-offset.seconds, 3), "sigma_s": round(offset.sigma, 3)}
-    return again, Faults().and_another(clock_said(offset), fixes_late=facts)
+    return again, Faults().and_another(describe_clock(offset), fixes_late=facts)
 
 
 def _usable(
@@ -235,7 +238,7 @@ def _at_first(alignment: GnssAlignment, fixes: Fixes, config: GnssConfig) -> tup
         T_enu_world=shift @ alignment.T_enu_world,
         epsg=config.crs,
         method="graph" if config.mode == "graph" else "fit",
-        fixes=fixes.given,
+        fixes=fixes.count,
         used=int(alignment.inliers.sum()),
         rmse_horizontal=float(np.sqrt((residuals[:, :2] ** 2).sum(1).mean())),
         rmse_vertical=float(np.sqrt((heights**2).mean())) if len(heights) else float("nan"),
@@ -255,7 +258,7 @@ def _elsewhere(alignment: GnssAlignment) -> str:
     )
 
 
-def contradicted(alignment: GnssAlignment, fixes: Fixes) -> str:
+def describe_outliers(alignment: GnssAlignment, fixes: Fixes) -> str:
     """A sentence about fixes that odometry rejects, and whether they agree with each other; empty where insignificant."""
     from scipy.special import bdtrc, chdtrc
 
@@ -296,7 +299,7 @@ def _fix_noise(
     Neither where the recording states no sigmas.
     """
     good = alignment.inliers
-    if not (fixes.is_stated or fixes.is_refuted):
+    if not (fixes.has_stated_sigmas or fixes.is_overconfident):
         return None, 0.0
     constant, unit = (noise.rotate(chain, alignment.T_enu_world[:3, :3]) for chain in chains(graph, config.graph))
     metre = drift_covariance(1.0, config.graph)
@@ -309,7 +312,7 @@ def _fix_noise(
         (fixes.positions - alignment.residuals)[good],
         RIGHT_PROBABILITY,
         drift,
-        config.gnss.max_sigma if fixes.is_refuted else None,
+        config.gnss.max_sigma if fixes.is_overconfident else None,
     )
     if fix_noise is not None:
         log.info(

@@ -41,7 +41,7 @@ class _Row:
     cells: dict[str, str]
 
     @property
-    def said(self) -> str:
+    def place(self) -> str:
         """The place, for messages."""
         return f"{self.path.name}, line {self.line}"
 
@@ -65,7 +65,7 @@ class _Row:
             raise self.error(f"{names[0]} = {text!r} is no number")
         return value
 
-    def needed(self, *names: str) -> float:
+    def require(self, *names: str) -> float:
         """Likewise, where it must not be empty."""
         value = self.number(*names)
         if value is None:
@@ -86,10 +86,10 @@ class _Row:
             number = whole_number(scan)
             if number is None:
                 raise self.error(f"scan{suffix} = {scan!r} is no number of a scan")
-            return Instant(self.said, scan=number)
+            return Instant(self.place, scan=number)
         if not (seconds or ns):
             raise self.error(f"scan{suffix} or stamp{suffix} is empty")
-        return Instant(self.said, stamp_ns=seconds_to_ns(seconds or ns, self.path, self.line, 10**9 if seconds else 1))
+        return Instant(self.place, stamp_ns=seconds_to_ns(seconds or ns, self.path, self.line, 10**9 if seconds else 1))
 
 
 def read_named_pairs(path: Path) -> list[NamedPair]:
@@ -135,8 +135,8 @@ def read_control_points(path: Path) -> list[ControlPoint]:
         if sigma is None:
             raise row.error("sigma is empty: a point without it holds nothing")
         spread = np.array([sigma, sigma, row.size("sigma_z", "sigma_z_m") or sigma])
-        position = np.array([row.needed(*X), row.needed(*Y), row.needed(*Z)])
-        points.append(ControlPoint(row.instant(), position, spread, epsg, _seen(row), height_epsg))
+        position = np.array([row.require(*X), row.require(*Y), row.require(*Z)])
+        points.append(ControlPoint(row.instant(), position, spread, epsg, _lidar_point(row), height_epsg))
     if not points:
         raise InputError(f"{path} has no control points below its header")
     return points
@@ -154,7 +154,7 @@ def write_control(path: Path, residuals: Iterable[ControlResidual]) -> None:
     write_text(path, "\n".join(rows) + "\n")
 
 
-def _seen(row: _Row) -> Floats:
+def _lidar_point(row: _Row) -> Floats:
     values = [row.number(f"lidar_{axis}", f"lidar_{axis}_m") for axis in "xyz"]
     if any(value is None for value in values) and any(value is not None for value in values):
         raise row.error("lidar_x, lidar_y and lidar_z go together")
@@ -167,20 +167,20 @@ def _is_comment(line: str, names: set[str]) -> bool:
     return text.startswith("#") and not names & {word.strip().lower() for word in re.split("[;,\\s]", text.lstrip("#"))}
 
 
-def _rows(path: Path, needed: Many[tuple[str, ...]]) -> Iterator[_Row]:
-    """The lines below the header, which has one column of each of the `needed`."""
+def _rows(path: Path, columns: Many[tuple[str, ...]]) -> Iterator[_Row]:
+    """The lines below the header, which has one column of each of the `columns`."""
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read: {cause(error)}") from None
-    names = {name for one in needed for name in one}
+    names = {name for one in columns for name in one}
     numbered = [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not _is_comment(line, names)]
     if not numbered:
         raise InputError(f"{path} is empty")
     separator = separator_of(numbered[0][1])
     table = [split_cells(line.strip(), separator) for _, line in numbered]
     header = [name.strip().lstrip("#").strip().lower() for name in table[0]]
-    missing = [names for names in needed if not any(name in header for name in names)]
+    missing = [names for names in columns if not any(name in header for name in names)]
     if missing:
         raise InputError(
             f"{path}, line {numbered[0][0]}: no column {' or '.join(missing[0])}; the file has {', '.join(header)}"
@@ -266,7 +266,7 @@ def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes:
         elif (min(a, b), max(a, b)) in numbers:
             found.problems.append(f"{pair.first.source}: the pair is named twice, it counts once")
         else:
-            found.known.append(_known(pair, ends, results, keyframes))
+            found.known.append(_keyframe_pair(pair, ends, results, keyframes))
     found.problems.extend(
         f"{known.source}: the pair is known and forbidden: it holds, and nothing else is closed there"
         for known in found.known
@@ -275,7 +275,7 @@ def keyframe_pairs(pairs: Many[NamedPair], results: Many[ScanResult], keyframes:
     return found
 
 
-def _known(
+def _keyframe_pair(
     pair: NamedPair, ends: list[tuple[int, int]], results: Many[ScanResult], keyframes: Many[Keyframe]
 ) -> KnownPair:
     """The keyframes lie beside the scans, as odometry has it."""

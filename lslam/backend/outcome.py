@@ -10,11 +10,11 @@ import numpy as np
 
 from lslam.backend.georeferencing import MIN_FIXES
 from lslam.backend.graph.drift import tilt_factor
-from lslam.backend.graph.factors import well_conditioned
+from lslam.backend.graph.factors import regularise
 from lslam.backend.graph.fix_errors import NO_HEIGHT
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
 from lslam.backend.graph.loop_drift import without_loop_drift
-from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph, Solution
 from lslam.backend.keyframes.store import KeyframeStore
@@ -38,7 +38,7 @@ CLOUD_KEYFRAMES = 10
 
 
 @dataclass(frozen=True)
-class Given:
+class BackEndInput:
     """The input of the back end.
 
     results : of odometry, all scans; store : of the keyframes; candidates : all loop candidates with the verdicts of verification
@@ -90,28 +90,28 @@ class BackEnd:
         return bool(self.constraints)
 
 
-def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = None) -> BackEnd | None:
+def solve(graph: PoseGraph, inputs: BackEndInput, georeference: Georeference | None = None) -> BackEnd | None:
     """The run at the optimum of the graph; None, and one more of the problems, when that fails.
 
     georeference : of the graph's frame, None where that is odometry's
     """
-    config = given.config
+    config = inputs.config
     try:
-        with given.clocks[len(given.store) - 1].stage("graph"):
+        with inputs.clocks[len(inputs.store) - 1].stage("graph"):
             solution = optimise(graph, config.graph)
     except (GraphError, np.linalg.LinAlgError) as error:
-        given.problems.append(f"{error}; the run goes on without it")
+        inputs.problems.append(f"{error}; the run goes on without it")
         return None
     free = [not fix.is_binding for fix in graph.fixes]
     accepted_fixes = int(solution.fix_inliers[free].sum())
     if any(free) and accepted_fixes < MIN_FIXES:
         text = f"GNSS: the pose graph accepts {accepted_fixes} of {sum(free)} fixes"
-        given.problems.append(
+        inputs.problems.append(
             f"{text}: all rejected" if all(free) else f"{text}, the control points contradict the others"
         )
         if all(free):
             return None
-    judged, accepted = judged_by(given.candidates, graph, solution)
+    judged, accepted = apply_verdicts(inputs.candidates, graph, solution)
     log.info(
         "pose graph: %d keyframes, %d of %d loop closures accepted, drift factor %.3g, %d rounds",
         len(graph),
@@ -121,31 +121,31 @@ def solve(graph: PoseGraph, given: Given, georeference: Georeference | None = No
         solution.rounds,
     )
     T = np.eye(4) if georeference is None else georeference.T_enu_world
-    facts = _facts(solution, graph, T @ _odometry(given), given.candidates, accepted)
+    facts = _facts(solution, graph, T @ _odometry(inputs), inputs.candidates, accepted)
     tilts = not accepted and tilt_factor(graph, config.graph) > 0
     if not (accepted or graph.fixes or graph.floors or graph.map_priors or tilts):
-        return BackEnd(given.results, judged, graph.poses, facts=facts)
+        return BackEnd(inputs.results, judged, graph.poses, facts=facts)
     if georeference is not None:
-        georeference = replace(_scored(georeference, graph, solution), T_enu_world=np.eye(4))
-    moved = corrected(
-        given.results, given.store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph
+        georeference = replace(_rescore(georeference, graph, solution), T_enu_world=np.eye(4))
+    moved = correct_scans(
+        inputs.results, inputs.store.keyframes, solution.poses, solution.covariances, solution.drift, config.graph
     )
     # As they were solved: odometry's covariance may be singular and has no information matrix then.
-    constraints = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*graph.odometry, *accepted)]
+    constraints = [replace(c, covariance=regularise(c.covariance)) for c in (*graph.odometry, *accepted)]
     return BackEnd(moved, judged, solution.poses, constraints, georeference, T, solution=solution, facts=facts)
 
 
-def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
+def without_steady_drift(graph: PoseGraph, inputs: BackEndInput) -> PoseGraph:
     """The graph corrected by the steady drift that its loop closures reveal; unchanged where they reveal none."""
-    if not given.config.graph.steady_drift:
+    if not inputs.config.graph.steady_drift:
         return graph
     try:
-        graph = without_loop_drift(graph, given.config.graph)
+        graph = without_loop_drift(graph, inputs.config.graph)
     except GraphError:
         # Reported where it is solved.
         return graph
     except np.linalg.LinAlgError as error:
-        given.problems.append(f"graph.steady_drift: {error}; steady drift is not corrected")
+        inputs.problems.append(f"graph.steady_drift: {error}; steady drift is not corrected")
     if graph.estimated_drift is not None:
         shift, turn = (float(np.linalg.norm(part)) for part in np.split(graph.estimated_drift.rates, 2))
         log.info(
@@ -156,23 +156,23 @@ def without_steady_drift(graph: PoseGraph, given: Given) -> PoseGraph:
     return graph
 
 
-def unsolved(given: Given) -> BackEnd:
+def keep_odometry(inputs: BackEndInput) -> BackEnd:
     """The run as odometry has it; accepted loop closures are rejected with the graph."""
     candidates = [
         replace(c, verdict=Verdict.REJECTED, stage=LoopStage.GRAPH, reason="the pose graph could not be solved")
         if c.is_accepted
         else c
-        for c in given.candidates
+        for c in inputs.candidates
     ]
-    return BackEnd(given.results, candidates, _odometry(given))
+    return BackEnd(inputs.results, candidates, _odometry(inputs))
 
 
-def _odometry(given: Given) -> Floats:
+def _odometry(inputs: BackEndInput) -> Floats:
     """(K, 4, 4) poses of the keyframes."""
-    return np.stack([k.T_world_lidar for k in given.store.keyframes])
+    return np.stack([k.T_world_lidar for k in inputs.store.keyframes])
 
 
-def judged_by(
+def apply_verdicts(
     candidates: list[LoopCandidate], graph: PoseGraph, solution: Solution
 ) -> tuple[list[LoopCandidate], list[Constraint]]:
     """Candidates with the graph's verdicts on those accepted before, and the constraints it accepts."""
@@ -189,7 +189,7 @@ def judged_by(
     return out, accepted
 
 
-def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
+def _rescore(georeference: Georeference, graph: PoseGraph, solution: Solution) -> Georeference:
     """The georeference with the residuals of the graph's inliers, of the kind that gave it; unchanged without any."""
     is_control = georeference.method == "control"
     used = [
@@ -201,7 +201,7 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
         if not graph.fixes:
             return georeference
         return replace(georeference, used=0, rmse_horizontal=float("nan"), rmse_vertical=float("nan"))
-    off = np.stack([f.position - f.seen(solution.poses) for f in used])
+    off = np.stack([f.position - f.predict(solution.poses) for f in used])
     heights = off[[f.sigma[2] < NO_HEIGHT for f in used], 2]
     return replace(
         georeference,
@@ -212,13 +212,13 @@ def _scored(georeference: Georeference, graph: PoseGraph, solution: Solution) ->
 
 
 def _facts(
-    solution: Solution, graph: PoseGraph, before: Floats, candidates: list[LoopCandidate], accepted: list[Constraint]
+    solution: Solution, graph: PoseGraph, before: Floats, candidates: list[LoopCandidate], closures: list[Constraint]
 ) -> dict[str, Any]:
     """For the manifest; before : (K, 4, 4) odometry's poses of the keyframes, in the frame of the graph."""
     moved = se3.relative(before, solution.poses)[:, :3, 3]
     return {
         "loop_candidates": len(candidates),
-        "loops": len(accepted),
+        "loops": len(closures),
         "fixes": sum(
             bool(ok) and not fix.is_binding for fix, ok in zip(graph.fixes, solution.fix_inliers, strict=True)
         ),
@@ -252,10 +252,10 @@ def _drift_facts(drift: EstimatedDrift) -> dict[str, Any]:
     return {"wandering_drift" if drift.is_varying else "steady_drift": facts}
 
 
-def view_loop(record: RunRecord, done: BackEnd, store: KeyframeStore) -> LoopView | None:
+def view_loop(record: RunRecord, back_end: BackEnd, store: KeyframeStore) -> LoopView | None:
     """The view; None without an accepted loop closure or an optimised graph."""
     closed = [c for c in record.loops if c.is_accepted]
-    if record.odometry is None or not done.is_optimised or not closed:
+    if record.odometry is None or not back_end.is_optimised or not closed:
         return None
     scans = record.keyframe_scans
     before, after = record.T_final_odometry @ record.odometry.poses[scans], record.trajectory.poses[scans]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 from lslam.core.errors import UsageError, nearest
 
 if TYPE_CHECKING:
-    from lslam.osm.matcher import Lay
+    from lslam.osm.corrections import Lay
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class Matcher:
 
 
 MATCHERS = {
-    "walls": Matcher("lslam.osm.matcher"),
+    "walls": Matcher("lslam.osm.corrections"),
     "baseline": Matcher("lslam.osm.baseline_matcher", reveals_drift=False),
 }
 
 
-def matcher_named(name: str) -> Matcher:
+def find_matcher(name: str) -> Matcher:
     """The matcher `osm.matcher` names. Raises UsageError with the nearest name when there is none."""
     if name not in MATCHERS:
         raise UsageError(f"no matcher {name!r} (osm.matcher); {nearest(name, MATCHERS)}")

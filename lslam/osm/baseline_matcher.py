@@ -9,27 +9,24 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.graph.building_graph import JointSolution, optimise_jointly
+from lslam.backend.graph.building_graph import optimise_jointly
 from lslam.backend.graph.drift import with_drift
 from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.odometry_constraints import fitness_covariance
 from lslam.backend.graph.problem import PoseGraph, Solution
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import submap_labels
-from lslam.backend.outcome import Given
+from lslam.backend.keyframes.store import KeyframeStore, submap_labels
+from lslam.backend.outcome import BackEndInput
 from lslam.core.config import Config
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se2, se3
 from lslam.core.labels import table_of
 from lslam.core.stopping import checking
 from lslam.core.types.arrays import Floats
-from lslam.core.types.building import BuildingMatch, CorrectedMap, KeyframeMatch, OsmMatches
-from lslam.core.types.scan_result import KeyframeClocks, StageClock
+from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
+from lslam.core.types.scan_result import StageClock
 from lslam.io.formats.osm_buildings import BuildingExtract
-from lslam.osm.classes import classify
-from lslam.osm.corrections import place_buildings
-from lslam.osm.matcher import Laid, accepted_part
-from lslam.osm.walls import WALL_RANGE_M, OsmMap
+from lslam.osm.corrections import BuildingFit, accepted_part, place_buildings
+from lslam.osm.walls import WALL_RANGE_M, OsmMap, classify
 from lslam.registration.alignment import solve
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import Annealing
@@ -50,26 +47,14 @@ FARTHEST_M = 5.0  # m from the prior; a result beyond has not converged
 FAR = 1.0  # m; points farther from their nearest one do not count in the fitness score (the range of hdl_graph_slam's)
 
 
-def lay(graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, given: Given) -> Laid:
-    """As `matcher.Lay`, without using `matches` of walls."""
-    joint, matches, buildings = run_baseline(graph, solution, extract, given.store, given.config, given.clocks)
-    return Laid(matches, buildings, joint)
-
-
-def run_baseline(
-    graph: PoseGraph,
-    solution: Solution,
-    extract: BuildingExtract,
-    store: KeyframeStore,
-    config: Config,
-    clocks: KeyframeClocks,
-) -> tuple[JointSolution, OsmMatches, CorrectedMap]:
+def lay(
+    graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
+) -> BuildingFit:
     """For each keyframe: NDT of the scan with all buildings near, VGICP of each building, an edge to each, optimisation.
 
-    graph : in the frame of the map, with the start that all modes share
-    solution : of `graph`; the loops and fixes that it rejected are left out
-    Raises GraphError when the graph cannot be solved.
+    As `corrections.Lay`, without using `matches` of walls; the loops and fixes that the solution rejected are left out.
     """
+    store, config, clocks = inputs.store, inputs.config, inputs.clocks
     osm = OsmMap(extract.buildings)
     odometry = with_drift(graph, 0.0, config.graph)
     graph = replace(accepted_part(graph, solution), odometry=odometry, map_priors=(), start=None, start_sigma=None)
@@ -86,18 +71,9 @@ def run_baseline(
             poses[: k + 1] = joint.poses
     with clocks[len(store) - 1].stage("graph"):
         joint = optimise_jointly(replace(graph, poses=poses), middles, local, None, config.graph)
-    matches = OsmMatches(
-        extract.origin,
-        osm.buildings,
-        osm.walls,
-        osm.owners,
-        tuple(sights),
-        tuple(local),
-        source=extract.source,
-        attribution=extract.attribution,
-    )
-    placed = place_buildings(matches, se2.of_se3(joint.poses), local, joint.buildings, config.osm, "baseline")
-    return joint, matches, placed
+    matches = osm.collect(extract, sights, local)
+    buildings = place_buildings(matches, se2.of_se3(joint.poses), local, joint.buildings, config.osm, "baseline")
+    return BuildingFit(matches, buildings, joint)
 
 
 def _match(
@@ -115,17 +91,10 @@ def _match(
     with clock.stage("map match"):
         whole = lay_scan(seen, osm.walls[osm.walls_near(at[:2], config.osm.use_radius)], at)
     start = at if whole is None else whole.pose
-    sight = KeyframeMatch(
-        number,
-        np.zeros((0, 2, 2)),
-        np.zeros((1, 2)),
-        at,
-        np.zeros(3),
-        start,
-        np.zeros((3, 3)),
-        kind="none" if whole is None else "edges",
-        reason="no convergence" if whole is None else ONLY_START,
-    )
+    no_walls, about = (np.zeros((0, 2, 2)), np.zeros((1, 2))), (at, np.zeros(3), start, np.zeros((3, 3)))
+    sight = KeyframeMatch(number, *no_walls, *about, kind="edges", reason=ONLY_START)
+    if whole is None:
+        sight = replace(sight, kind="none", reason="no convergence")
     found = []
     for building in osm.near(start[:2], config.osm.use_radius).tolist():
         middle = osm.buildings[building].middle
@@ -134,12 +103,9 @@ def _match(
             fit = lay_building(walls, seen, se2.relative(start, np.append(middle, 0.0)))
         if fit is not None:
             spread = fitness_covariance(fit.rmse**2, config.graph)[np.ix_(PLANAR, PLANAR)]
-            information, nothing = np.asarray(np.linalg.inv(spread), np.float64), np.zeros((0, 2), np.int64)
-            found.append(
-                BuildingMatch(
-                    number, building, fit.pose, information, 3, "edges", -fit.rmse, fit.overlap, fit.rmse, nothing
-                )
-            )
+            information = np.asarray(np.linalg.inv(spread), np.float64)
+            scores = (-fit.rmse, fit.overlap, fit.rmse, np.zeros((0, 2), np.int64))
+            found.append(BuildingMatch(number, building, fit.pose, information, 3, "edges", *scores))
     return sight, found
 
 
@@ -184,14 +150,14 @@ def outline_points(walls: Floats) -> Floats:
     return np.concatenate(found) if found else np.zeros((0, 2))
 
 
-def lay_scan(seen: Floats, walls: Floats, prior: Floats) -> FlatFit | None:
+def lay_scan(scan: Floats, walls: Floats, prior: Floats) -> FlatFit | None:
     """Register the flattened scan (N, 2) with all `walls` (T, 2, 2) by NDT from `prior` (3,); None without convergence."""
-    return _align(seen, outline_points(walls), prior, NDT_VOXEL, "ndt")
+    return _align(scan, outline_points(walls), prior, NDT_VOXEL, "ndt")
 
 
-def lay_building(walls: Floats, seen: Floats, prior: Floats) -> FlatFit | None:
+def lay_building(walls: Floats, scan: Floats, prior: Floats) -> FlatFit | None:
     """Register a building's `walls` (T, 2, 2), about its middle, with the flattened scan (N, 2) by VGICP; None likewise."""
-    return _align(outline_points(walls), seen, prior, VGICP_VOXEL, "vgicp")
+    return _align(outline_points(walls), scan, prior, VGICP_VOXEL, "vgicp")
 
 
 def _align(

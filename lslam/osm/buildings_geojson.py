@@ -24,39 +24,39 @@ ONE_NODE = 0.05  # m; a node that its buildings want nearer together than this s
 STAYS = 0.01  # m; what moves less is not edited
 
 
-def write_corrected(path: Path, found: CorrectedMap) -> None:
-    """Write `found`: one feature a building at its real place, then one a wall that no building has; atomically.
+def write_buildings_geojson(path: Path, corrected_map: CorrectedMap) -> None:
+    """Write `corrected_map`: one feature a building at its real place, then one a wall that no building has; atomically.
 
     `@id` is the element's number in OpenStreetMap; displacements are real minus map, east, north, m, and counter-clockwise
     about the middle of the box round the outlines on the map. Raises OutputError when the file cannot be written.
     """
-    stuck: dict[int, list[str]] = {k: [] for pair in found.overlaps for k in pair}
-    for i, j in found.overlaps:
-        stuck[i].append(found.buildings[j].building.osm_id)
-        stuck[j].append(found.buildings[i].building.osm_id)
-    features = [_feature(c, found.origin, stuck.get(k, [])) for k, c in enumerate(found.buildings)]
+    stuck: dict[int, list[str]] = {k: [] for pair in corrected_map.overlaps for k in pair}
+    for i, j in corrected_map.overlaps:
+        stuck[i].append(corrected_map.buildings[j].building.osm_id)
+        stuck[j].append(corrected_map.buildings[i].building.osm_id)
+    features = [_feature(c, corrected_map.origin, stuck.get(k, [])) for k, c in enumerate(corrected_map.buildings)]
     features += [
         {
             "type": "Feature",
             "properties": {"status": "new", "length_m": round(float(np.linalg.norm(wall[1] - wall[0])), 2)},
-            "geometry": {"type": "LineString", "coordinates": _positions(wall, found.origin)},
+            "geometry": {"type": "LineString", "coordinates": _positions(wall, corrected_map.origin)},
         }
-        for wall in found.new_walls
+        for wall in corrected_map.new_walls
     ]
     tree = {
         "type": "FeatureCollection",
         "schema": SCHEMA,
-        "attribution": found.attribution or "",
-        "origin": [float(v) for v in found.origin],
-        "mode": found.mode,
-        "map_shift_m": [round(float(v), 4) for v in found.shift],
+        "attribution": corrected_map.attribution or "",
+        "origin": [float(v) for v in corrected_map.origin],
+        "mode": corrected_map.mode,
+        "map_shift_m": [round(float(v), 4) for v in corrected_map.shift],
         "features": features,
     }
     write_text(path, json.dumps(tree, allow_nan=False, ensure_ascii=False) + "\n")
 
 
-def read_corrected(path: Path) -> CorrectedMap:
-    """Read what `write_corrected` wrote, outlines rounded to 7 decimals of a degree. Raises InputError naming the file."""
+def read_buildings_geojson(path: Path) -> CorrectedMap:
+    """Read a file of `write_buildings_geojson`, outlines rounded to 7 decimals of a degree. Raises InputError naming it."""
     try:
         tree = parse_json(path.read_bytes())
         if tree["schema"] != SCHEMA:
@@ -149,31 +149,32 @@ def _metres(ring: Any, origin: Floats) -> Floats:
     return np.asarray(to_local(np.column_stack([places[:, ::-1], np.zeros(len(places))]), origin)[:, :2])
 
 
-def corrected_osm(data: OsmData, found: CorrectedMap) -> OsmData:
-    """The buildings of `found` with all their nodes, moved, as an extract to open in an editor (JOSM).
+def corrected_osm(data: OsmData, corrected_map: CorrectedMap) -> OsmData:
+    """The buildings of `corrected_map` with all their nodes, moved, as an extract to open in an editor (JOSM).
 
     Nodes and ways keep their numbers and versions; those that differ from `data` are `modified`. A node that several
     buildings share and that they no longer agree on stays with the one known best; the others get new nodes, with numbers
-    below zero. A building of `data` that is not in `found` holds its nodes where they are. What the run found absent is not
-    deleted: it is for a mapper to decide.
+    below zero. A building of `data` that is not in `corrected_map` holds its nodes where they are. What the run found absent
+    is not deleted: it is for a mapper to decide.
     """
-    owners = {_element(c.building): c for c in found.buildings}
-    result = OsmData(attribution=found.attribution)
+    owners = {_element(c.building): c for c in corrected_map.buildings}
+    result = OsmData(attribution=corrected_map.attribution)
     wishes: dict[int, list[_NodeTarget]] = {}
     for name, correction in owners.items():
         ways = sorted(_ways_of(data, name))
         for number in ways:
             result.add_way(data.ways[number])
             result.nodes.update((node, data.nodes[node]) for node in data.ways[number].nodes)
-        for wish in _wishes(data, ways, correction, found.origin):
+        for wish in _wishes(data, ways, correction, corrected_map.origin):
             wishes.setdefault(wish.node, []).append(wish)
         if name[0] == "relation":
             result.add_relation(data.relations[name[1]])
-    for node in _held(data, owners) & set(wishes):
+    for node in _other_nodes(data, owners) & set(wishes):
         was = wishes[node][0].was
         wishes[node].append(_NodeTarget(node, (), was, was, np.inf))
-    _place(result, wishes, found.origin)
-    kept = {(kind, number) for kind, numbers in _numbers(result) for number in numbers}
+    _place(result, wishes, corrected_map.origin)
+    numbers = (("node", list(result.nodes)), ("way", list(result.ways)), ("relation", list(result.relations)))
+    kept = {(kind, number) for kind, those in numbers for number in those}
     result.versions = {key: version for key, version in data.versions.items() if key in kept}
     return result
 
@@ -219,10 +220,10 @@ def _place(result: OsmData, wishes: dict[int, list[_NodeTarget]], origin: Floats
                 result.modified.add(("way", way))
 
 
-def _agreeing(wanted: list[_NodeTarget]) -> list[list[_NodeTarget]]:
+def _agreeing(wishes: list[_NodeTarget]) -> list[list[_NodeTarget]]:
     """Wishes in groups that want one place, the best known first."""
     groups: list[list[_NodeTarget]] = []
-    for wish in wanted:
+    for wish in wishes:
         near = [g for g in groups if np.linalg.norm(wish.place - g[0].place) <= ONE_NODE]
         if near:
             near[0].append(wish)
@@ -244,14 +245,10 @@ def _ways_of(data: OsmData, element: tuple[str, int]) -> set[int]:
     return {n for n in ways & set(data.ways) if all(node in data.nodes for node in data.ways[n].nodes)}
 
 
-def _held(data: OsmData, corrected: Iterable[tuple[str, int]]) -> set[int]:
+def _other_nodes(data: OsmData, elements: Iterable[tuple[str, int]]) -> set[int]:
     """Nodes of buildings that were not corrected."""
-    known = set(corrected)
+    known = set(elements)
     inside = {number for name in known for number in _ways_of(data, name)}
     names = [("way", way.id) for way in data.ways.values() if "building" in way.tags and way.id not in inside]
     names += [("relation", r.id) for r in data.relations.values() if "building" in r.tags]
     return {node for name in names if name not in known for n in _ways_of(data, name) for node in data.ways[n].nodes}
-
-
-def _numbers(data: OsmData) -> tuple[tuple[str, Iterable[int]], ...]:
-    return ("node", data.nodes), ("way", data.ways), ("relation", data.relations)

@@ -1,4 +1,7 @@
-"""The second level: with the trajectory fixed, the displacement of every building is estimated from sightings of its walls."""
+"""The second level: with the trajectory fixed, the displacement of every building is estimated from sightings of its walls.
+
+The interface of matchers, `Lay`, and the matcher of walls are here as well.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,22 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from lslam.backend.graph.building_graph import BuildingSolution, MapPrior, agreeing, solve_buildings
+from lslam.backend.graph.building_graph import (
+    BuildingSolution,
+    JointSolution,
+    MapPrior,
+    agreeing,
+    optimise_jointly,
+    solve_buildings,
+)
+from lslam.backend.graph.drift import with_drift
+from lslam.backend.graph.problem import PoseGraph, Solution
+from lslam.backend.outcome import BackEndInput
+from lslam.core.config import Config
 from lslam.core.config.backend import OsmConfig
 from lslam.core.geometry import se2
 from lslam.core.stopping import checking
@@ -26,11 +40,12 @@ from lslam.core.types.building import (
     footprint_polygon,
     is_canopy,
 )
+from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.io.formats.osm_data import OsmData
 from lslam.io.formats.osm_files import write_osm
-from lslam.osm.buildings_geojson import corrected_osm, write_corrected
+from lslam.osm.buildings_geojson import corrected_osm, write_buildings_geojson
 from lslam.osm.kernels import wall_matching
-from lslam.osm.overlap import Untangled, remove_overlaps
+from lslam.osm.overlap import Separation, remove_overlaps
 from lslam.osm.wall_match import LIKENESS
 from lslam.osm.walls import walls_of
 
@@ -66,7 +81,7 @@ def absent_buildings(
     """
     from shapely import STRtree, linestrings, points
 
-    looks = _placed(sights, poses)
+    looks = _place_views(sights, poses)
     shapes = [_ground(building) for building in buildings]
     found = np.zeros(len(shapes), bool)
     everything = [_samples(look.walls) for look in looks]
@@ -101,7 +116,7 @@ def new_walls(buildings: Sequence[Building], sights: Sequence[KeyframeMatch], po
     ground = union_all([_ground(building).buffer(ONE_LINE) for building in buildings])
     prepare(ground)
     lines: list[_Line] = []
-    for look in checking(_placed(sights, poses)):
+    for look in checking(_place_views(sights, poses)):
         rows = np.ascontiguousarray(look.walls.reshape(-1, 4))
         # The outside of a wall that is seen at a grazing angle is uncertain: both directions are matched.
         pairs = [
@@ -153,7 +168,7 @@ class _Line:
         return np.asarray(self._from + np.outer([self._low, self._high], self._u))
 
 
-def _placed(sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> list[_PlacedView]:
+def _place_views(sights: Sequence[KeyframeMatch], poses: Mapping[int, Floats]) -> list[_PlacedView]:
     """The walls seen about each keyframe with a pose, in the map frame."""
     found = []
     for sight in sights:
@@ -191,7 +206,7 @@ def correct_buildings(matches: OsmMatches, poses: Floats, config: OsmConfig) -> 
     prior = map_prior(matches, config)
     if config.mode == "rigid":
         prior = replace(prior, sigma=TOGETHER)
-    local = agreed(matches, poses)
+    local = select_agreeing(matches, poses)
     solution = solve_buildings(middles_of(matches), local, dict(enumerate(poses)), prior)
     return place_buildings(matches, poses, local, solution, config, config.mode)
 
@@ -209,11 +224,11 @@ def place_buildings(
     mode : of `OsmConfig.mode`, or the name of the matcher
     """
     place = dict(enumerate(poses))
-    untangled, own = Untangled(solution.displacements, (), ()), solution.covariances
+    untangled, own = Separation(solution.displacements, (), ()), solution.covariances
     if mode == "prior":
         # No building moves: covariances are those of the prior.
         own = solve_buildings(middles_of(matches), (), {}, _unseen(config)).covariances
-        untangled = Untangled(np.zeros_like(solution.displacements), (), ())
+        untangled = Separation(np.zeros_like(solution.displacements), (), ())
     elif mode in ("non-rigid", "two-level"):
         information = np.asarray(np.linalg.inv(solution.covariances), np.float64)
         untangled = remove_overlaps(matches.buildings, solution.displacements, information)
@@ -245,7 +260,7 @@ def middles_of(matches: OsmMatches) -> Floats:
     return np.array([b.middle for b in matches.buildings]).reshape(-1, 2)
 
 
-def agreed(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
+def select_agreeing(matches: OsmMatches, poses: Floats) -> list[BuildingMatch]:
     """The accepted local matches that agree with others of their building, with the keyframes at `poses` (K, 3)."""
     local = [m for m in matches.local if m.is_accepted and m.keyframe < len(poses)]
     agrees = agreeing(middles_of(matches), local, dict(enumerate(poses)))
@@ -265,17 +280,17 @@ def _unseen(config: OsmConfig) -> MapPrior:
     return MapPrior(np.zeros(2), np.maximum(np.full(2, config.shift_sigma), TOGETHER[:2]), sigma)
 
 
-def write_buildings(folder: Path, found: CorrectedMap, data: OsmData) -> None:
+def write_buildings(folder: Path, corrected_map: CorrectedMap, data: OsmData) -> None:
     """Write buildings.geojson, and buildings.osm for editors, which has the elements of `data` displaced.
 
     Raises OutputError when they cannot be written.
     """
-    write_corrected(folder / BUILDINGS_GEOJSON, found)
-    write_osm(folder / BUILDINGS_OSM, corrected_osm(data, found))
+    write_buildings_geojson(folder / BUILDINGS_GEOJSON, corrected_map)
+    write_osm(folder / BUILDINGS_OSM, corrected_osm(data, corrected_map))
 
 
-def _status(used: int, is_absent: bool) -> BuildingStatus:
-    if used:
+def _status(count: int, is_absent: bool) -> BuildingStatus:
+    if count:
         return "seen"
     return "absent" if is_absent else "unseen"
 
@@ -289,3 +304,65 @@ def _counts(
     used = np.bincount(owners[solution.inliers], minlength=size)
     tried = np.bincount(np.array([m.building for m in matches.local], np.intp), minlength=size)
     return used.tolist(), (tried - used).tolist()
+
+
+@dataclass(frozen=True)
+class BuildingFit:
+    """Matches, and buildings with their displacements.
+
+    joint : solution of buildings and trajectory in one graph; None when the trajectory is fixed
+    """
+
+    matches: OsmMatches
+    buildings: CorrectedMap
+    joint: JointSolution | None = None
+
+
+class Lay(Protocol):
+    """`lay` of a matcher's module."""
+
+    def __call__(
+        self, graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
+    ) -> BuildingFit:
+        """Estimate the displacements of the buildings of `extract`.
+
+        graph : in the frame of the map; solution : of `graph`, with planar priors; matches : of walls, with the verdicts
+            of the solution
+        Raises GraphError and LinAlgError when it cannot be solved.
+        """
+
+
+def lay(
+    graph: PoseGraph, solution: Solution, matches: OsmMatches, extract: BuildingExtract, inputs: BackEndInput
+) -> BuildingFit:
+    """As `Lay`, by walls: with the trajectory in one graph in mode `non-rigid`, with a fixed trajectory in the others."""
+    with inputs.clocks[len(inputs.store) - 1].stage("graph"):
+        if inputs.config.osm.mode == "non-rigid":
+            joint, buildings = join_buildings(graph, solution, matches, inputs.config)
+            return BuildingFit(matches, buildings, joint)
+        return BuildingFit(matches, correct_buildings(matches, se2.of_se3(solution.poses), inputs.config.osm))
+
+
+def join_buildings(
+    graph: PoseGraph, solution: Solution, matches: OsmMatches, config: Config
+) -> tuple[JointSolution, CorrectedMap]:
+    """Mode `non-rigid`: one graph of all buildings and of the inliers of `solution` in `graph`.
+
+    Raises GraphError when it cannot be solved.
+    """
+    accepted = replace(
+        accepted_part(graph, solution),
+        poses=solution.poses,
+        odometry=with_drift(graph, solution.drift, config.graph),
+        map_priors=(),
+    )
+    local = select_agreeing(matches, se2.of_se3(solution.poses))
+    found = optimise_jointly(accepted, middles_of(matches), local, map_prior(matches, config.osm), config.graph)
+    return found, place_buildings(matches, se2.of_se3(found.poses), local, found.buildings, config.osm, config.osm.mode)
+
+
+def accepted_part(graph: PoseGraph, solution: Solution) -> PoseGraph:
+    """The graph without the loops and fixes that `solution` rejected."""
+    loops = [loop for loop, why in zip(graph.loops, solution.loop_reasons, strict=True) if not why]
+    fixes = [fix for fix, is_kept in zip(graph.fixes, solution.fix_inliers, strict=True) if is_kept]
+    return replace(graph, loops=loops, fixes=fixes)

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from lslam.backend.georeferencing import Placement, on_earth
-from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.graph.problem import PlanarPrior, PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.outcome import BackEnd, Given, solve
+from lslam.backend.outcome import BackEnd, BackEndInput, solve
 from lslam.core.config import Config
 from lslam.core.config.backend import OsmConfig
 from lslam.core.errors import GraphError, InputError
@@ -21,8 +21,8 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
-from lslam.osm import matcher_named
-from lslam.osm.location import Located, finish, locate
+from lslam.osm import find_matcher
+from lslam.osm.location import MapLocations, finish, locate
 from lslam.osm.source import OsmSource
 from lslam.osm.wall_drift import WallDrift, WallSightings, find_wall_drift, without_drift
 from lslam.osm.wall_match import match_buildings
@@ -36,12 +36,12 @@ RIGID_MODES = ("prior", "rigid")
 SURVEY_SIGMA = 0.01
 
 
-def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, given: Given) -> BackEnd | None:
+def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, inputs: BackEndInput) -> BackEnd | None:
     """The back end with planar priors by a map's buildings, and with fixes where there are some.
 
-    None, with a problem in `given`, when there is no map, no keyframe located on it, or no solution.
+    None, with a problem in `inputs`, when there is no map, no keyframe located on it, or no solution.
     """
-    config, store, problems = given.config, given.store, given.problems
+    config, store, problems = inputs.config, inputs.store, inputs.problems
     known = placement.georeference
     origin = known.origin if known is not None else config.osm.origin
     if origin is None:
@@ -65,28 +65,28 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     is_on_earth = known is not None and known.is_in_graph
     if is_on_earth:
         graph = on_earth(graph, placement)
-    located, held = find_on_map(
-        extract, graph, store, up, None if known is None else known.T_enu_world, config, given.clocks
+    locations, held = find_on_map(
+        extract, graph, store, up, None if known is None else known.T_enu_world, config, inputs.clocks
     )
-    if located.problem:
-        problems.append(located.problem)
+    if locations.problem:
+        problems.append(locations.problem)
         return None
     on_walls = Georeference(
         extract.origin,
-        located.T_enu_odometry,
+        locations.T_enu_odometry,
         config.gnss.crs,
         "osm",
-        used=len(located.priors),
+        used=len(locations.priors),
         height_epsg=config.gnss.height_crs,
         geoid=config.gnss.geoid,
     )
     georeference = known if is_on_earth else on_walls
-    out = solve(held, given, georeference)
+    out = solve(held, inputs, georeference)
     if out is None or out.solution is None:
         return None
-    matches = finish(located, extract, out.keyframes, out.solution, config.osm, given.clocks)
+    matches = finish(locations, extract, out.keyframes, out.solution, config.osm, inputs.clocks)
     try:
-        laid = matcher_named(config.osm.matcher).lay(held, out.solution, matches, extract, given)
+        laid = find_matcher(config.osm.matcher).lay(held, out.solution, matches, extract, inputs)
     except (GraphError, np.linalg.LinAlgError) as error:
         problems.append(f"OSM: {error}; the run goes on with its buildings where the map has them")
         return replace(out, osm=matches)
@@ -94,7 +94,7 @@ def hold_by_buildings(osm: OsmSource, graph: PoseGraph, placement: Placement, gi
     if laid.joint is None:
         return laid_out
     poses, covariances = laid.joint.poses, laid.joint.covariances
-    moved = corrected(given.results, store.keyframes, poses, covariances, out.solution.drift, config.graph)
+    moved = correct_scans(inputs.results, store.keyframes, poses, covariances, out.solution.drift, config.graph)
     return replace(laid_out, results=moved, keyframes=poses)
 
 
@@ -103,35 +103,35 @@ def find_on_map(
     graph: PoseGraph,
     store: KeyframeStore,
     up: Floats | None,
-    placed: Floats | None,
+    T_map_world: Floats | None,
     config: Config,
     clocks: KeyframeClocks | None = None,
-) -> tuple[Located, PoseGraph]:
+) -> tuple[MapLocations, PoseGraph]:
     """The keyframes located on the map, and the graph in its frame, corrected by a significant drift.
 
-    graph : of odometry, or aligned by GNSS fixes; up, placed, clocks : as of `locate`; stage `drift` of the last keyframe
+    graph : of odometry, or aligned by GNSS fixes; up, T_map_world, clocks : as of `locate`; stage `drift` of the last keyframe
     """
     clocks = KeyframeClocks() if clocks is None else clocks
-    located = locate(extract, store, up, config, placed, clocks=clocks)
-    held = on_map(graph, located, config)
+    locations = locate(extract, store, up, config, T_map_world, clocks=clocks)
+    held = on_map(graph, locations, config)
     is_straight = held.is_rigid or not config.graph.steady_drift
-    if located.problem or not matcher_named(config.osm.matcher).reveals_drift or is_straight:
-        return located, held
+    if locations.problem or not find_matcher(config.osm.matcher).reveals_drift or is_straight:
+        return locations, held
     before: WallDrift | None = None
     for _ in range(HOLD_ROUNDS):
         with clocks[len(store) - 1].stage("drift"):
-            seen = sightings(located, held.poses, config)
+            seen = sightings(locations, held.poses, config)
             drift = find_wall_drift(held, seen, *_wall_sigmas(config.osm), config.graph, before)
         if drift is None or not drift.is_sure:
             break
         before = drift
         held = replace(without_drift(held, drift.rates), spread=drift.spread, estimated_drift=drift.estimated_drift)
-        odometry = se3.inverse(located.T_enu_odometry) @ held.poses
-        again = None if drift.is_settled else locate(extract, store, up, config, placed, odometry, clocks)
+        odometry = se3.inverse(locations.T_enu_odometry) @ held.poses
+        again = None if drift.is_final else locate(extract, store, up, config, T_map_world, odometry, clocks)
         if again is None or again.problem:
             break
-        located = again
-        held = on_map(replace(held, poses=odometry), located, config)
+        locations = again
+        held = on_map(replace(held, poses=odometry), locations, config)
     if before is not None:
         estimated = before.estimated_drift
         rates = estimated.rates if estimated.rms is None else estimated.rms
@@ -141,35 +141,35 @@ def find_on_map(
             100 * np.linalg.norm(rates[:2]),
             100 * np.degrees(rates[2]),
         )
-    return located, held
+    return locations, held
 
 
-def on_map(graph: PoseGraph, located: Located, config: Config) -> PoseGraph:
+def on_map(graph: PoseGraph, locations: MapLocations, config: Config) -> PoseGraph:
     """The graph in the frame of the map, with planar priors by walls, and with its fixes."""
     return replace(
         graph,
-        poses=graph.poses if graph.fixes else located.T_enu_odometry @ graph.poses,
-        map_priors=_priors(located, config),
+        poses=graph.poses if graph.fixes else locations.T_enu_odometry @ graph.poses,
+        map_priors=_priors(locations, config),
         shift_sigma=0.0 if config.osm.mode == "prior" else config.osm.shift_sigma,
         map_sigma=0.0 if config.osm.mode in RIGID_MODES else config.osm.map_sigma,
         world_up=np.array([0.0, 0.0, 1.0]),
-        start=None if graph.fixes else located.start,
-        start_sigma=None if graph.fixes else located.start_sigma,
+        start=None if graph.fixes else locations.start,
+        start_sigma=None if graph.fixes else locations.start_sigma,
         is_rigid=config.osm.trust_poses and config.odometry.method == "poses",
     )
 
 
-def _priors(located: Located, config: Config) -> list[PlanarPrior]:
+def _priors(locations: MapLocations, config: Config) -> list[PlanarPrior]:
     """The planar priors by the matches.
 
     The error of a wall on the map is common to all keyframes that see it (`shares`). In the modes with an exact map only
     sightings have errors, which are independent between submaps.
     """
     if config.osm.mode not in RIGID_MODES:
-        return located.priors
+        return locations.priors
     sharper = (config.osm.wall_sigma / _wall_sigmas(config.osm)[0]) ** 2
     share = 1.0 / config.keyframes.submap_size
-    return [replace(prior, information=sharper * prior.information, share=share) for prior in located.priors]
+    return [replace(prior, information=sharper * prior.information, share=share) for prior in locations.priors]
 
 
 def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
@@ -180,11 +180,11 @@ def _wall_sigmas(config: OsmConfig) -> tuple[float, float]:
     return config.wall_sigma, config.building_sigma
 
 
-def sightings(located: Located, poses: Floats, config: Config) -> WallSightings:
+def sightings(locations: MapLocations, poses: Floats, config: Config) -> WallSightings:
     """The sightings of all buildings' walls, with the keyframes at `poses` (K, 4, 4)."""
-    osm, planar = located.osm, se2.of_se3(poses)
+    osm, planar = locations.osm, se2.of_se3(poses)
     rows: list[tuple[Floats, Floats]] = [(np.zeros((0, 2, 2)), np.zeros((0, 2), np.int64))]
-    for match in checking(located.matches):
+    for match in checking(locations.matches):
         at = match.pose if match.is_accepted else match.prior
         for one in match_buildings(match, at, np.zeros(2), osm, config.osm):
             if one.is_accepted:

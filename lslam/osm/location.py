@@ -14,8 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lslam.backend.graph.problem import PlanarPrior, Solution
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import neighbours, submap, submap_labels
+from lslam.backend.keyframes.store import KeyframeStore, neighbours, submap, submap_labels
 from lslam.backend.levelling import floor_planes
 from lslam.core.config import Config
 from lslam.core.config.backend import GraphConfig, OsmConfig
@@ -28,11 +27,10 @@ from lslam.core.types.building import BuildingMatch, KeyframeMatch, OsmMatches
 from lslam.core.types.constraint import Verdict
 from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
-from lslam.osm.classes import classify
 from lslam.osm.source import first_pose
 from lslam.osm.track import OsmTrack
 from lslam.osm.wall_match import SEARCH_SIGMAS, START_WALLS, find_heading, match_buildings, match_keyframe, shares
-from lslam.osm.walls import OsmMap, find_walls
+from lslam.osm.walls import OsmMap, classify, find_walls
 from lslam.registration.preprocessing.ground import Z, up_of, world_up_of
 
 log = logging.getLogger("lslam")
@@ -46,7 +44,7 @@ GROWTH, TRIES = 2, 4
 
 
 @dataclass(frozen=True)
-class Located:
+class MapLocations:
     """The keyframes of a run located on the map.
 
     T_enu_odometry : (4, 4) from the world of odometry to the map frame; translation by one match, heading by all
@@ -74,14 +72,14 @@ def locate(
     store: KeyframeStore,
     up: Floats | None,
     config: Config,
-    placed: Floats | None = None,
+    T_map_world: Floats | None = None,
     odometry: Floats | None = None,
     clocks: KeyframeClocks | None = None,
-) -> Located:
+) -> MapLocations:
     """Match all keyframes with the map.
 
     up : (3,) up in the world of odometry by an IMU; None estimates it by the ground
-    placed : (4, 4) from that world to the map frame by GNSS fixes
+    T_map_world : (4, 4) from that world to the map frame by GNSS fixes
     odometry : (K, 4, 4) poses of the keyframes in that world, by default those of the store
     clocks : measure the time of each keyframe, stages `walls` and `map match`
     """
@@ -89,11 +87,11 @@ def locate(
     osm = OsmMap(extract.buildings)
     odometry = np.stack([k.T_world_lidar for k in store.keyframes]) if odometry is None else odometry
     up = _up_by_ground(store, odometry, config) if up is None else up
-    T_level = se3.make(so3.least_rotation(up, Z), np.zeros(3)) if placed is None else placed
-    poses = T_level @ odometry
-    start = _start(store, poses, osm, config, placed)
+    T_level = se3.make(so3.least_rotation(up, Z), np.zeros(3)) if T_map_world is None else T_map_world
+    run = LevelRun(store, T_level @ odometry, config)
+    start = run.start(osm, T_map_world)
     if start.problem:
-        return Located(T_level, osm, problem=start.problem)
+        return MapLocations(T_level, osm, problem=start.problem)
     track = OsmTrack(
         start.pose,
         start.sigma,
@@ -101,30 +99,28 @@ def locate(
         np.radians(config.graph.drift_deg_per_100m) / 100,
         np.array([config.osm.map_sigma, config.osm.map_sigma, np.radians(config.osm.map_sigma_deg)]),
     )
-    matches = _both_ways(store, poses, osm, track, config, clocks)
+    matches = _both_ways(run, osm, track, clocks)
     accepted = [match for match in matches if match.is_accepted]
     if not accepted:
-        return Located(T_level, osm, matches, problem=_why_none(matches, osm, extract))
+        return MapLocations(T_level, osm, matches, problem=_why_none(matches, osm, extract))
     log.info("OSM: %d of %d keyframes are matched with the map", len(accepted), len(matches))
     first = next((match for match in accepted if match.rank == 3), accepted[0])
     sigma = np.maximum(start.sigma, track.sigma)
-    T = _lowered(
-        se2.to_se3(_place(store, se2.of_se3(poses), first, accepted, track, sigma)) @ T_level, odometry[0], placed
-    )
+    T = _lower(se2.to_se3(_place(run, first, accepted, track, sigma)) @ T_level, odometry[0], T_map_world)
     parts = shares(accepted, len(osm.walls))
     priors = [
         PlanarPrior(m.keyframe, m.pose, m.information, m.rank, part) for m, part in zip(accepted, parts, strict=True)
     ]
     if not (config.osm.hold_start or config.osm.mode == "rigid"):
-        return Located(T, osm, matches, priors, None, sigma)
+        return MapLocations(T, osm, matches, priors, None, sigma)
     # The position is that of the prior, the heading the estimate by all matches.
     given, laid = known_start(config.osm), se2.of_se3(T @ odometry[0])
-    place = given.pose[:2] if placed is None else start.pose[:2]
-    return Located(T, osm, matches, priors, np.append(place, laid[2]), np.append(given.sigma[:2], sigma[2]))
+    place = given.pose[:2] if T_map_world is None else start.pose[:2]
+    return MapLocations(T, osm, matches, priors, np.append(place, laid[2]), np.append(given.sigma[:2], sigma[2]))
 
 
 def finish(
-    located: Located,
+    locations: MapLocations,
     extract: BuildingExtract,
     poses: Floats,
     solution: Solution,
@@ -137,23 +133,17 @@ def finish(
     """
     clocks = KeyframeClocks() if clocks is None else clocks
     rejections = iter(solution.map_reasons)
-    judged = [_judged(m, next(rejections)) if m.is_accepted else m for m in located.matches]
+    reasons = [next(rejections) if m.is_accepted else "" for m in locations.matches]
+    judged = [
+        replace(m, verdict=Verdict.REJECTED, reason=reason) if reason else m
+        for m, reason in zip(locations.matches, reasons, strict=True)
+    ]
     planar, local = se2.of_se3(poses), list[BuildingMatch]()
     for match in checking(judged):
         with clocks[match.keyframe].stage("building match"):
-            local += match_buildings(match, planar[match.keyframe], solution.shift, located.osm, config)
-    return OsmMatches(
-        extract.origin,
-        located.osm.buildings,
-        located.osm.walls,
-        located.osm.owners,
-        tuple(judged),
-        tuple(local),
-        solution.shift,
-        solution.shift_sigma,
-        extract.source,
-        extract.attribution,
-    )
+            local += match_buildings(match, planar[match.keyframe], solution.shift, locations.osm, config)
+    shift = {"shift": solution.shift, "shift_sigma": solution.shift_sigma}
+    return locations.osm.collect(extract, judged, local, **shift)
 
 
 def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Floats:
@@ -165,42 +155,28 @@ def _up_by_ground(store: KeyframeStore, odometry: Floats, config: Config) -> Flo
     return np.asarray(up / np.linalg.norm(up))
 
 
-def _start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: Config, placed: Floats | None) -> FirstPose:
-    if placed is not None:
-        return replace(known_start(config.osm), pose=se2.of_se3(poses[0]))
-    if config.osm.heading_deg is not None:
-        return known_start(config.osm)
-    return sought_start(store, poses, osm, config.osm, config.keyframes.submap_size)
-
-
-def _both_ways(
-    store: KeyframeStore, poses: Floats, osm: OsmMap, track: OsmTrack, config: Config, clocks: KeyframeClocks
-) -> list[KeyframeMatch]:
+def _both_ways(run: LevelRun, osm: OsmMap, track: OsmTrack, clocks: KeyframeClocks) -> list[KeyframeMatch]:
     """Forward from the first keyframe; then back from the first accepted match of full rank."""
-    found = _along(range(len(store)), store, poses, osm, track, config, clocks)
+    found = _along(range(len(run.store)), run, osm, track, clocks)
     numbers = [m.keyframe for m in found if m.is_accepted and m.rank == 3]
     if numbers and numbers[0] > 0:
         first = found[numbers[0]]
         back = copy.deepcopy(track)
         back.begin(first.pose, first.information)
-        found[: numbers[0]] = _along(
-            range(numbers[0] - 1, -1, -1), store, poses, osm, back, config, clocks, numbers[0]
-        )[::-1]
+        found[: numbers[0]] = _along(range(numbers[0] - 1, -1, -1), run, osm, back, clocks, numbers[0])[::-1]
     return found
 
 
 def _along(
     numbers: Iterable[int],
-    store: KeyframeStore,
-    poses: Floats,
+    run: LevelRun,
     osm: OsmMap,
     track: OsmTrack,
-    config: Config,
     clocks: KeyframeClocks,
     before: int | None = None,
 ) -> list[KeyframeMatch]:
     """Match the keyframes `numbers` in turn. The track is at keyframe `before`, or at the first of them for None."""
-    planar = se2.of_se3(poses)
+    config, planar = run.config, run.planar
     matches: list[KeyframeMatch] = []
     for number in checking(numbers):
         if before is not None:
@@ -208,23 +184,23 @@ def _along(
             track.move(step, float(np.linalg.norm(step[:2])))
         before = number
         with clocks[number].stage("walls"):
-            seen = see_walls(store, poses, number, config.keyframes.submap_size, config.osm)
-        view = KeyframeMatch(number, seen.walls, seen.views, track.pose, track.sigma, track.pose, np.zeros((3, 3)))
+            seen = run.see_walls(number, config.keyframes.submap_size)
+        view = KeyframeMatch(number, *seen, track.pose, track.sigma, track.pose, np.zeros((3, 3)))
         with clocks[number].stage("map match"):
-            match = _gated(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
+            match = _gate(match_keyframe(view, osm, config.osm), track, config.osm, config.graph)
         if match.is_accepted:
             track.take(match.pose, match.information)
         matches.append(match)
     return matches
 
 
-def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: GraphConfig) -> KeyframeMatch:
+def _gate(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: GraphConfig) -> KeyframeMatch:
     """The match with its verdict."""
     if match.reason:
         return match
     if track.sigma[0] > LOST_RATIO * config.map_sigma and (match.rank < 3 or len(match.pairs) < START_WALLS):
         return replace(match, reason="too few walls for a relocalisation")
-    squared, rank = track.squared(match.pose, match.information)
+    squared, rank = track.squared_distance(match.pose, match.information)
     limit = quantile(RIGHT_PROBABILITY, rank)
     if squared > limit:
         return replace(
@@ -233,28 +209,19 @@ def _gated(match: KeyframeMatch, track: OsmTrack, config: OsmConfig, graph: Grap
     return replace(match, verdict=Verdict.ACCEPTED)
 
 
-def _judged(match: KeyframeMatch, reason: str) -> KeyframeMatch:
-    return replace(match, verdict=Verdict.REJECTED, reason=reason) if reason else match
-
-
 def _place(
-    store: KeyframeStore,
-    poses: Floats,
-    first: KeyframeMatch,
-    accepted: list[KeyframeMatch],
-    track: OsmTrack,
-    sigma: Floats,
+    run: LevelRun, first: KeyframeMatch, accepted: list[KeyframeMatch], track: OsmTrack, sigma: Floats
 ) -> Floats:
-    """The pose (3,) of the world of `poses` (K, 3) in the map frame.
+    """The pose (3,) of the run's level world in the map frame.
 
     The position is that of one match: the nearest to `first` that is as accurate as the map and agrees with the others. The
     heading is estimated from all matches. A single match of few walls, or of a house drawn with a wrong heading, would rotate
     the run by degrees, which looks like drift of odometry.
     """
-    matches = [first, *(match for match in accepted if match is not first)]
+    poses, matches = run.planar, [first, *(match for match in accepted if match is not first)]
     numbers = [match.keyframe for match in matches]
     place = se2.compose(first.pose, se2.inverse(poses[first.keyframe]))
-    laid, ways = se2.compose(place, poses[numbers]), np.array([store.keyframes[k].distance for k in numbers])
+    laid, ways = se2.compose(place, poses[numbers]), np.array([run.store.keyframes[k].distance for k in numbers])
     turn, squared = track.lay(laid, ways, matches, sigma)
     right = [
         i
@@ -266,9 +233,9 @@ def _place(
     return se2.compose(there, se2.inverse(poses[numbers[at]]))
 
 
-def _lowered(T: Floats, first: Floats, placed: Floats | None) -> Floats:
+def _lower(T: Floats, first: Floats, T_map_world: Floats | None) -> Floats:
     """`T` with the first keyframe at height 0, unless satellite fixes gave its height."""
-    if placed is not None:
+    if T_map_world is not None:
         return T
     down = np.eye(4)
     down[2, 3] = -(T @ first)[2, 3]
@@ -299,55 +266,66 @@ class FirstPose:
     problem: str = ""
 
 
-@dataclass(frozen=True)
-class WallView:
-    """Walls (S, 2, 2) seen about a keyframe and the positions (V, 2) of the sensor, m, in the keyframe's level frame."""
-
-    walls: Floats
-    views: Floats
-
-
-def see_walls(store: KeyframeStore, poses: Floats, number: int, size: int, config: OsmConfig) -> WallView:
-    """Walls in the submap of `size` keyframes about keyframe `number`; `poses` (K, 4, 4) of all keyframes, level world."""
-    at = se2.of_se3(poses[number])
-    T_world_level = se2.to_se3(at)
-    T_world_level[2, 3] = poses[number, 2, 3]
-    cloud = submap(store, poses, number, size, T_world_frame=T_world_level)
-    near = neighbours(len(store), number, size)
-    views = se2.apply(se2.inverse(at), poses[near.start : near.stop, :2, 3])
-    is_wall = None
-    if config.labels:
-        labels = submap_labels(store, number, size) if config.needs_labels else classify(cloud)
-        is_wall = table_of(config.labels)[labels]
-    return WallView(find_walls(cloud, config, views, is_wall).segments, views)
-
-
 def known_start(config: OsmConfig) -> FirstPose:
     """The start by the origin and heading of the configuration, with their sigmas."""
     radius, turn = config.start_radius / SEARCH_SIGMAS, np.radians(config.start_heading_deg) / SEARCH_SIGMAS
     return FirstPose(first_pose(config), np.array([radius, radius, turn]))
 
 
-def sought_start(store: KeyframeStore, poses: Floats, osm: OsmMap, config: OsmConfig, submap_size: int) -> FirstPose:
-    """The start by a match over all headings, of a submap that grows until the match is unambiguous.
+@dataclass(frozen=True)
+class LevelRun:
+    """The keyframes of a run at `poses` (K, 4, 4) of a level world."""
 
-    poses : (K, 4, 4) of all keyframes in a level world; the first keyframe is the start
-    """
-    first, size, why = se2.of_se3(poses[0]), submap_size, ""
-    for _ in checking(range(TRIES)):
-        number = min(size // 2, len(store) - 1)
-        seen = see_walls(store, poses, number, size, config)
-        walls = se2.apply(se2.relative(first, se2.of_se3(poses[number])), seen.walls)
-        found = find_heading(walls, osm.walls, np.zeros(2), config.start_radius, config) if len(walls) else None
-        if found is not None and not found.is_ambiguous:
-            sigma = np.sqrt(np.diag(np.linalg.inv(found.information)))
-            return FirstPose(found.pose, sigma)
-        why = "several places and headings fit alike" if found is not None else "nothing fits"
-        if size >= len(store):
-            break
-        size *= GROWTH
-    problem = (
-        f"OSM: the walls about the start do not locate it on the map ({why} within {config.start_radius:g} m of the "
-        "origin): give --heading DEG, or a better --origin; the run goes on without the buildings"
-    )
-    return FirstPose(np.zeros(3), np.zeros(3), problem)
+    store: KeyframeStore
+    poses: Floats
+    config: Config
+
+    @property
+    def planar(self) -> Floats:
+        """(K, 3) the poses from above."""
+        return se2.of_se3(self.poses)
+
+    def planar_pose(self, number: int) -> Floats:
+        """(3,) one of them."""
+        return se2.of_se3(self.poses[number])
+
+    def see_walls(self, number: int, size: int) -> tuple[Floats, Floats]:
+        """Walls (S, 2, 2) in the submap of `size` keyframes about one, and positions (V, 2) of the sensor, in its level frame."""
+        store, config, at = self.store, self.config.osm, self.planar_pose(number)
+        T_world_level = se2.to_se3(at)
+        T_world_level[2, 3] = self.poses[number, 2, 3]
+        cloud = submap(store, self.poses, number, size, T_world_frame=T_world_level)
+        near = neighbours(len(store), number, size)
+        views = se2.apply(se2.inverse(at), self.poses[near.start : near.stop, :2, 3])
+        is_wall = None
+        if config.labels:
+            labels = submap_labels(store, number, size) if config.needs_labels else classify(cloud)
+            is_wall = table_of(config.labels)[labels]
+        return find_walls(cloud, config, views, is_wall).segments, views
+
+    def start(self, osm: OsmMap, T_map_world: Floats | None) -> FirstPose:
+        """The first keyframe in the map frame: by GNSS fixes, by the configured heading, or by a search over all headings."""
+        config = self.config.osm
+        if T_map_world is not None:
+            return replace(known_start(config), pose=self.planar_pose(0))
+        return known_start(config) if config.heading_deg is not None else self._search_start(osm)
+
+    def _search_start(self, osm: OsmMap) -> FirstPose:
+        """The start by a match over all headings, of a submap that grows until the match is unambiguous."""
+        config, first, why = self.config.osm, self.planar_pose(0), ""
+        size = self.config.keyframes.submap_size
+        for _ in checking(range(TRIES)):
+            number = min(size // 2, len(self.store) - 1)
+            walls = se2.apply(se2.relative(first, self.planar_pose(number)), self.see_walls(number, size)[0])
+            match = find_heading(walls, osm.walls, np.zeros(2), config.start_radius, config) if len(walls) else None
+            if match is not None and not match.is_ambiguous:
+                return FirstPose(match.pose, np.sqrt(np.diag(np.linalg.inv(match.information))))
+            why = "several places and headings fit alike" if match is not None else "nothing fits"
+            if size >= len(self.store):
+                break
+            size *= GROWTH
+        problem = (
+            f"OSM: the walls about the start do not locate it on the map ({why} within {config.start_radius:g} m of the "
+            "origin): give --heading DEG, or a better --origin; the run goes on without the buildings"
+        )
+        return FirstPose(np.zeros(3), np.zeros(3), problem)

@@ -66,7 +66,7 @@ class Solid:
 
     def core_at(self, displacement: Floats) -> Any:
         """The displaced area less `OVERLAP_M`, of shapely."""
-        return _transformed(self.core, *about(self.middle, displacement))
+        return _transform(self.core, *about(self.middle, displacement))
 
 
 def party_contacts(one: Solid, other: Solid) -> list[Contact]:
@@ -100,7 +100,7 @@ def separate(one: Solid, at: Floats, other: Solid, other_at: Floats) -> list[Con
     prepare(obstacle)
     moves = [*_alignments(one, ours, other, theirs), *_touches(ours, theirs)]
     for move in sorted((m for m in moves if m.price < LARGEST_MOVE_M + FLUSH_WORTH), key=lambda m: m.price):
-        if not _transformed(core, move.rotation, move.shift).intersects(obstacle):
+        if not _transform(core, move.rotation, move.shift).intersects(obstacle):
             return [_on_map(contact, one, other) for contact in move.contacts]
     return []
 
@@ -157,15 +157,15 @@ def _touches(ours: Floats, theirs: Floats) -> Iterator[_Move]:
 
 def _move(
     ours: Floats,
-    turned: Floats,
+    corners: Floats,
     rotation: Floats,
     push: Floats,
     contacts: tuple[tuple[int, int, int], ...],
     extra: float = 0.0,
 ) -> _Move:
-    """The move that takes our corners to `turned` + `push`."""
-    farthest = float(np.linalg.norm(turned + push - ours[:, 0], axis=1).max())
-    return _Move(rotation, turned[0] + push - rotation @ ours[0, 0], farthest + extra, contacts)
+    """The move that takes our corners to `corners` + `push`."""
+    farthest = float(np.linalg.norm(corners + push - ours[:, 0], axis=1).max())
+    return _Move(rotation, corners[0] + push - rotation @ ours[0, 0], farthest + extra, contacts)
 
 
 def _direction(wall: Floats) -> tuple[Floats, float]:
@@ -175,7 +175,7 @@ def _direction(wall: Floats) -> tuple[Floats, float]:
     return along / length, length
 
 
-def _transformed(shape: Any, rotation: Floats, shift: Floats) -> Any:
+def _transform(shape: Any, rotation: Floats, shift: Floats) -> Any:
     from shapely.affinity import affine_transform
 
     return affine_transform(shape, [*rotation.ravel(), *shift])
@@ -188,7 +188,7 @@ def _on_map(contact: tuple[int, int, int], one: Solid, other: Solid) -> Contact:
 
 
 @dataclass(frozen=True)
-class Untangled:
+class Separation:
     """Displaced buildings without overlaps.
 
     displacements : (B, 3) x, y (m), yaw (rad) about each building's middle
@@ -200,7 +200,7 @@ class Untangled:
     left: tuple[tuple[int, int], ...]
 
 
-def remove_overlaps(buildings: Sequence[Building], displacements: Floats, information: Floats) -> Untangled:
+def remove_overlaps(buildings: Sequence[Building], displacements: Floats, information: Floats) -> Separation:
     """The least displacements that separate overlapping buildings and keep party walls aligned.
 
     Parameters
@@ -211,16 +211,16 @@ def remove_overlaps(buildings: Sequence[Building], displacements: Floats, inform
     Buildings without contacts keep their displacement exactly. Canopies, buildings that begin above the ground and those
     that overlap on the map by more than `NESTED` are not separated.
     """
-    wanted = np.asarray(displacements, np.float64).reshape(-1, 3)
-    if not len(wanted):
-        return Untangled(wanted, (), ())
+    targets = np.asarray(displacements, np.float64).reshape(-1, 3)
+    if not len(targets):
+        return Separation(targets, (), ())
     solids = [Solid(k, building) for k, building in enumerate(buildings)]
     solid_ground = [s for s, b in zip(solids, buildings, strict=True) if not is_canopy(b) and b.base <= 0]
-    on_map = np.zeros_like(wanted)
-    nested = {(i, j) for i, j in _overlapping(solid_ground, on_map) if _is_nested(solids[i], solids[j])}
+    on_map = np.zeros_like(targets)
+    nested = {(i, j) for i, j in _overlapping(solid_ground, on_map) if _is_building_part(solids[i], solids[j])}
     contacts = {(i, j): party_contacts(solids[i], solids[j]) for i, j in _neighbours(solid_ground)}
     inseparable: set[tuple[int, int]] = set()
-    moved = _constrained(solids, wanted, information, contacts)
+    moved = _constrain(solids, targets, information, contacts)
     for _ in checking(range(SEPARATION_ROUNDS)):
         pairs = [pair for pair in _overlapping(solid_ground, moved) if pair not in nested and pair not in inseparable]
         if not pairs:
@@ -229,11 +229,11 @@ def remove_overlaps(buildings: Sequence[Building], displacements: Floats, inform
             contacts[i, j] = separate(solids[i], moved[i], solids[j], moved[j])
             if not contacts[i, j]:
                 inseparable.add((i, j))
-        moved = _constrained(solids, wanted, information, contacts)
+        moved = _constrain(solids, targets, information, contacts)
     left = tuple(pair for pair in _overlapping(solid_ground, moved) if pair not in nested)
     if left:
         log.warning("%d pairs of buildings overlap, and no small move separates them", len(left))
-    return Untangled(moved, tuple(c for some in contacts.values() for c in some), left)
+    return Separation(moved, tuple(c for some in contacts.values() for c in some), left)
 
 
 def _overlapping(solids: Sequence[Solid], displacements: Floats) -> list[tuple[int, int]]:
@@ -252,25 +252,25 @@ def _neighbours(solids: Sequence[Solid]) -> list[tuple[int, int]]:
     return _pairs(solids, STRtree(shapes).query(shapes, predicate="dwithin", distance=TOUCHING_M))
 
 
-def _pairs(solids: Sequence[Solid], found: Longs) -> list[tuple[int, int]]:
+def _pairs(solids: Sequence[Solid], rows: Longs) -> list[tuple[int, int]]:
     """Numbers of the two buildings of each pair, every pair once and sorted."""
-    return sorted((solids[a].number, solids[b].number) for a, b in found.T.tolist() if a < b)
+    return sorted((solids[a].number, solids[b].number) for a, b in rows.T.tolist() if a < b)
 
 
-def _is_nested(one: Solid, other: Solid) -> bool:
+def _is_building_part(one: Solid, other: Solid) -> bool:
     shared = one.shape.intersection(other.shape).area
     return bool(shared > NESTED * min(one.shape.area, other.shape.area))
 
 
-def _constrained(
-    solids: Sequence[Solid], wanted: Floats, information: Floats, contacts: dict[tuple[int, int], list[Contact]]
+def _constrain(
+    solids: Sequence[Solid], targets: Floats, information: Floats, contacts: dict[tuple[int, int], list[Contact]]
 ) -> Floats:
-    """The displacements (B, 3) nearest to `wanted` that satisfy all contacts, for each group of touching buildings."""
+    """The displacements (B, 3) nearest to `targets` that satisfy all contacts, for each group of touching buildings."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     pairs = np.array([pair for pair, some in contacts.items() if some], np.intp).reshape(-1, 2)
-    moved = wanted.copy()
+    moved = targets.copy()
     count = len(solids)
     links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (count, count))
     _, group = connected_components(links, directed=False)
@@ -278,14 +278,16 @@ def _constrained(
         members = np.flatnonzero(group == name)
         own = [c for (i, _), some in contacts.items() if group[i] == name for c in some]
         middles = np.array([solids[m].middle for m in members.tolist()])
-        moved[members] = _group(members.tolist(), middles, wanted[members], information[members], own)
+        moved[members] = _group(members.tolist(), middles, targets[members], information[members], own)
     return moved
 
 
-def _group(members: list[int], middles: Floats, wanted: Floats, information: Floats, contacts: list[Contact]) -> Floats:
+def _group(
+    members: list[int], middles: Floats, targets: Floats, information: Floats, contacts: list[Contact]
+) -> Floats:
     """Displacements (M, 3) of one group by Gauss-Newton; dense, since groups are small."""
     place = {m: k for k, m in enumerate(members)}
-    moved = wanted.copy()
+    moved = targets.copy()
     size = 3 * len(members)
     known = np.zeros((size, size))
     for k, own in enumerate(information):
@@ -297,7 +299,7 @@ def _group(members: list[int], middles: Floats, wanted: Floats, information: Flo
             found = _residual(contact, middles[i], moved[i], middles[j], moved[j])
             values[row], rows[row, 3 * i : 3 * i + 3], rows[row, 3 * j : 3 * j + 3] = found
         normal = known + rows.T @ rows / CONTACT_SIGMA_M**2
-        gradient = known @ (moved - wanted).ravel() + rows.T @ values / CONTACT_SIGMA_M**2
+        gradient = known @ (moved - targets).ravel() + rows.T @ values / CONTACT_SIGMA_M**2
         step = np.linalg.solve(normal, gradient).reshape(-1, 3)
         moved -= step
         if np.abs(step).max() < 1e-7:

@@ -13,7 +13,7 @@ import logging
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextvars import copy_context
 from pathlib import Path
@@ -26,25 +26,22 @@ from lslam.core.config.backend import OsmConfig
 from lslam.core.errors import InputError, OutputError, UsageError
 from lslam.core.kernels.cache import cache_folder
 from lslam.core.machine import one_at_a_time
-from lslam.core.untrusted import JsonItems, parse_json, whole_number
+from lslam.core.untrusted import JsonItems, whole_number
 from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.osm_data import OsmData
 from lslam.io.formats.osm_files import ELEMENTS, GaveUpError, add_elements, check_reply
 from lslam.osm.bounds import Bounds
 
 
-class OverpassReply(Mapping[str, Any]):
-    """The reply as the mapping its text says, parsed when it is asked for and then forgotten; nothing in it is checked.
-
-    text : JSON; UTF-8, UTF-16 or UTF-32
-    """
+class OverpassReply:
+    """The reply of a server as its text, of which nothing is checked: JSON in UTF-8, made of UTF-8, UTF-16 or UTF-32."""
 
     def __init__(self, text: bytes) -> None:
         encoding = json.detect_encoding(text[:4])
         self.text = text if encoding == "utf-8" else text.decode(encoding, "surrogatepass").encode("utf-8", "replace")
 
     @classmethod
-    def of(cls, tree: Mapping[str, Any]) -> OverpassReply:
+    def of(cls, tree: OverpassReply | Mapping[str, Any]) -> OverpassReply:
         """The reply of a parsed one, or itself."""
         return tree if isinstance(tree, cls) else cls(json.dumps(tree, ensure_ascii=False).encode("utf-8", "replace"))
 
@@ -64,25 +61,16 @@ class OverpassReply(Mapping[str, Any]):
             pass
         return found.rest
 
-    def __getitem__(self, key: str) -> Any:
-        return parse_json(self.text)[key]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(parse_json(self.text))
-
-    def __len__(self) -> int:
-        return len(parse_json(self.text))
-
     def __repr__(self) -> str:
         return f"OverpassReply({self.text[:60]!r}..., {len(self.text)} bytes)"
 
 
 def from_overpass(reply: Any) -> OsmData:
-    """An Overpass reply (`[out:json]`), an `OverpassReply` or parsed already. Raises as `merged`."""
-    return merged([reply])
+    """An Overpass reply (`[out:json]`), an `OverpassReply` or parsed already. Raises as `merge_replies`."""
+    return merge_replies([reply])
 
 
-def merged(replies: Iterable[Any]) -> OsmData:
+def merge_replies(replies: Iterable[Any]) -> OsmData:
     """One extract of many replies; what several hold is in it once.
 
     Raises ValueError saying what is wrong with one; GaveUpError, which is such, when a server did.
@@ -169,7 +157,7 @@ def kept_reply(bounds: Bounds, folder: Path) -> OverpassReply | None:
     larger = [(box.area_km2, path) for path in folder.glob("*.json") if (box := _bounds_of(path)) and box.holds(bounds)]
     for path in [exact, *(path for _, path in sorted(larger))]:
         try:
-            return _checked(OverpassReply(path.read_bytes()), bounds, is_own=path == exact)
+            return _check_place(OverpassReply(path.read_bytes()), bounds, is_own=path == exact)
         except (OSError, ValueError):
             continue
     return None
@@ -229,7 +217,7 @@ def _ask(bounds: Bounds, config: OsmConfig) -> OverpassReply:
         raise InputError(_too_late(config.server, config.timeout)) from None
     finally:
         is_late.set()
-    return _parsed(body, bounds, config.server)
+    return _parse(body, bounds, config.server)
 
 
 def _exchange(bounds: Bounds, config: OsmConfig, is_late: threading.Event) -> bytes:
@@ -298,11 +286,11 @@ def _too_late(server: str, limit: float) -> str:
     return f"{server} did not answer within {limit:g} s: try later, or name another osm.server"
 
 
-def _parsed(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
+def _parse(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
     if body[:64].lstrip()[:1] == b"<":
         raise InputError(f"{server} answered with a web page, not with data: check osm.server")
     try:
-        return _checked(OverpassReply(body), bounds)
+        return _check_place(OverpassReply(body), bounds)
     except (json.JSONDecodeError, UnicodeDecodeError):
         raise _TryAgainError("the reply was cut short") from None
     except GaveUpError as error:
@@ -311,7 +299,7 @@ def _parsed(body: bytes, bounds: Bounds, server: str) -> OverpassReply:
         raise InputError(f"the reply of {server} cannot be used, {error}: check osm.server") from None
 
 
-def _checked(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
+def _check_place(reply: OverpassReply, bounds: Bounds, is_own: bool = True) -> OverpassReply:
     """The reply; raises ValueError when it is invalid, or, for a reply to exactly `bounds`, about another place."""
     data = from_overpass(reply)
     places = np.array([*data.nodes.values()]).reshape(-1, 2)

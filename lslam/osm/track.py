@@ -52,7 +52,7 @@ class OsmTrack:
         self.pose = np.asarray(pose, np.float64)
         self.covariance = np.asarray(np.linalg.inv(information) + np.diag(self._map))
 
-    def squared(self, pose: Floats, information: Floats) -> tuple[float, int]:
+    def squared_distance(self, pose: Floats, information: Floats) -> tuple[float, int]:
         """Squared Mahalanobis distance of a match from the track, along the directions it observes, and their number."""
         error, H, R = self._innovation(pose, information)
         S = H @ self.covariance @ H.T + R
@@ -104,18 +104,18 @@ class OsmTrack:
     @staticmethod
     def _weight(information: Floats, variance: Floats) -> Floats:
         """Information (3, 3) of a match with an additional `variance` (3,); unobserved directions remain unobserved."""
-        H, own = _seen(information)
+        H, own = _directions(information)
         return np.asarray(H.T @ np.linalg.solve(own + H @ np.diag(variance) @ H.T, H))
 
     def _innovation(self, pose: Floats, information: Floats) -> tuple[Floats, Floats, Floats]:
         """Innovation (R,) of a match, its Jacobian (R, 3) and the covariance (R, R), along the observed directions."""
-        H, own = _seen(information)
+        H, own = _directions(information)
         away = np.asarray(pose, np.float64) - self.pose
         away[2] = se2.wrap(away[2])
         return H @ away, H, own + H @ np.diag(self._map) @ H.T
 
 
-def _seen(information: Floats) -> tuple[Floats, Floats]:
+def _directions(information: Floats) -> tuple[Floats, Floats]:
     """Directions (R, 3) that a match observes, and the covariance (R, R) along them."""
     values, axes = np.linalg.eigh(information)
     is_seen = values > FREE * values[-1]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lslam.backend.graph.drift import MEMORY_M, SIZES, correct_drift, linear_basis, rate_roots, walk_root
+from lslam.backend.graph.drift import MEMORY_M, SIZES, correct_drift, linear_basis, mean_rates, rate_roots, walk_root
 from lslam.backend.graph.factors import PLANAR
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
 from lslam.core.config.backend import GraphConfig
@@ -69,35 +69,35 @@ class Sizes:
 class DriftFit:
     """Least squares for start, shift of the map and rates at knots; the error of each wall on the map is marginalised.
 
-    effects : (K, 3, 5 + P) Jacobians of the planar poses; taken : (P,) rates by which the poses are corrected already
-    seen_sigma, map_sigma : m, of a sighting and of a wall on the map; given : (5,) m, rad, prior sigmas of start and shift
+    effects : (K, 3, 5 + P) Jacobians of the planar poses; rates_before : (P,) by which the poses are corrected already
+    seen_sigma, map_sigma : m, of a sighting and of a wall on the map; prior_sigmas : (5,) m, rad, of start and shift
     """
 
     def __init__(
         self,
         graph: PoseGraph,
-        seen: WallSightings,
+        sightings: WallSightings,
         effects: Floats,
-        taken: Floats,
+        rates_before: Floats,
         seen_sigma: float,
         map_sigma: float,
-        given: Floats,
+        prior_sigmas: Floats,
     ) -> None:
-        about = seen.places - graph.poses[seen.keyframes, :2, 3]
-        turned = seen.normals[:, 1] * about[:, 0] - seen.normals[:, 0] * about[:, 1]
-        self._axes = np.column_stack([seen.normals, turned])
-        self._keyframes, self._wall = seen.keyframes, np.unique(seen.walls, return_inverse=True)[1]
-        self._effects, self._seen, self._map, self._given = effects, seen_sigma**2, map_sigma**2, given
-        self._offsets = seen.offsets - self._along(np.append(np.zeros(len(given)), taken))
-        self._rows = float(len(seen.walls))
-        self._set_weights(np.ones(len(seen.walls)))
+        about = sightings.places - graph.poses[sightings.keyframes, :2, 3]
+        turned = sightings.normals[:, 1] * about[:, 0] - sightings.normals[:, 0] * about[:, 1]
+        self._axes = np.column_stack([sightings.normals, turned])
+        self._keyframes, self._wall = sightings.keyframes, np.unique(sightings.walls, return_inverse=True)[1]
+        self._effects, self._seen, self._map, self._given = effects, seen_sigma**2, map_sigma**2, prior_sigmas
+        self._offsets = sightings.offsets - self._along(np.append(np.zeros(len(prior_sigmas)), rates_before))
+        self._rows = float(len(sightings.walls))
+        self._set_weights(np.ones(len(sightings.walls)))
 
     def negative_log_likelihood(self, noise: float, root: Floats, sizes: tuple[float, ...]) -> Floats:
         """Twice the negative log-likelihood (len(sizes),), up to a constant, for `root` times each of `sizes`."""
         from scipy.linalg import cho_factor, cho_solve
 
         variance, n = noise**2 * self._seen, len(self._given)
-        normal, pull, squared = self._reduced(variance)
+        normal, pull, squared = self._without_walls(variance)
         whole = self._root(root)
         system, right = whole.T @ normal @ whole, whole.T @ pull
         free = self._rows * np.log(variance) + np.log1p(self._map / variance * self._weight).sum() + squared
@@ -111,14 +111,14 @@ class DriftFit:
 
     def rates(self, sizes: Sizes) -> tuple[Floats, Floats]:
         """Rates (P,) at the knots, three each, and their covariance (P, P)."""
-        found, covariance = self._solved(sizes)
+        found, covariance = self._solve(sizes)
         n = len(self._given)
         return found[n:], covariance[n:, n:]
 
     def reweight(self, sizes: Sizes) -> None:
         """Reweight the sightings by Student's t of their residuals (IRLS)."""
         variance = sizes.noise**2 * self._seen
-        away = self._offsets + self._along(self._solved(sizes)[0])
+        away = self._offsets + self._along(self._solve(sizes)[0])
         pulls = np.bincount(self._wall, self._weights * away)
         away -= (pulls / (self._weight + variance / self._map))[self._wall]
         self._set_weights((FREEDOM + 1.0) / (FREEDOM + away**2 / variance))
@@ -152,7 +152,7 @@ class DriftFit:
         self._by_wall, self._wall_offsets = by_wall @ flat, np.bincount(self._wall, weights * self._offsets)
         self._known: dict[float, tuple[Floats, Floats, float]] = {}
 
-    def _reduced(self, variance: float) -> tuple[Floats, Floats, float]:
+    def _without_walls(self, variance: float) -> tuple[Floats, Floats, float]:
         """Normal matrix, right side and squared norm of the offsets, with the errors of the walls marginalised."""
         if variance not in self._known:
             share = 1.0 / np.sqrt(self._weight + variance / self._map)
@@ -171,9 +171,9 @@ class DriftFit:
         whole[:n, :n], whole[n:, n:] = np.diag(self._given), rates
         return whole
 
-    def _solved(self, sizes: Sizes) -> tuple[Floats, Floats]:
+    def _solve(self, sizes: Sizes) -> tuple[Floats, Floats]:
         """Posterior mean and covariance of the parameters, without the inverse of the prior, which may be singular."""
-        normal, pull, _ = self._reduced(sizes.noise**2 * self._seen)
+        normal, pull, _ = self._without_walls(sizes.noise**2 * self._seen)
         root = self._root(sizes.root)
         covariance = root @ np.linalg.solve(np.eye(len(root)) + root.T @ normal @ root, root.T)
         return np.asarray(covariance @ pull), np.asarray(covariance)
@@ -188,14 +188,14 @@ class WallDrift:
         of earlier iterations
     spread : (K, 6, 6) covariance of the poses due to that of the rates, as the covariances of `Solution`
     estimated_drift : the total drift
-    is_settled : whether the iteration has converged: the additional rates are well below their sigmas
+    is_final : whether the iteration has converged: the additional rates are well below their sigmas
     """
 
     knots: Floats
     rates: Floats
     spread: Floats
     estimated_drift: EstimatedDrift
-    is_settled: bool
+    is_final: bool
 
     @property
     def is_sure(self) -> bool:
@@ -205,7 +205,7 @@ class WallDrift:
 
 def find_wall_drift(
     graph: PoseGraph,
-    seen: WallSightings,
+    sightings: WallSightings,
     seen_sigma: float,
     map_sigma: float,
     config: GraphConfig,
@@ -220,21 +220,21 @@ def find_wall_drift(
     seen_sigma, map_sigma : m, of a sighting, and of a wall of the map beside the common shift
     before : the correction applied already; the prior is on the total drift
     """
-    if not len(seen.walls) or graph.start_sigma is None or graph.distances[-1] <= 0:
+    if not len(sightings.walls) or graph.start_sigma is None or graph.distances[-1] <= 0:
         return None
 
-    def fitted(is_varying: bool) -> WallDrift:
-        return _fitted(graph, seen, (seen_sigma, map_sigma), config, before, is_varying)
+    def fit_rates(is_varying: bool) -> WallDrift:
+        return _fit_rates(graph, sightings, (seen_sigma, map_sigma), config, before, is_varying)
 
     if before is not None:
-        return fitted(before.estimated_drift.is_varying)
-    constant, varying = fitted(is_varying=False), fitted(is_varying=True)
+        return fit_rates(before.estimated_drift.is_varying)
+    constant, varying = fit_rates(is_varying=False), fit_rates(is_varying=True)
     return varying if varying.is_sure and varying.estimated_drift.gain > constant.estimated_drift.gain else constant
 
 
-def _fitted(
+def _fit_rates(
     graph: PoseGraph,
-    seen: WallSightings,
+    sightings: WallSightings,
     sigmas: tuple[float, float],
     config: GraphConfig,
     before: WallDrift | None,
@@ -247,7 +247,7 @@ def _fitted(
     at_knots = linear_basis(graph.distances, apart)
     effects = _effects(graph, at_knots)
     taken = np.zeros(3 * at_knots.shape[1]) if before is None else before.knots.ravel()
-    fit = DriftFit(graph, seen, effects, taken, *sigmas, np.append(graph.start_sigma, [graph.shift_sigma] * 2))
+    fit = DriftFit(graph, sightings, effects, taken, *sigmas, np.append(graph.start_sigma, [graph.shift_sigma] * 2))
     roots = [walk_root(length, config, PLANAR, apart)] if is_varying else rate_roots(length, config, PLANAR)
     sizes = _likeliest(fit, roots)
     for _ in range(REWEIGHTINGS):
@@ -255,14 +255,13 @@ def _fitted(
         sizes = _likeliest(fit, roots)
     found, _ = fit.rates(sizes)
     # The correlation of sightings is in the covariance alone, not in the estimate.
-    fit.count_less(seen.share)
+    fit.count_less(sightings.share)
     _, covariance = fit.rates(sizes)
     without = min(float(fit.negative_log_likelihood(noise, sizes.root, (0.0,))[0]) for noise in SCALES)
     gain = without - float(fit.negative_log_likelihood(sizes.noise, sizes.root, (1.0,))[0])
     new = found - taken
+    mean, sigma = mean_rates(graph.distances, at_knots, found, covariance)
     shares = np.diff(graph.distances) / np.ptp(graph.distances)
-    mean = np.kron(shares @ at_knots, np.eye(3))
-    sigma = np.sqrt(np.diag(mean @ covariance @ mean.T))
     rms = np.sqrt(shares @ (at_knots @ found.reshape(-1, 3)) ** 2) if is_varying else None
     moves = effects[:, :, 5:]
     spread = np.zeros((len(graph), 6, 6))
@@ -271,8 +270,8 @@ def _fitted(
         found.reshape(-1, 3),
         np.asarray(at_knots @ new.reshape(-1, 3)),
         spread,
-        EstimatedDrift(-(mean @ found), sigma, gain, quantile(RIGHT_PROBABILITY, FITTED), rms),
-        is_settled=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
+        EstimatedDrift(-mean, sigma, gain, quantile(RIGHT_PROBABILITY, FITTED), rms),
+        is_final=float(new @ np.linalg.solve(covariance, new)) <= SETTLED * len(found),
     )
 
 

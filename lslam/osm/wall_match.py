@@ -60,7 +60,6 @@ class WallMatch:
     fitness : of equation 3.4, weighted as the configuration says; coverage : share of the source's length that lies on the
         target; distance : m, mean distance of equation 3.1; rms : m, of the distances across paired walls
     pairs : (K, 2) int64 numbers of a source wall and of its target wall
-    kind : `edges` when the paired walls are not all parallel, else `lines`
     is_ambiguous : another pose fits nearly as well
     """
 
@@ -72,8 +71,18 @@ class WallMatch:
     distance: float
     rms: float
     pairs: Longs
-    kind: Literal["edges", "lines"]
-    is_ambiguous: bool
+    is_ambiguous: bool = False
+
+    @property
+    def kind(self) -> Literal["edges", "lines"]:
+        """`edges` when the paired walls are not all parallel, else `lines`."""
+        return "edges" if self.rank == 3 else "lines"
+
+    def facts(self) -> dict[str, Any]:
+        """The fields that it has in common with the matches of keyframes and of buildings, and why it is rejected."""
+        names = ("pose", "information", "rank", "kind", "fitness", "coverage", "rms", "pairs")
+        reason = "another place fits nearly as well" if self.is_ambiguous else ""
+        return {name: getattr(self, name) for name in names} | {"reason": reason}
 
 
 def match_walls(
@@ -96,7 +105,7 @@ def match_walls(
     at, spread = np.asarray(prior, np.float64), np.asarray(sigma, np.float64)
     window = np.append(SEARCH_SIGMAS * spread[:2], min(SEARCH_SIGMAS * spread[2], np.pi))
     trust = FAINT * config.wall_sigma**2 / np.maximum(spread, 1e-6) ** 2
-    return _best(_rows(source), _rows(target), at, window, trust, config, by_coverage)
+    return _WallSearch(_rows(source), _rows(target), at, window, trust, config, by_coverage).best()
 
 
 def find_heading(
@@ -110,120 +119,122 @@ def find_heading(
     config = config or OsmConfig()
     # Without a heading the least coverage is larger, and the distance from the prior does not count.
     config = config.model_copy(update={"translation_weight": 0.0, "min_coverage": MIN_START_COVERAGE})
-    at = np.append(np.asarray(place, np.float64)[:2], 0.0)
-    found = _best(
-        _rows(source), _rows(target), at, np.array([radius, radius, np.pi]), np.zeros(3), config, by_coverage=False
-    )
-    return None if found is None or found.rank < 3 or len(found.pairs) < START_WALLS else found
-
-
-def _best(
-    seen: Floats, known: Floats, at: Floats, window: Floats, trust: Floats, config: OsmConfig, by_coverage: bool
-) -> WallMatch | None:
-    """The refined pose of best fitness, from the prior and from the poses that corners propose."""
-    known, numbers = _within(known, seen, at, float(np.hypot(window[0], window[1])))
-    if not len(seen) or not len(known):
-        return None
-    gates = FINE_GATES if by_coverage else GATES
-    starts = [(at, np.concatenate([FIRST_GATES, gates]))]
-    starts += [(pose, gates) for pose in _proposals(seen, known, at, window, by_coverage)]
-
-    def laid(starts: list[tuple[Floats, Floats]]) -> list[WallMatch]:
-        found = [_refined(seen, known, pose, gates, at, trust, window, config, by_coverage) for pose, gates in starts]
-        return [m for m in found if m is not None]
-
-    inside = laid(starts)
-    if not inside:
-        return None
-    best = max(inside, key=lambda m: m.fitness)
-    if best.rank < 3:
-        inside += laid([(pose, gates) for pose in _beside(best, at, window)])
-        best = max(inside, key=lambda m: m.fitness)
-    if best.coverage < (MIN_BUILDING_COVERAGE if by_coverage else config.min_coverage):
-        return None
-    pairs = np.column_stack([best.pairs[:, 0], numbers[best.pairs[:, 1]]])
-    return replace(best, pairs=pairs, is_ambiguous=_has_alternative(best, inside, config))
+    at, window = np.append(np.asarray(place, np.float64)[:2], 0.0), np.array([radius, radius, np.pi])
+    match = _WallSearch(_rows(source), _rows(target), at, window, np.zeros(3), config, by_coverage=False).best()
+    return None if match is None or match.rank < 3 or len(match.pairs) < START_WALLS else match
 
 
 def _rows(segments: NDArray[Any]) -> Floats:
     return np.ascontiguousarray(np.asarray(segments, np.float64).reshape(-1, 4))
 
 
-def _within(known: Floats, seen: Floats, at: Floats, slack: float) -> tuple[Floats, Longs]:
-    """The target walls within reach of the source, and their numbers."""
-    reach = min(float(np.abs(seen).max(initial=0.0)) * np.sqrt(2), VISIBLE_M * 2) + slack + 5.0
-    a, b = known[:, :2] - at[:2], known[:, 2:] - at[:2]
-    along = b - a
-    share = np.clip(-(a * along).sum(1) / np.maximum((along * along).sum(1), 1e-12), 0, 1)
-    numbers = np.flatnonzero(np.linalg.norm(a + share[:, None] * along, axis=1) <= reach)
-    return np.ascontiguousarray(known[numbers]), numbers
+class _WallSearch:
+    """The search for the pose of source walls among target walls, rows x y x y, m, in a window about a prior.
+
+    at : (3,) the prior; window : (3,) m, m, rad; trust : (3,) inverse variances of the prior relative to that of a wall
+    by_coverage : as of `match_walls`
+    """
+
+    def __init__(
+        self,
+        source: Floats,
+        target: Floats,
+        at: Floats,
+        window: Floats,
+        trust: Floats,
+        config: OsmConfig,
+        by_coverage: bool,
+    ) -> None:
+        self.source, self.at, self.window, self.trust = source, at, window, trust
+        self.config, self.by_coverage = config, by_coverage
+        self.numbers = self._within_reach(target)
+        self.target = np.ascontiguousarray(target[self.numbers])
+
+    def best(self) -> WallMatch | None:
+        """The refined pose of best fitness, from the prior and from the poses that corners propose."""
+        if not len(self.source) or not len(self.target):
+            return None
+        gates = FINE_GATES if self.by_coverage else GATES
+        starts = [(self.at, np.concatenate([FIRST_GATES, gates]))]
+        starts += [(pose, gates) for pose in self._proposals()]
+        inside = self._refine_all(starts)
+        if not inside:
+            return None
+        best = max(inside, key=lambda m: m.fitness)
+        if best.rank < 3:
+            inside += self._refine_all([(pose, gates) for pose in self._beside(best)])
+            best = max(inside, key=lambda m: m.fitness)
+        if best.coverage < (MIN_BUILDING_COVERAGE if self.by_coverage else self.config.min_coverage):
+            return None
+        pairs = np.column_stack([best.pairs[:, 0], self.numbers[best.pairs[:, 1]]])
+        return replace(best, pairs=pairs, is_ambiguous=_has_alternative(best, inside, self.config))
+
+    def _within_reach(self, target: Floats) -> Longs:
+        """Numbers of the target walls within reach of the source."""
+        slack = float(np.hypot(self.window[0], self.window[1]))
+        reach = min(float(np.abs(self.source).max(initial=0.0)) * np.sqrt(2), VISIBLE_M * 2) + slack + 5.0
+        a, b = target[:, :2] - self.at[:2], target[:, 2:] - self.at[:2]
+        along = b - a
+        share = np.clip(-(a * along).sum(1) / np.maximum((along * along).sum(1), 1e-12), 0, 1)
+        return np.flatnonzero(np.linalg.norm(a + share[:, None] * along, axis=1) <= reach)
+
+    def _proposals(self) -> Floats:
+        """Poses (K, 3) with many votes of pairs of corners, those of least distance between the walls first."""
+        ours, theirs = (wall_matching.corners(walls, EDGE_REACH_M, SHARPEST) for walls in (self.source, self.target))
+        if not len(ours) or not len(theirs):
+            return np.zeros((0, 3))
+        # The corners of largest weight are enough.
+        ours = ours[np.argsort(-ours[:, 4], kind="stable")[:CORNERS]]
+        is_round = bool(self.window[2] >= np.pi - 1e-9)
+        cell = np.where(is_round, [*CELL[:2], 2 * np.pi / 90 * (1 + 1e-9)], CELL)
+        grid = wall_matching.votes(ours, theirs, self.at, self.window, cell, CORNER_SPREAD_RAD)
+        if is_round:
+            grid = np.ascontiguousarray(grid[:, :, :90])
+        poses = wall_matching.peaks(grid, self.at, PROPOSALS, is_round)
+        away = [self._fit(pose, ROUGH)[0] for pose in poses]
+        return np.asarray(poses[np.argsort(away, kind="stable")[:REFINED]])
+
+    def _beside(self, best: WallMatch) -> Floats:
+        """Poses (K, 3) across the parallel walls of `best`, over the whole window; parallel walls have no corners that vote."""
+        across = np.linalg.eigh(best.information[:2, :2])[1][:, 1]
+        reach = float(np.linalg.norm(across * self.window[:2]))
+        steps = np.arange(0.5 * BESIDE, reach, BESIDE)
+        return np.asarray(self.at + np.append(across, 0.0) * np.concatenate([-steps, steps])[:, None])
+
+    def _refine_all(self, starts: list[tuple[Floats, Floats]]) -> list[WallMatch]:
+        return [match for start in starts if (match := self._refine(*start)) is not None]
+
+    def _refine(self, pose: Floats, gates: Floats) -> WallMatch | None:
+        """The pose refined by lines; None when it leaves the window or no wall has a partner."""
+        at, config, prior = self.at, self.config, (self.at, self.trust)
+        pose, normal, centre, rms, pair = wall_matching.refine(
+            self.source, self.target, pose, *prior, gates, LAST_ITERATIONS, LIKENESS, SHORT, self.by_coverage
+        )
+        away = np.array([*(pose[:2] - at[:2]), (pose[2] - at[2] + np.pi) % (2 * np.pi) - np.pi])
+        if (np.abs(away) > self.window + REFINED_SLACK).any() or not (pair >= 0).any():
+            return None
+        # The error of a wall on the map does not decrease with the number of points on it.
+        planar, free, rank = _deflate(normal / config.wall_sigma**2)
+        pose[:2] -= free @ away[:2]
+        distance, coverage, pair = self._fit(pose, config.max_distance)
+        if not (pair >= 0).any():
+            return None
+        translation = float(np.linalg.norm(pose[:2] - at[:2]))
+        farthest = float(np.linalg.norm(self.window[:2]))
+        fitness = 100.0 * (
+            -config.distance_weight * min(distance / config.max_distance, 1.0)
+            + config.coverage_weight * coverage
+            - config.translation_weight * min(translation / max(farthest, 1e-9), 1.0)
+        )
+        information = _at_pose(planar, centre, pose) * (1.0 if rank == 3 else LINE_WEIGHT)
+        pairs = np.column_stack([np.flatnonzero(pair >= 0), pair[pair >= 0]])
+        return WallMatch(pose, information, rank, float(fitness), float(coverage), float(distance), float(rms), pairs)
+
+    def _fit(self, pose: Floats, farthest: float) -> tuple[float, float, Longs]:
+        return wall_matching.fit(self.source, self.target, pose, farthest, LIKENESS, self.by_coverage)
 
 
-def _proposals(seen: Floats, known: Floats, at: Floats, window: Floats, by_coverage: bool) -> Floats:
-    """Poses (K, 3) with many votes of pairs of corners, those of least distance between the walls first."""
-    ours, theirs = (wall_matching.corners(walls, EDGE_REACH_M, SHARPEST) for walls in (seen, known))
-    if not len(ours) or not len(theirs):
-        return np.zeros((0, 3))
-    # The corners of largest weight are enough.
-    ours = ours[np.argsort(-ours[:, 4], kind="stable")[:CORNERS]]
-    is_round = bool(window[2] >= np.pi - 1e-9)
-    cell = np.where(is_round, [*CELL[:2], 2 * np.pi / 90 * (1 + 1e-9)], CELL)
-    grid = wall_matching.votes(ours, theirs, at, window, cell, CORNER_SPREAD_RAD)
-    if is_round:
-        grid = np.ascontiguousarray(grid[:, :, :90])
-    poses = wall_matching.peaks(grid, at, PROPOSALS, is_round)
-    away = [wall_matching.fit(seen, known, pose, ROUGH, LIKENESS, by_coverage)[0] for pose in poses]
-    return np.asarray(poses[np.argsort(away, kind="stable")[:REFINED]])
-
-
-def _beside(best: WallMatch, at: Floats, window: Floats) -> Floats:
-    """Poses (K, 3) across the parallel walls of `best`, over the whole window; parallel walls have no corners that vote."""
-    across = np.linalg.eigh(best.information[:2, :2])[1][:, 1]
-    reach = float(np.linalg.norm(across * window[:2]))
-    steps = np.arange(0.5 * BESIDE, reach, BESIDE)
-    return np.asarray(at + np.append(across, 0.0) * np.concatenate([-steps, steps])[:, None])
-
-
-def _refined(
-    seen: Floats,
-    known: Floats,
-    pose: Floats,
-    gates: Floats,
-    at: Floats,
-    trust: Floats,
-    window: Floats,
-    config: OsmConfig,
-    by_coverage: bool,
-) -> WallMatch | None:
-    """The pose refined by lines; None when it leaves the window or no wall has a partner."""
-    pose, normal, centre, rms, pair = wall_matching.refine(
-        seen, known, pose, at, trust, gates, LAST_ITERATIONS, LIKENESS, SHORT, by_coverage
-    )
-    away = np.array([*(pose[:2] - at[:2]), (pose[2] - at[2] + np.pi) % (2 * np.pi) - np.pi])
-    if (np.abs(away) > window + REFINED_SLACK).any() or not (pair >= 0).any():
-        return None
-    # The error of a wall on the map does not decrease with the number of points on it.
-    planar, free, rank = _deflated(normal / config.wall_sigma**2)
-    pose[:2] -= free @ away[:2]
-    distance, coverage, pair = wall_matching.fit(seen, known, pose, config.max_distance, LIKENESS, by_coverage)
-    if not (pair >= 0).any():
-        return None
-    translation = float(np.linalg.norm(pose[:2] - at[:2]))
-    farthest = float(np.linalg.norm(window[:2]))
-    fitness = 100.0 * (
-        -config.distance_weight * min(distance / config.max_distance, 1.0)
-        + config.coverage_weight * coverage
-        - config.translation_weight * min(translation / max(farthest, 1e-9), 1.0)
-    )
-    kind: Literal["edges", "lines"] = "edges" if rank == 3 else "lines"
-    information = _at_pose(planar, centre, pose) * (1.0 if kind == "edges" else LINE_WEIGHT)
-    pairs = np.column_stack([np.flatnonzero(pair >= 0), pair[pair >= 0]])
-    return WallMatch(
-        pose, information, rank, float(fitness), float(coverage), float(distance), float(rms), pairs, kind, False
-    )
-
-
-def _deflated(normal: Floats) -> tuple[Floats, Floats, int]:
+def _deflate(normal: Floats) -> tuple[Floats, Floats, int]:
     """The normal matrix (3, 3) about the walls' centre without free directions, whose information is noise of the walls' angles.
 
     Returns also the projector (2, 2) on the free directions, and the rank of the matrix.
@@ -278,27 +289,11 @@ def match_keyframe(view: KeyframeMatch, osm: OsmMap, config: OsmConfig) -> Keyfr
     numbers = osm.walls_near(view.prior[:2], reach)
     if not len(numbers):
         return replace(view, reason="no building near")
-    found = match_walls(view.walls, osm.walls[numbers], view.prior, view.sigma, config)
-    if found is None:
+    match = match_walls(view.walls, osm.walls[numbers], view.prior, view.sigma, config)
+    if match is None:
         return replace(view, reason="too few of the walls seen lie on the map")
-    return matched(view, found, numbers)
-
-
-def matched(view: KeyframeMatch, found: WallMatch, numbers: Longs) -> KeyframeMatch:
-    """`view` with the match `found`; numbers : (T,) of the map's walls that it was matched with."""
-    pairs = np.column_stack([found.pairs[:, 0], numbers[found.pairs[:, 1]]])
-    return replace(
-        view,
-        pose=found.pose,
-        information=found.information,
-        rank=found.rank,
-        kind=found.kind,
-        fitness=found.fitness,
-        coverage=found.coverage,
-        rms=found.rms,
-        pairs=pairs,
-        reason="another place fits nearly as well" if found.is_ambiguous else "",
-    )
+    pairs = np.column_stack([match.pairs[:, 0], numbers[match.pairs[:, 1]]])
+    return replace(view, **match.facts() | {"pairs": pairs})
 
 
 def match_buildings(
@@ -323,23 +318,8 @@ def match_buildings(
         one = match_walls(walls, match.walls, prior, sigma, own, by_coverage=True)
         if one is None:
             continue
-        reason = "another place fits nearly as well" if one.is_ambiguous else ""
-        found.append(
-            BuildingMatch(
-                match.keyframe,
-                number,
-                one.pose,
-                one.information,
-                one.rank,
-                one.kind,
-                one.fitness,
-                one.coverage,
-                one.rms,
-                one.pairs,
-                Verdict.REJECTED if reason else Verdict.ACCEPTED,
-                reason,
-            )
-        )
+        verdict = Verdict.REJECTED if one.is_ambiguous else Verdict.ACCEPTED
+        found.append(BuildingMatch(match.keyframe, number, **one.facts(), verdict=verdict))
     return found
 
 

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from lslam.backend import added_drift
-from lslam.backend.control_points import doubts, where_held
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import mounted_up
+from lslam.backend.control_points import doubts, place_keyframes
+from lslam.backend.keyframes.store import KeyframeStore, mounted_up
 from lslam.backend.levelling import find_level, level_results
-from lslam.backend.loops.find_loops import find_loops, verify_known
+from lslam.backend.loops.find_loops import find_loops, verify_pairs
 from lslam.backend.manual import KeyframePairs, keyframe_pairs, write_control
 from lslam.backend.optimise import run_back_end
 from lslam.backend.outcome import BackEnd
@@ -119,7 +118,7 @@ def _loops(
         candidates: list[LoopCandidate] = known["candidates"]
         return candidates, doubts(store.keyframes, candidates[: len(pairs.known)], pairs.known, results, config)
     submap_size, up = config.keyframes.submap_size, mounted_up(store, poses, config.preprocess)
-    candidates = verify_known(store, pairs.known, config.loops, config.registration, submap_size, should_stop, up)
+    candidates = verify_pairs(store, pairs.known, config.loops, config.registration, submap_size, should_stop, up)
     said = doubts(store.keyframes, candidates, pairs.known, results, config)
     if config.loops.use:
         taken = {(c.a, c.b) for c in candidates}
@@ -131,7 +130,7 @@ def _loops(
             clocks,
             should_stop,
             config.input.workers,
-            where_held(store.keyframes, candidates, job.manual.points, results, config),
+            place_keyframes(store.keyframes, candidates, job.manual.points, results, config),
             pairs.forbidden,
             up,
         )

@@ -9,7 +9,7 @@ from lslam.core.config.odometry import FIXED_DEVICE, TIGHTLY_COUPLED
 from lslam.core.errors import UsageError
 from lslam.evaluation import check_words, parse_delta
 from lslam.odometry import FEATURE_METHODS, METHODS, require_method
-from lslam.osm import matcher_named
+from lslam.osm import find_matcher
 from lslam.registration.residuals import find_residual
 
 # Methods that match a scan against Gaussian voxels, and what only some methods look at. A policy of `recovery` that is switched
@@ -57,7 +57,7 @@ def check_config(config: Config) -> None:
     if config.registration.residual is not None:
         find_residual(config.registration.residual)
     _check_heeded(config)
-    matcher_named(config.osm.matcher)
+    find_matcher(config.osm.matcher)
     if not config.osm.extract and (config.osm.origin is not None or config.osm.heading_deg is not None):
         raise UsageError("--origin and --heading do nothing without --osm FILE: give it, or drop them")
     _check_places(config)

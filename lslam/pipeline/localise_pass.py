@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from lslam.backend.graph.drift import drift_covariance
-from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.localization.follow import MapFollower, doubted
-from lslam.backend.localization.place_search import PlaceSearch
-from lslam.backend.localization.prior_map import LocalView, PriorMap
-from lslam.backend.localization.start import PlaceFinder, Start, StartPrior
+from lslam.backend.localization.locate import MapFollower, PlaceFinder, Start, StartPrior, mark_doubts
+from lslam.backend.localization.prior_map import LocalView, PlaceSearch, PriorMap
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError, RunFailedError
 from lslam.core.geometry import noise, se3
@@ -223,7 +221,7 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
     results = record.results[: len(fixes)]
     into_map = [
         replace(f, T_map_lidar=T @ f.T_map_lidar, covariance=noise.rotate(f.covariance, T[:3, :3]))
-        for f in doubted(fixes)
+        for f in mark_doubts(fixes)
     ]
     held = [k for k, fix in enumerate(into_map) if fix.is_binding]
     if not held:
@@ -234,7 +232,7 @@ def _deliver(record: RunRecord, prior_map: PriorMap, fixes: list[MapFix], config
     poses = np.stack([into_map[k].T_map_lidar for k in held])
     covariances = np.stack([into_map[k].covariance for k in held])
     record.odometry = record.trajectory
-    record.results = corrected(results, anchors, poses, covariances, 1.0, config.graph)
+    record.results = correct_scans(results, anchors, poses, covariances, 1.0, config.graph)
     record.trajectory = to_trajectory(record.results, record.method)
     record.georeference = prior_map.georeference
     record.map_fixes = [replace(f, T_map_lidar=r.T_world_lidar) for f, r in zip(into_map, record.results, strict=True)]

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from lslam.backend.graph.odometry_constraints import corrected
+from lslam.backend.graph.odometry_constraints import correct_scans
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PoseGraph, Solution
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.localization.sessions import Chain, Session, tie
 from lslam.backend.loops.detector import Detector
 from lslam.backend.loops.find_loops import warm_up
-from lslam.backend.outcome import judged_by
+from lslam.backend.outcome import apply_verdicts
 from lslam.core.config import Config
 from lslam.core.errors import GraphError, InputError, InterruptedRunError, RunFailedError, UsageError
 from lslam.core.stopping import asking
@@ -231,8 +231,10 @@ def _solve(
     for n, session in enumerate(chain.sessions):
         part = chain.part(n)
         poses, covariances = solution.poses[part], solution.covariances[part]
-        results.append(corrected(session.results, session.keyframes, poses, covariances, solution.drift, config.graph))
-    judged, _ = judged_by(candidates, graph, solution)
+        results.append(
+            correct_scans(session.results, session.keyframes, poses, covariances, solution.drift, config.graph)
+        )
+    judged, _ = apply_verdicts(candidates, graph, solution)
     return Merged(
         [runs[s.name] for s in chain.sessions], chain.sessions, results, chain, chain.poses, solution, judged, left_out
     )

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.backend.graph.factors import well_conditioned
+from lslam.backend.graph.factors import regularise
 from lslam.core import __version__
 from lslam.core.config import Config
 from lslam.core.errors import InputError, InterruptedRunError, LslamError, OutputError, UsageError
@@ -114,7 +114,7 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
     numbers = [s.results[k.scan].index for s in merged.sessions for k in s.keyframes]
     write_loops(folder.path / "loops.csv", merged.candidates, numbers)
     accepted = [c.constraint for c in merged.candidates if c.is_accepted and c.constraint is not None]
-    constraints = [replace(c, covariance=well_conditioned(c.covariance)) for c in (*merged.chain.odometry(), *accepted)]
+    constraints = [replace(c, covariance=regularise(c.covariance)) for c in (*merged.chain.odometry(), *accepted)]
     write_g2o(folder.path / "graph.g2o", merged.solution.poses, constraints)
     georeference = _georeference(merged)
     about: dict[str, Any] = {}

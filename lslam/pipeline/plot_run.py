@@ -14,7 +14,7 @@ from lslam.io.formats.atomic import atomic_write
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.odometry import create_odometry
 from lslam.odometry.base import FeatureSource
-from lslam.osm.buildings_geojson import read_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.pipeline.feature_map_pass import view_features
 from lslam.pipeline.job import choose_scans
 from lslam.pipeline.rebuild import is_gone, read_run, results_of, viewed_run
@@ -45,7 +45,7 @@ def plotted_run(
     if what == "trajectory" and (folder / "trajectory_odometry.tum").is_file():
         about["odometry"] = read_trajectory(folder / "trajectory_odometry.tum", "tum")
     if what == "buildings" and (folder / "buildings.geojson").is_file():
-        about["buildings"] = read_corrected(folder / "buildings.geojson")
+        about["buildings"] = read_buildings_geojson(folder / "buildings.geojson")
     if what not in ON_THE_MAP and not (what == "trajectory" and sequence is None and is_gone(run)):
         opened = open_again(run, sequence, **reading)
         given = truth_of(opened) or opened.ground_truth

@@ -10,8 +10,8 @@ import numpy as np
 
 from lslam.backend.adjustment import SweptPoints, adjust
 from lslam.backend.control_points import control_facts, control_residuals
-from lslam.backend.graph.odometry_constraints import bent
-from lslam.backend.graph.pose_prior import PosePrior
+from lslam.backend.graph.marginals import PosePrior
+from lslam.backend.graph.odometry_constraints import bend_scans
 from lslam.backend.outcome import BackEnd
 from lslam.core.config import Config
 from lslam.core.errors import InterruptedRunError
@@ -145,7 +145,9 @@ def _adjustment(
         for number, (i, k) in enumerate((i, nodes[i]) for i in np.flatnonzero(is_taken).tolist())
     ]
     # Poses in frames of their own know nothing of these.
-    moved = [b if not a.frame else a for a, b in zip(results, bent(results, anchors, after[is_taken]), strict=True)]
+    moved = [
+        b if not a.frame else a for a, b in zip(results, bend_scans(results, anchors, after[is_taken]), strict=True)
+    ]
     away = np.linalg.norm(after[is_taken, :3, 3] - before[is_taken, :3, 3], axis=1)
     facts |= {
         "thickness_before_mm": _thickness_mm(thick[0][is_judge]),

@@ -11,8 +11,8 @@ import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore, PartOfStore
 from lslam.backend.localization.sessions import Chain, Session, Vicinity, tie
-from lslam.backend.localization.start import is_elsewhere
 from lslam.backend.loops.detector import LEAST_REACH
+from lslam.backend.loops.verify import is_elsewhere
 from lslam.core.config import Config
 from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.loops.pair_view import view_pairs
+from lslam.backend.loops.find_loops import view_pairs
 from lslam.backend.outcome import BackEnd, view_loop
 from lslam.core.config import Config, load_config
 from lslam.core.errors import (

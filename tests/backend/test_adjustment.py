@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.adjustment import SweptPoints, adjust, find_planes
-from lslam.backend.graph.pose_prior import PosePrior
+from lslam.backend.graph.marginals import PosePrior
 from lslam.backend.kernels import plane_adjustment
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
@@ -114,7 +114,7 @@ def test_points_move_with_the_poses_round_the_instant_they_were_measured() -> No
     np.testing.assert_allclose(swept.shares, [0.0, 0.0, 0.5, 0.0, 0.0])
     corrections = np.zeros((2, 6))
     corrections[1] = [0.2, 0, 0, 0, 0, np.pi / 2]
-    moved = swept.moved(np.stack([np.eye(4), np.eye(4)]), corrections)
+    moved = swept.move(np.stack([np.eye(4), np.eye(4)]), corrections)
     np.testing.assert_allclose(moved[[0, 3]], [[1, 0, 0], [0.2, 1, 0]], atol=1e-12)
     np.testing.assert_allclose(moved[2], [0.6, 0.5, 0], atol=1e-12)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lslam.backend.control_points import contradicting, control_residuals, where_held, with_control
+from lslam.backend.control_points import contradicting, control_residuals, place_keyframes, with_control
 from lslam.backend.georeferencing import Placement
 from lslam.core.config import Config
 from lslam.core.errors import UsageError
@@ -52,7 +52,7 @@ def test_exact_points_give_the_exact_place_and_factors_without_a_residual(seen: 
     on_earth = placed.georeference.T_enu_world @ np.stack([k.T_world_lidar for k in KEYFRAMES])
     for fix in placed.fixes:
         assert fix.is_binding
-        np.testing.assert_allclose(fix.seen(on_earth), fix.position, atol=2e-3)
+        np.testing.assert_allclose(fix.predict(on_earth), fix.position, atol=2e-3)
     # Scan 21 is no keyframe: half of it hangs on the one before, half on the next.
     assert (placed.fixes[1].keyframe, placed.fixes[1].share) == (10, pytest.approx(0.5))
     left = control_residuals(points, RESULTS, placed.georeference)
@@ -120,4 +120,4 @@ def test_coordinates_that_are_none_are_refused(position: list[float], epsg: int,
 def test_one_keyframe_and_one_scan_are_placed_nowhere() -> None:
     points = surveyed((0, 60))
     for results, keyframes in ((RESULTS, KEYFRAMES[:1]), (RESULTS[:1], KEYFRAMES[:1])):
-        assert where_held(keyframes, [], points, results, Config()) == keyframes
+        assert place_keyframes(keyframes, [], points, results, Config()) == keyframes

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lslam.backend.final_checks import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.backend.fix_faults import Fixes
+from lslam.backend.optimise import fixes_against_points, redundancy, thickening, thicker_map
 from lslam.core.geometry import geodesy
 from lslam.core.types.constraint import ControlPoint, Instant
 from lslam.core.types.gnss import Georeference

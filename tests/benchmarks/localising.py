@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 import lslam
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.localization.place_search import PlaceSearch
-from lslam.backend.localization.start import PlaceFinder
+from lslam.backend.localization.locate import PlaceFinder
+from lslam.backend.localization.prior_map import PlaceSearch
 from lslam.core.config import load_config
 from lslam.core.geometry import se3
 from lslam.core.geometry.se3 import umeyama

@@ -37,7 +37,7 @@ from lslam.evaluation.thesis import planar
 from lslam.evaluation.timing import read_timing_rows
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.osm.buildings_geojson import read_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.corrections import BUILDINGS_GEOJSON
 from lslam.simulation.osm_perturb import read_perturbation
 from lslam.studies.subjects import Scene, simulate_once
@@ -93,7 +93,7 @@ def buildings_of(folder: Path, drive: Path, which: str, found: Floats) -> list[B
     if not (folder / BUILDINGS_GEOJSON).is_file():
         return []
     poses, origin = true_poses(drive)
-    corrected = read_corrected(folder / BUILDINGS_GEOJSON)
+    corrected = read_buildings_geojson(folder / BUILDINGS_GEOJSON)
     truth = {c.building.osm_id: np.zeros(3) for c in corrected.buildings}
     if which != "exact":
         exact = read_buildings(drive / "map.osm", origin)[1].buildings

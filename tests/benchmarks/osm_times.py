@@ -18,6 +18,7 @@ from osm import SPACING, true_poses
 
 from lslam.backend.keyframes.select import keyframe_cloud
 from lslam.backend.keyframes.store import KeyframeStore
+from lslam.core.config import Config
 from lslam.core.config.backend import KeyframesConfig, OsmConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se2
@@ -26,7 +27,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.readers import open_sequence
-from lslam.osm.location import see_walls
+from lslam.osm.location import LevelRun
 from lslam.osm.wall_match import match_buildings, match_keyframe, warm_up
 from lslam.osm.walls import OsmMap
 
@@ -51,12 +52,10 @@ def measured(drive: Path, count: int, size: int) -> dict[str, list[float]]:
         at = se2.of_se3(poses[scans[k]])
         store.points(k)
         begin = thread_time()
-        seen = see_walls(store, poses[scans], k, size, config)
+        seen = LevelRun(store, poses[scans], Config(osm=config)).see_walls(k, size)
         walls = thread_time()
         prior = at + SIGMA * rng.standard_normal(3)
-        view = match_keyframe(
-            KeyframeMatch(k, seen.walls, seen.views, prior, SIGMA, prior, np.zeros((3, 3))), osm, config
-        )
+        view = match_keyframe(KeyframeMatch(k, *seen, prior, SIGMA, prior, np.zeros((3, 3))), osm, config)
         whole = thread_time()
         match_buildings(view, at, np.zeros(2), osm, config)
         local = (thread_time() - whole) / max(len(osm.near(at[:2], config.use_radius)), 1)

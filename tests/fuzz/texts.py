@@ -29,7 +29,7 @@ from lslam.io.formats.time_columns import read_stamps
 from lslam.io.formats.trajectory_files import read_times, read_trajectory
 from lslam.io.readers.scan_stamps import stamps_in_names
 from lslam.osm.bounds import Bounds
-from lslam.osm.buildings_geojson import read_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.overpass import kept_reply
 from lslam.pipeline.rebuild import map_of, read_run, viewed_run
 from lslam.pipeline.resume import may_go_on
@@ -277,7 +277,7 @@ PARSERS = [
     Parser("Overpass JSON", lambda f: read_buildings(f / "map.json"), _extract("json")),
     _text_parser("GeoJSON outlines", "map.geojson", read_buildings, _OUTLINES),
     _text_parser("GeoJSON line", "line.geojson", read_line, _LINE),
-    _text_parser("buildings.geojson", "buildings.geojson", read_corrected, CORRECTED),
+    _text_parser("buildings.geojson", "buildings.geojson", read_buildings_geojson, CORRECTED),
     _text_parser("perturbed map", "p.json", read_perturbation, _PERTURBED),
     Parser("kept reply", lambda f: kept_reply(_BOUNDS, f), _kept),
     _text_parser("job state", "state.json", results_csv.read_state,

@@ -12,7 +12,7 @@ import pytest
 from stub_sequences import Stub, sample
 
 import lslam
-from lslam.backend.graph.factors import well_conditioned
+from lslam.backend.graph.factors import regularise
 from lslam.backend.graph.odometry_constraints import odometry_constraints
 from lslam.backend.keyframes.store import KeyframeStore
 from lslam.backend.optimise import run_back_end
@@ -169,7 +169,7 @@ def test_the_pose_graph_has_the_imu_beside_odometry_that_weighs_as_much_as_its_p
     by_points = odometry_constraints(keyframes, [result.by_points for result in results], config)
     by_smoother = odometry_constraints(keyframes, results, config)
     for held, one in zip(done.constraints, by_points, strict=True):
-        np.testing.assert_allclose(held.covariance, well_conditioned(one.covariance), rtol=1e-9, atol=1e-15)
+        np.testing.assert_allclose(held.covariance, regularise(one.covariance), rtol=1e-9, atol=1e-15)
     # Of rotation, where the IMU is what is known better.
     grown = [sum(np.trace(c.covariance[3:, 3:]) for c in steps) for steps in (by_points, by_smoother)]
     assert grown[0] > 1.2 * grown[1]

@@ -11,7 +11,7 @@ from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se2, se3
 from lslam.core.labels import CLASSES
 from lslam.core.types.motion_prior import MotionPrior
-from lslam.osm import classes
+from lslam.osm.walls import classify
 from lslam.simulation.scenarios import simulate
 
 TRUE = {
@@ -57,7 +57,7 @@ def confusion(scenario: str, seed: int, lidar: str | None, places: int) -> NDArr
     """(5, 6) points of each true class that were taken for each of `NAMES`, the last column for none of them."""
     counts = np.zeros((len(NAMES), len(NAMES) + 1))
     for cloud, truth in submap_of(scenario, seed, lidar, places):
-        found = classes.classify(cloud)
+        found = classify(cloud)
         for k, names in enumerate(TRUE.values()):
             of_class = found[np.isin(truth, [CLASSES[name] for name in names])]
             row = [np.count_nonzero(of_class == number) for number in FOUND]

@@ -20,7 +20,7 @@ from lslam.core.errors import InputError
 from lslam.core.types.building import Building
 from lslam.io.formats.osm_buildings import buildings_of
 from lslam.osm.bounds import Bounds
-from lslam.osm.overpass import fetch_buildings, from_overpass
+from lslam.osm.overpass import fetch_buildings, merge_replies
 from lslam.osm.source import OsmBuffer
 from lslam.osm.walls import OsmMap
 
@@ -56,7 +56,7 @@ class Server:
 def near(buffer: OsmBuffer, place: np.ndarray) -> list[Building]:
     """Ask for the surroundings of a place; the buildings within 35 m of it that are here."""
     buffer.ask(place)
-    data = from_overpass({"elements": [element for reply in buffer.replies for element in reply["elements"]]})
+    data = merge_replies(buffer.replies)
     town = OsmMap(buildings_of(data, ORIGIN).buildings)
     return [town.buildings[number] for number in town.near(place, 35.0)]
 
@@ -166,7 +166,9 @@ def test_a_run_that_goes_on_uses_the_replies_it_has_and_asks_only_for_others(tmp
             second.ask(position)
             if second.is_waiting:
                 server.let_go(second)
-        assert [tree["elements"] for tree in second.replies[:asked]] == [tree["elements"] for tree in first.replies]
+        assert [list(one.items_of()) for one in second.replies[:asked]] == [
+            list(one.items_of()) for one in first.replies
+        ]
     assert len(server.asked) == 7, "as one that was not killed"
     (tmp_path / "000000.json").write_text(json.dumps({"elements": []}))
     with pytest.raises(InputError, match=r"000000.json is no reply kept by an earlier run"):

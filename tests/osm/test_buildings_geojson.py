@@ -14,7 +14,7 @@ from lslam.core.errors import InputError, OutputError
 from lslam.core.types.building import Building, BuildingCorrection, CorrectedMap, Footprint
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_data import ATTRIBUTION
-from lslam.osm.buildings_geojson import read_corrected, write_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson, write_buildings_geojson
 
 YES = {"building": "yes"}
 
@@ -40,8 +40,8 @@ def found() -> CorrectedMap:
 
 def test_everything_reads_back(tmp_path: Path) -> None:
     path = tmp_path / "buildings.geojson"
-    write_corrected(path, found())
-    back, was = read_corrected(path), found()
+    write_buildings_geojson(path, found())
+    back, was = read_buildings_geojson(path), found()
     np.testing.assert_array_equal(back.origin, was.origin)
     assert (back.mode, back.overlaps, back.attribution) == (was.mode, was.overlaps, was.attribution)
     np.testing.assert_allclose(back.shift, was.shift)
@@ -64,7 +64,7 @@ def test_everything_reads_back(tmp_path: Path) -> None:
 
 def test_a_gis_sees_corrected_outlines_with_the_attribution(tmp_path: Path) -> None:
     path = tmp_path / "buildings.geojson"
-    write_corrected(path, found())
+    write_buildings_geojson(path, found())
     tree = json.loads(path.read_text())
     assert "OpenStreetMap contributors, ODbL 1.0" in tree["attribution"]
     assert [f["properties"]["status"] for f in tree["features"]] == ["seen", "unseen", "absent", "new", "new"]
@@ -80,8 +80,8 @@ def test_a_gis_sees_corrected_outlines_with_the_attribution(tmp_path: Path) -> N
     np.testing.assert_allclose(
         extract.buildings[0].footprints[0].outer, found().buildings[0].real_building.footprints[0].outer, atol=0.012
     )
-    write_corrected(path, replace(found(), attribution=None))
-    assert read_corrected(path).attribution is None
+    write_buildings_geojson(path, replace(found(), attribution=None))
+    assert read_buildings_geojson(path).attribution is None
 
 
 def test_confidence_is_the_share_of_draws_that_lie_near() -> None:
@@ -101,11 +101,11 @@ def test_other_files_are_errors_with_a_reason(tmp_path: Path, text: str) -> None
     path = tmp_path / "buildings.geojson"
     path.write_text(text)
     with pytest.raises(InputError, match=r"buildings\.geojson is no buildings\.geojson of a run"):
-        read_corrected(path)
+        read_buildings_geojson(path)
 
 
 def test_files_that_cannot_be_opened_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.geojson cannot be read"):
-        read_corrected(tmp_path / "none.geojson")
+        read_buildings_geojson(tmp_path / "none.geojson")
     with pytest.raises(OutputError, match="cannot be written"):
-        write_corrected(tmp_path / "none" / "buildings.geojson", found())
+        write_buildings_geojson(tmp_path / "none" / "buildings.geojson", found())

@@ -8,7 +8,7 @@ from point_truth import NAMES, confusion, scores
 from wall_scenes import Floats, box_at, noisy, plain, upright
 
 from lslam.core.labels import CLASSES
-from lslam.osm import classes
+from lslam.osm.walls import ROUGHNESS_M, classify
 
 # Least precision and recall on a clean street: what geometry can tell there.
 BOUNDS = {"ground": (0.8, 0.95), "wall": (0.95, 0.75), "vegetation": (0.45, 0.8), "vehicle": (0.8, 0.65)}
@@ -37,17 +37,17 @@ def test_each_thing_of_a_street_is_what_it_is(low: float) -> None:
     parts, expected = scene()
     rng = np.random.default_rng(1)
     ghosts = np.column_stack([rng.uniform(14, 20, (30, 2)), np.full(30, low - 5.0)]) if low else np.zeros((0, 3))
-    found = classes.classify(noisy(np.concatenate([*parts, ghosts])))
+    found = classify(noisy(np.concatenate([*parts, ghosts])))
     ends = np.cumsum([len(part) for part in parts])
     for k, (end, number) in enumerate(zip(ends, expected, strict=True)):
         of_part = found[end - len(parts[k]) : end]
-        above = parts[k][:, 2] > classes.ROUGHNESS_M + 0.1 if k else np.ones(len(parts[k]), np.bool_)
+        above = parts[k][:, 2] > ROUGHNESS_M + 0.1 if k else np.ones(len(parts[k]), np.bool_)
         assert np.mean(of_part[above] == number) > 0.8, k
 
 
 def test_nothing_and_a_few_points_have_classes() -> None:
-    assert len(classes.classify(np.zeros((0, 3)))) == 0
-    assert len(classes.classify(np.ones((3, 3)))) == 3
+    assert len(classify(np.zeros((0, 3)))) == 0
+    assert len(classify(np.ones((3, 3)))) == 3
 
 
 def test_geometry_agrees_with_the_surfaces_that_rays_met() -> None:

@@ -171,7 +171,7 @@ def test_the_fit_converges_well_within_its_sigma(seed: int) -> None:
     graph = odometry(0.1, 0.0)
     seen = sighted(graph, seed, 0.5)
     verdicts = [find_wall_drift(graph, replace(seen, share=share), SEEN, MAP, GraphConfig()) for share in (0.01, 3e-4)]
-    assert [drift is not None and drift.is_settled for drift in verdicts] == [False, True]
+    assert [drift is not None and drift.is_final for drift in verdicts] == [False, True]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PoseGraph, PositionFix
+from lslam.backend.outcome import BackEndInput
 from lslam.core.config import Config
 from lslam.core.geometry import se3
-from lslam.core.types.building import Building, Footprint
+from lslam.core.types.building import Building, Footprint, OsmMatches
 from lslam.core.types.constraint import Constraint
-from lslam.core.types.scan_result import KeyframeClocks
 from lslam.io.formats.osm_buildings import BuildingExtract
-from lslam.osm.baseline_matcher import run_baseline
+from lslam.osm.baseline_matcher import lay
 
 
 class NothingSeen:
@@ -41,7 +41,15 @@ def test_a_rejected_fix_does_not_affect_the_baseline() -> None:
     assert np.flatnonzero(~solution.fix_inliers).tolist() == [10]
     house = Building("way/1", (Footprint(np.array([[200.0, 0], [210, 0], [210, 10], [200, 10]])),))
     extract = BuildingExtract([house], {}, np.array([49.0, 8.4, 0.0]), None, "a map")
-    joint, matches, placed = run_baseline(graph, solution, extract, NothingSeen(), Config(), KeyframeClocks())  # type: ignore[arg-type]
-    np.testing.assert_allclose(joint.poses[:, :3, 3], poses[:, :3, 3], atol=0.1)
-    assert [match.reason for match in matches.keyframes] == ["no convergence"] * 20
-    assert [c.status for c in placed.buildings] == ["unseen"]
+    inputs = BackEndInput([], NothingSeen(), Config(), [])  # type: ignore[arg-type]
+    fit = lay(
+        graph,
+        solution,
+        OsmMatches(extract.origin, (), np.zeros((0, 2, 2)), np.zeros(0, np.int64), (), ()),
+        extract,
+        inputs,
+    )
+    assert fit.joint is not None
+    np.testing.assert_allclose(fit.joint.poses[:, :3, 3], poses[:, :3, 3], atol=0.1)
+    assert [match.reason for match in fit.matches.keyframes] == ["no convergence"] * 20
+    assert [c.status for c in fit.buildings.buildings] == ["unseen"]

@@ -17,7 +17,7 @@ from lslam.core.types.building import Building, Footprint, KeyframeMatch
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm import location
-from lslam.osm.location import Located, finish, locate
+from lslam.osm.location import MapLocations, finish, locate
 from lslam.osm.wall_match import match_keyframe
 from lslam.osm.walls import OsmMap
 
@@ -73,7 +73,7 @@ def config(heading: float | None = 90.0, *more: str) -> Config:
     return load_config(None, ["osm.origin=[49.0, 8.4, 115.0]", *given, *more])
 
 
-def off(located: Located, way: np.ndarray) -> np.ndarray:
+def off(located: MapLocations, way: np.ndarray) -> np.ndarray:
     """(K, 3) m, m, deg, of the accepted matches."""
     accepted = [m for m in located.matches if m.verdict == "accepted"]
     error = np.array([m.pose - way[m.keyframe] for m in accepted]).reshape(-1, 3)

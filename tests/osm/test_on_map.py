@@ -13,7 +13,7 @@ from test_location import HOUSES, ORIGIN, Outline, config, driven, extract_of, s
 from lslam.backend.georeferencing import Placement
 from lslam.backend.graph.problem import PoseGraph
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.outcome import Given, solve
+from lslam.backend.outcome import BackEndInput, solve
 from lslam.core.config import Config
 from lslam.core.config.config import load_config
 from lslam.core.errors import UsageError
@@ -23,7 +23,7 @@ from lslam.core.types.gnss import Georeference
 from lslam.core.types.scan_result import ScanResult
 from lslam.osm import MATCHERS
 from lslam.osm.hold import find_on_map, hold_by_buildings, on_map, sightings
-from lslam.osm.location import Located, locate
+from lslam.osm.location import MapLocations, locate
 from lslam.osm.source import OsmServer
 from lslam.pipeline.check import check_config
 
@@ -54,7 +54,7 @@ def runaway(way: np.ndarray, percent: float, degrees: float) -> np.ndarray:
     return np.stack(told)
 
 
-def laid(store: KeyframeStore, outlines: list[Outline], given: Config | None = None) -> tuple[Located, PoseGraph]:
+def laid(store: KeyframeStore, outlines: list[Outline], given: Config | None = None) -> tuple[MapLocations, PoseGraph]:
     return find_on_map(extract_of(outlines), graph_of(store), store, None, None, given or config())
 
 
@@ -85,7 +85,7 @@ def test_drift_is_corrected_by_a_perturbed_map(seed: int, caplog: pytest.LogCapt
     # What the manifest calls the largest correction is that of odometry, with the drift corrected before the graph.
     results = [ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes]
     on_walls = Georeference(ORIGIN, located.T_enu_odometry, None, "osm")
-    done = solve(held, Given(results, store, config(), []), on_walls)
+    done = solve(held, BackEndInput(results, store, config(), []), on_walls)
     assert done is not None
     moved = done.keyframes[:, :3, 3] - (located.T_enu_odometry @ before.poses)[:, :3, 3]
     assert done.facts["largest_correction_m"] == pytest.approx(np.linalg.norm(moved, axis=1).max(), abs=1e-4)
@@ -117,7 +117,8 @@ def test_wandering_drift_is_reported_as_such(caplog: pytest.LogCaptureFixture) -
     assert said is not None
     assert 1.0 < float(said[1]) < 5.0
     done = solve(
-        held, Given([ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes], store, config(), [])
+        held,
+        BackEndInput([ScanResult(k.scan, k.stamp_ns, k.T_world_lidar) for k in store.keyframes], store, config(), []),
     )
     assert done is not None
     assert "steady_drift" not in done.facts
@@ -190,7 +191,7 @@ def test_without_a_building_there_is_no_wall_to_see() -> None:
 
 def test_a_run_without_enough_fixes_reports_what_is_needed() -> None:
     store = driven(HOUSES, street(6.0))
-    given = Given([], store, load_config(), [])
+    given = BackEndInput([], store, load_config(), [])
     nobody_asks = OsmServer(ORIGIN, None, given.config.osm, lambda bounds: {})
     assert hold_by_buildings(nobody_asks, graph_of(store), Placement(), given) is None
     (said,) = given.problems

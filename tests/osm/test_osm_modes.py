@@ -24,7 +24,7 @@ from lslam.io.formats.osm_buildings import buildings_of, read_buildings
 from lslam.io.formats.osm_files import read_osm
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.osm import location
-from lslam.osm.buildings_geojson import read_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.osm.track import OsmTrack
 from lslam.simulation.osm_perturb import read_perturbation
 
@@ -65,7 +65,7 @@ def two_level(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_displaced_buildings_are_nearer_to_their_true_places(two_level: Path) -> None:
-    found = errors(two_level, read_corrected(two_level / "buildings.geojson"))
+    found = errors(two_level, read_buildings_geojson(two_level / "buildings.geojson"))
     assert len(found) >= 5
     held = [e for e in found if e.sides == 2]
     assert np.median([e.before for e in held]) > 1.0
@@ -74,7 +74,7 @@ def test_displaced_buildings_are_nearer_to_their_true_places(two_level: Path) ->
 
 
 def test_the_change_file_holds_the_corrected_outlines(two_level: Path) -> None:
-    corrected = read_corrected(two_level / "buildings.geojson")
+    corrected = read_buildings_geojson(two_level / "buildings.geojson")
     edited = read_osm(two_level / "buildings.osm")
     assert edited.modified
     assert {w for w in edited.ways if w < 0} <= set(read_osm(DRIVE / "map_perturbed.osm").ways)
@@ -115,7 +115,7 @@ def test_the_same_run_writes_the_same_bytes(two_level: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize("mode", ["prior", "rigid", "non-rigid"])
 def test_every_mode_moves_its_own_variables_only(mode: str, tmp_path: Path) -> None:
     folder = run(tmp_path / "run", f"osm.mode={mode}", scans=30)
-    corrected = read_corrected(folder / "buildings.geojson")
+    corrected = read_buildings_geojson(folder / "buildings.geojson")
     moves = np.array([c.displacement for c in corrected.buildings])
     assert corrected.mode == mode
     if mode == "prior":
@@ -141,7 +141,8 @@ def test_backward_matching_begins_at_a_match_of_full_rank(monkeypatch: pytest.Mo
 
     monkeypatch.setattr(location, "_along", along)
     track = OsmTrack(np.zeros(3), np.ones(3), 1.0, 1e-4, np.ones(3))
-    found = location._both_ways([0] * 4, np.zeros((4, 4, 4)), None, track, Config(), KeyframeClocks())  # type: ignore[arg-type]
+    run = location.LevelRun([0] * 4, np.zeros((4, 4, 4)), Config())  # type: ignore[arg-type]
+    found = location._both_ways(run, None, track, KeyframeClocks())  # type: ignore[arg-type]
     assert asked == [[0, 1, 2, 3], [2, 1, 0]]
     assert [m.keyframe for m in found] == [0, 1, 2, 3]
 
@@ -153,8 +154,8 @@ def test_a_match_far_from_odometry_is_refused() -> None:
         4, np.zeros((0, 2, 2)), np.zeros((1, 2)), np.zeros(3), np.ones(3), np.array([0.4, -0.3, 0.0]),
         np.diag([100.0, 100.0, 1e4]), 3, "edges", pairs=np.zeros((5, 2), np.int64),
     )  # fmt: skip
-    assert location._gated(near, track, config.osm, config.graph).verdict == "accepted"
-    far = location._gated(replace(near, pose=np.array([4.0, -3.0, 0.0])), track, config.osm, config.graph)
+    assert location._gate(near, track, config.osm, config.graph).verdict == "accepted"
+    far = location._gate(replace(near, pose=np.array([4.0, -3.0, 0.0])), track, config.osm, config.graph)
     assert far.verdict == "rejected"
     assert far.reason.endswith("times as far from odometry as it may have drifted")
 
@@ -176,7 +177,7 @@ def test_trusted_poses_are_not_changed(is_trusted: bool, how: str, tmp_path: Pat
     bent = se3.relative(se3.relative(real[:1], real), se3.relative(found[:1], found))
     away = np.linalg.norm(bent[:, :3, 3], axis=1).max()
     assert (away < 0.005) == is_trusted
-    corrected = read_corrected(folder / "buildings.geojson")
+    corrected = read_buildings_geojson(folder / "buildings.geojson")
     assert corrected.mode == ("baseline" if "baseline" in how else how.removeprefix("osm.mode="))
     if corrected.mode != "baseline":
         assert np.median([e.across for e in errors(folder, corrected)]) < 0.3
@@ -184,7 +185,7 @@ def test_trusted_poses_are_not_changed(is_trusted: bool, how: str, tmp_path: Pat
 
 def test_the_baseline_runs_whole(tmp_path: Path) -> None:
     folder = run(tmp_path / "run", "odometry.preset=thesis-baseline", "loops.use=false", scans=30)
-    corrected = read_corrected(folder / "buildings.geojson")
+    corrected = read_buildings_geojson(folder / "buildings.geojson")
     assert corrected.mode == "baseline"
     seen = [c for c in corrected.buildings if c.status == "seen"]
     assert len(seen) >= 3
@@ -204,7 +205,7 @@ def test_the_baseline_runs_whole(tmp_path: Path) -> None:
 
 def test_the_improved_system_matches_single_scans_and_keeps_its_start(tmp_path: Path) -> None:
     folder = run(tmp_path / "run", "odometry.preset=thesis-improved", "loops.use=false", scans=30)
-    corrected = read_corrected(folder / "buildings.geojson")
+    corrected = read_buildings_geojson(folder / "buildings.geojson")
     assert corrected.mode == "two-level"
     assert np.abs(corrected.shift).max() < 0.001, "its map is not off as a whole"
     rows = read_timing_rows(folder / "timing.csv")

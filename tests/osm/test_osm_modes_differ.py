@@ -16,7 +16,7 @@ from lslam.core.config import Config
 from lslam.core.types.arrays import Floats
 from lslam.io.formats.osm_buildings import BuildingExtract
 from lslam.osm import hold
-from lslam.osm.location import Located, locate
+from lslam.osm.location import MapLocations, locate
 from lslam.pipeline import odometry_pass
 
 # Half as many keyframes: what is common to the map shows as well; of single houses each needs all that saw it.
@@ -29,12 +29,12 @@ def shared_steps(held_odometry: SharedOdometry) -> Iterator[None]:
 
     Not so in mode `rigid` unless the start is held, as it is in all of these runs.
     """
-    held: dict[tuple[str, bytes], Located] = {}
+    held: dict[tuple[str, bytes], MapLocations] = {}
 
     def once(
         extract: BuildingExtract, store: KeyframeStore, up: Floats | None, config: Config,
         placed: Floats | None, odometry: Floats | None = None, clocks: Any = None,
-    ) -> Located:  # fmt: skip
+    ) -> MapLocations:  # fmt: skip
         assert up is None
         assert placed is None
         assert config.osm.hold_start

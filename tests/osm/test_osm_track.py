@@ -38,10 +38,10 @@ def test_a_match_of_one_direction_moves_that_direction_only() -> None:
 
 def test_the_gate_counts_directions_that_are_seen_and_wraps_the_heading() -> None:
     one = OsmTrack(np.array([0.0, 0.0, np.pi - 0.01]), np.array([0.1, 0.1, 0.02]), 1.0, 1e-4, MAP)
-    near, rank = one.squared(np.array([0.0, 0.0, -np.pi + 0.01]), np.diag([100.0, 100.0, 1e4]))
+    near, rank = one.squared_distance(np.array([0.0, 0.0, -np.pi + 0.01]), np.diag([100.0, 100.0, 1e4]))
     assert rank == 3
     assert near < 1.0
-    far, rank = one.squared(np.array([3.0, 50.0, np.pi - 0.01]), np.diag([100.0, 0.0, 1e4]))
+    far, rank = one.squared_distance(np.array([3.0, 50.0, np.pi - 0.01]), np.diag([100.0, 0.0, 1e4]))
     assert rank == 2
     # 3 m against 0.1 m of the track, 0.1 m of the match and half a metre of the map; the 50 m are along the wall.
     np.testing.assert_allclose(far, 9.0 / (0.01 + 0.01 + 0.25), rtol=1e-6)

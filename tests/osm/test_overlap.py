@@ -13,7 +13,7 @@ from shapely.affinity import rotate, scale, translate
 from wall_scenes import box_at
 
 from lslam.core.types.building import Building, Footprint, footprint_polygon
-from lslam.osm.overlap import LARGEST_TURN_RAD, Untangled, remove_overlaps
+from lslam.osm.overlap import LARGEST_TURN_RAD, Separation, remove_overlaps
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def penetrates(one: object, other: object, depth: float = 0.02) -> bool:
     return bool(one.buffer(-depth / 2).intersects(other.buffer(-depth / 2)))  # type: ignore[attr-defined]
 
 
-def check_apart(buildings: list[Building], found: Untangled) -> None:
+def check_apart(buildings: list[Building], found: Separation) -> None:
     shapes = polygons(buildings, found.displacements)
     assert not [(i, j) for i in range(len(shapes)) for j in range(i) if penetrates(shapes[i], shapes[j])]
     assert found.left == ()

@@ -54,11 +54,11 @@ def test_the_query_is_that_of_the_conventions_with_a_user_agent_of_our_own(
 
 
 def test_a_place_is_requested_once(server: FakeOverpass, tmp_path: Path) -> None:
-    first = fetch(server, tmp_path)
-    assert fetch(server, tmp_path) == first
+    first = fetch(server, tmp_path).text
+    assert fetch(server, tmp_path).text == first
     assert server.requests == []
     inside = Bounds(49.002, 8.405, 49.004, 8.41)
-    assert fetch(server, tmp_path, bounds=inside) == first, "a larger box that is kept will do"
+    assert fetch(server, tmp_path, bounds=inside).text == first, "a larger box that is kept will do"
     assert server.requests == []
     fetch(server, tmp_path, bounds=Bounds(49.002, 8.405, 49.012, 8.41))
     assert len(server.requests) == 1, "this one looks out of it"
@@ -69,11 +69,11 @@ def test_a_place_is_requested_once(server: FakeOverpass, tmp_path: Path) -> None
 def test_without_network_only_what_is_kept(server: FakeOverpass, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no reply for 49\.000000"):
         fetch(server, tmp_path, cache="only")
-    kept = fetch(server, tmp_path)
+    kept = fetch(server, tmp_path).text
     dead = "http://127.0.0.1:9/api"
-    assert fetch(server, tmp_path, server=dead, cache="only") == kept
-    assert fetch(server, tmp_path, server=dead) == kept
-    assert fetch(server, tmp_path, server=dead, cache="refresh") == kept, "an old reply is better than none"
+    assert fetch(server, tmp_path, server=dead, cache="only").text == kept
+    assert fetch(server, tmp_path, server=dead).text == kept
+    assert fetch(server, tmp_path, server=dead, cache="refresh").text == kept, "an old reply is better than none"
     with pytest.raises(InputError, match=r"127.0.0.1:9/api cannot be reached: check the network"):
         fetch(server, tmp_path, server=dead, bounds=Bounds(50.0, 8.4, 50.01, 8.42))
     assert fetch.waits == [], "nobody waits for a server that is not there"  # type: ignore[attr-defined]
@@ -135,8 +135,8 @@ def test_a_reply_may_be_compressed(server: FakeOverpass, tmp_path: Path) -> None
 
 
 def test_a_place_without_buildings_is_an_answer(server: FakeOverpass, tmp_path: Path) -> None:
-    assert fetch(server, tmp_path, "empty")["elements"] == []
-    assert fetch(server, tmp_path, "busy")["elements"] == []
+    assert list(fetch(server, tmp_path, "empty").items_of()) == []
+    assert list(fetch(server, tmp_path, "busy").items_of()) == []
     assert server.requests == []
 
 

@@ -85,7 +85,7 @@ def test_drift_is_corrected_on_a_perturbed_map(seed: int, size: float) -> None:
     assert drift is not None
     assert drift.is_sure
     assert not drift.estimated_drift.is_varying
-    assert not drift.is_settled
+    assert not drift.is_final
     straight = without_drift(graph, drift.rates)
     assert ate(straight.poses, REAL) < 0.1 * ate(graph.poses, REAL)
     # Odometry goes along: without the map it is what the poses say.
@@ -104,7 +104,7 @@ def test_the_reported_rates_are_those_of_the_drift() -> None:
         graph = without_drift(graph, drift.rates)
         drift = found(graph, sighted(graph, 0, 0.5))
         assert drift is not None
-    assert drift.is_settled
+    assert drift.is_final
     assert not drift.is_sure
 
 

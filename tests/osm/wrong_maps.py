@@ -18,7 +18,7 @@ from lslam.core.geometry import geodesy, se2
 from lslam.io.formats.osm_buildings import read_buildings
 from lslam.io.formats.osm_files import write_osm
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.osm.buildings_geojson import read_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.simulation.osm_extract import osm_from_buildings
 from lslam.simulation.osm_perturb import Change, Perturbation, perturb
 
@@ -73,7 +73,7 @@ def on(
         out = folder / f"{mode}-{drift}"
         config = load_config(settings=[*settings, f"osm.mode={mode}", f"debug.drift_seed={drift}"])
         lslam.run(str(DRIVE), config, out=out)
-        corrected = read_corrected(out / "buildings.geojson")
+        corrected = read_buildings_geojson(out / "buildings.geojson")
         poses = read_trajectory(out / "trajectory.tum").poses
         places = geodesy.to_local(geodesy.from_local(poses[:, :3, 3], corrected.origin), origin)[:, :2]
         away = [

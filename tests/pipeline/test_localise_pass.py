@@ -12,9 +12,8 @@ import pytest
 
 import lslam
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.localization.place_search import PlaceSearch
-from lslam.backend.localization.prior_map import make_prior_map
-from lslam.backend.localization.start import PlaceFinder
+from lslam.backend.localization.locate import PlaceFinder
+from lslam.backend.localization.prior_map import PlaceSearch, make_prior_map
 from lslam.core.config import Config, load_config
 from lslam.core.errors import InputError, InterruptedRunError, RunFailedError
 from lslam.core.geometry import se3

@@ -11,7 +11,7 @@ import pytest
 from graph_builders import ate
 
 import lslam
-from lslam.backend.adjustment import Adjusted, SweptPoints
+from lslam.backend.adjustment import Adjustment, SweptPoints
 from lslam.core.config import load_config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.geometry import geodesy
@@ -113,7 +113,7 @@ def test_poses_in_frames_of_their_own_stay(monkeypatch: pytest.MonkeyPatch) -> N
     nodes, better = np.array([0, 1, 4, 5]), poses.copy()
     better[:, 1, 3] = 0.1 * np.arange(6)
     monkeypatch.setattr(
-        refine_pass, "adjust", lambda before, swept, used, prior, numbers: Adjusted(better[nodes], swept.points, 1)
+        refine_pass, "adjust", lambda before, swept, used, prior, numbers: Adjustment(better[nodes], swept.points, 1)
     )
     monkeypatch.setattr(refine_pass, "thinner_windows", lambda gain, scans, cells, count: np.ones(count, bool))
     swept = SweptPoints(np.random.default_rng(0).random((4000, 3)) * 4, np.zeros(4000, np.int64), np.zeros(4000))

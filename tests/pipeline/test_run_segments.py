@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stub_sequences import Stub, sample
 
 import lslam
-from lslam.backend.localization import start
+from lslam.backend.localization import locate
 from lslam.core.config import Config, load_config
 from lslam.core.errors import InterruptedRunError
 from lslam.core.types.scan import Scan
@@ -188,7 +188,7 @@ def test_a_walk_too_short_for_two_keyframes_is_tied_by_most_of_what_one_sees(tmp
 
 def test_a_walk_of_another_town_is_not_tied(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The place that one side finds is not the one that the other finds, however little of it agrees."""
-    monkeypatch.setattr(start, "MAJORITY", 0.0)
+    monkeypatch.setattr(locate, "MAJORITY", 0.0)
     first, other = walk(*range(13, 25)), walk(*range(45, 57), seed=42)
     joined = replace(first, scans=[*first.scans, *other.scans], ground_truth=None, kept=(*first.kept, *other.kept))
     lslam.run(joined, config(), out=tmp_path / "out")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.backend.loops.pair_view import FEW_POINTS, MOST_VIEWS
+from lslam.backend.loops.find_loops import FEW_POINTS, MOST_VIEWS
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.run_record import PairView, RunRecord
 from lslam.reports.candidates import candidate_data, pair_data

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from lslam.backend.loops.pair_view import FEW_POINTS, MOST_VIEWS
+from lslam.backend.loops.find_loops import FEW_POINTS, MOST_VIEWS
 from lslam.core.errors import OutputError
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict

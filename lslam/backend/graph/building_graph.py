@@ -16,17 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.backend.graph import factors
+from lslam.backend.graph.marginals import marginal_blocks, marginals
 from lslam.backend.graph.pose_graph import check_graph
 from lslam.backend.graph.problem import PlanarPrior, PoseGraph
 from lslam.backend.graph.solve import (
     GROWTH,
     ROUNDS,
     OutlierCandidate,
-    are_decided,
+    are_binary,
     gnc_solve,
-    joined,
-    marginal_blocks,
-    marginals,
+    join_factors,
     truncated_weights,
 )
 from lslam.core.config.backend import GraphConfig
@@ -82,27 +81,25 @@ def solve_buildings(
     outlier candidate. Matches of one building share the map's error, so the covariances are those of one match of mean
     information, while the displacements use all of them.
     """
-    owners = np.array([m.building for m in matches], np.intp)
-    measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
-    weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
+    owners, measurements, weights = _as_arrays(middles, matches, poses)
     limits = np.array([quantile(PROBABILITY, max(m.rank, 1)) for m in matches])
     trust = np.ones(len(matches))
-    solution = _linear(len(middles), owners, measured, weights, map_prior)
-    ratio = _squared(solution, owners, measured, weights) / limits
+    solution = _linear(len(middles), owners, measurements, weights, map_prior)
+    ratio = _squared_residuals(solution, owners, measurements, weights) / limits
     mu = 1.0 / (2.0 * float(ratio.max(initial=1.0)) - 1.0)
     for _ in checking(range(ROUNDS if (ratio > 1).any() else 0)):
         trust = truncated_weights(ratio, mu)
-        solution = _linear(len(middles), owners, measured, trust[:, None, None] * weights, map_prior)
-        ratio = _squared(solution, owners, measured, weights) / limits
-        if are_decided(trust):
+        solution = _linear(len(middles), owners, measurements, trust[:, None, None] * weights, map_prior)
+        ratio = _squared_residuals(solution, owners, measurements, weights) / limits
+        if are_binary(trust):
             break
         mu *= GROWTH
     inliers = ratio <= 1
     if not inliers.all():
-        solution = _linear(len(middles), owners, measured, inliers[:, None, None] * weights, map_prior)
+        solution = _linear(len(middles), owners, measurements, inliers[:, None, None] * weights, map_prior)
     counts = np.bincount(owners[inliers], minlength=len(middles))
     shared = np.where(inliers, 1.0 / np.maximum(counts[owners], 1), 0.0)
-    _, covariances, _ = _linear(len(middles), owners, measured, shared[:, None, None] * weights, map_prior)
+    _, covariances, _ = _linear(len(middles), owners, measurements, shared[:, None, None] * weights, map_prior)
     return BuildingSolution(solution[0], covariances, solution[2], inliers)
 
 
@@ -112,9 +109,7 @@ def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[i
     One keyframe may match a hedge or the neighbour's wall; along a direction that no other match observes, it could not be
     rejected as an outlier.
     """
-    measured = np.array([m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]).reshape(-1, 3)
-    weights = np.array([_in_map(m.information, poses[m.keyframe][2]) for m in matches]).reshape(-1, 3, 3)
-    owners = np.array([m.building for m in matches], np.intp)
+    owners, measured, weights = _as_arrays(middles, matches, poses)
     agrees = np.zeros(len(matches), bool)
     for k, match in enumerate(checking(matches)):
         values, axes = np.linalg.eigh(weights[k])
@@ -129,21 +124,25 @@ def agreeing(middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[i
     return agrees
 
 
-def _in_map(information: Floats, yaw: float) -> Floats:
-    """Information in the level axes of a keyframe with heading `yaw`, in those of the map."""
-    turn = np.eye(3)
-    turn[:2, :2] = se2.rotation(yaw)
-    return turn @ information @ turn.T
+def _as_arrays(
+    middles: Floats, matches: Sequence[BuildingMatch], poses: Mapping[int, Floats]
+) -> tuple[NDArray[np.intp], Floats, Floats]:
+    """Building (M,), displacement (M, 3) and its information (M, 3, 3) of each match, in the axes of the map."""
+    measured = [m.displacement(poses[m.keyframe], middles[m.building]) for m in matches]
+    turns = [se2.to_se3(np.append(np.zeros(2), poses[m.keyframe][2]))[:3, :3] for m in matches]
+    weights = [turn @ m.information @ turn.T for turn, m in zip(turns, matches, strict=True)]
+    owners = np.array([m.building for m in matches], np.intp)
+    return owners, np.array(measured).reshape(-1, 3), np.array(weights).reshape(-1, 3, 3)
 
 
 def _linear(
-    count: int, owners: NDArray[np.intp], measured: Floats, weights: Floats, map_prior: MapPrior
+    count: int, owners: NDArray[np.intp], measurements: Floats, weights: Floats, map_prior: MapPrior
 ) -> tuple[Floats, Floats, Floats]:
     """Displacements, covariances and shift by least squares; each building is eliminated, the shift is what is left."""
     own = np.diag(1.0 / map_prior.sigma**2)
     normal, pull = np.tile(own, (count, 1, 1)), np.zeros((count, 3))
     np.add.at(normal, owners, weights)
-    np.add.at(pull, owners, (weights @ measured[:, :, None])[:, :, 0])
+    np.add.at(pull, owners, (weights @ measurements[:, :, None])[:, :, 0])
     covariances = np.linalg.inv(normal)
     # d_i = C_i (pull_i + own (shift, 0)), so each building informs the shift by its matches alone.
     through = own[:2, :2]
@@ -157,11 +156,11 @@ def _linear(
     return offsets, covariances + by_shift @ spread @ np.swapaxes(by_shift, -1, -2), shift
 
 
-def _squared(
-    solution: tuple[Floats, Floats, Floats], owners: NDArray[np.intp], measured: Floats, weights: Floats
+def _squared_residuals(
+    solution: tuple[Floats, Floats, Floats], owners: NDArray[np.intp], measurements: Floats, weights: Floats
 ) -> Floats:
     """(M,) whitened squared residuals of the matches."""
-    away = measured - solution[0][owners]
+    away = measurements - solution[0][owners]
     away[:, 2] = se2.wrap(away[:, 2])
     return np.asarray(np.einsum("mi,mij,mj->m", away, weights, away))
 
@@ -191,6 +190,8 @@ def optimise_jointly(
 
     Raises GraphError when the graph is disconnected, singular or not finite.
     """
+    import gtsam
+
     check_graph(graph)
     seen = list(dict.fromkeys(m.building for m in matches))
     keys = {building: factors.map_key(graph) + 1 + n for n, building in enumerate(seen)}
@@ -200,9 +201,9 @@ def optimise_jointly(
         shift = np.zeros(2) if map_prior is None else map_prior.shift
         pose = se2.to_se3(np.append(middles[building] + shift, 0.0))
         certain.append(_own(key, pose, _sigma(map_prior, building == seen[0])))
-        _insert(values, key, pose)
+        values.insert(key, gtsam.Pose3(pose))
     edges = [partial(factors.planar, _seen_from(m), graph.poses[m.keyframe], keys[m.building]) for m in matches]
-    fixed = joined(factors.fixed_part(graph), certain)
+    fixed = join_factors(factors.fixed_part(graph), certain)
     candidates = [OutlierCandidate(edge, max(m.rank, 1)) for edge, m in zip(edges, matches, strict=True)]
     solved = gnc_solve(fixed, candidates, values, config if map_prior else config.model_copy(update={"robust": "none"}))
     poses = se3.normalise(factors.poses_of(solved.values, len(graph)))
@@ -242,28 +243,20 @@ def _own(key: int, pose: Floats, sigma: Floats) -> Any:
     return gtsam.PriorFactorPose3(key, gtsam.Pose3(pose), model)
 
 
-def _insert(values: Any, key: int, pose: Floats) -> None:
-    import gtsam
-
-    values.insert(key, gtsam.Pose3(pose))
-
-
 def _solution(
     middles: Floats,
     which: list[int],
     places: Floats,
-    spread: Floats,
+    block_covariances: Floats,
     inliers: Bools,
     map_prior: MapPrior | None,
 ) -> BuildingSolution:
     """Displacements of all buildings; those without a match follow the shift of the others."""
-    solution, covariances = (
-        np.zeros((len(middles), 3)),
-        np.tile(np.diag(_sigma(map_prior, False) ** 2), (len(middles), 1, 1)),
-    )
+    solution = np.zeros((len(middles), 3))
+    covariances = np.tile(np.diag(_sigma(map_prior, False) ** 2), (len(middles), 1, 1))
     if which:
         solution[which] = se2.of_se3(places) - np.column_stack([middles[which], np.zeros(len(which))])
-        covariances[which] = spread[:, factors.PLANAR][:, :, factors.PLANAR]
+        covariances[which] = block_covariances[:, factors.PLANAR][:, :, factors.PLANAR]
     shift = solution[which, :2].mean(axis=0) if which else (np.zeros(2) if map_prior is None else map_prior.shift)
     unseen = np.setdiff1d(np.arange(len(middles)), which)
     solution[unseen, :2] = 0.0 if map_prior is None else shift

@@ -75,7 +75,7 @@ def chains(graph: PoseGraph, config: GraphConfig) -> tuple[Floats, Floats]:
     b, own = np.array([c.b for c in steps], np.intp), np.array([c.covariance for c in steps]).reshape(-1, 6, 6)
     lengths = np.array([_length(c) for c in steps])
     drifting = lengths[:, None, None] * drift_covariance(1.0, config)
-    return _accumulated(graph.poses, b, own), _accumulated(graph.poses, b, drifting)
+    return _accumulate(graph.poses, b, own), _accumulate(graph.poses, b, drifting)
 
 
 def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
@@ -89,7 +89,7 @@ def _as_fixes(graph: PoseGraph) -> list[PositionFix]:
     return out
 
 
-def _accumulated(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
+def _accumulate(poses: Floats, b: NDArray[np.intp], own: Floats) -> Floats:
     """(K, 6, 6) of each pose in the world by steps to keyframes `b` (P,) from those before, of covariances `own` (P, 6, 6)."""
     # About one point the covariances of all steps add up.
     about_origin = np.zeros((len(poses), 6, 6))
@@ -107,9 +107,7 @@ def _of_loops(graph: PoseGraph, loops: Sequence[Constraint], white: Floats, drif
     a, b = np.array([c.a for c in few]), np.array([c.b for c in few])
     T = np.stack([c.T_a_b for c in few])
     R_a = graph.poses[a, :3, :3]
-    odometry = se3.relative(graph.poses[a], graph.poses[b])
-    turn = so3.log(T[:, :3, :3] @ np.swapaxes(odometry[:, :3, :3], -1, -2))
-    error = np.concatenate([T[:, :3, 3] - odometry[:, :3, 3], turn], axis=1)
+    error = noise.changes(se3.relative(graph.poses[a], graph.poses[b]), T)
     own, grown = (
         noise.rotate(_between(chain, graph.poses, a, b), np.swapaxes(R_a, -1, -2)) for chain in (white, drift)
     )
@@ -180,12 +178,12 @@ def _measurements(graph: PoseGraph) -> tuple[NDArray[np.intp], Floats, Floats]:
     return np.array(keyframes, np.intp), np.array(ups).reshape(-1, 3), np.array(variances)
 
 
-def _fitting(error: Floats, own: Floats, grown: Floats) -> float:
-    """The factor on `grown` (P, n, n), beside `own`, with which the median error (P, n) has its expected size."""
+def _fitting(error: Floats, own: Floats, drift: Floats) -> float:
+    """The factor on `drift` (P, n, n), beside `own`, with which the median error (P, n) has its expected size."""
     typical = quantile(0.5, error.shape[1])
 
     def is_enough(factor: float) -> bool:
-        return bool(np.median(squared_distances(error, factor * grown + own)) <= typical)
+        return bool(np.median(squared_distances(error, factor * drift + own)) <= typical)
 
     if is_enough(0.0):
         return 0.0
@@ -207,6 +205,16 @@ def linear_basis(distances: Floats, apart: float = MEMORY_M) -> Floats:
     """
     middle, knots = 0.5 * (distances[1:] + distances[:-1]), _knots(distances[-1], apart)
     return np.column_stack([np.interp(middle, knots, unit) for unit in np.eye(len(knots))])
+
+
+def mean_rates(distances: Floats, at_knots: Floats, rates: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Mean over the way (d,), and its sigmas, of `rates` (n d,) at the knots, whose `covariance` is (n d, n d).
+
+    at_knots : (K-1, n) of `linear_basis`
+    """
+    shares = np.diff(distances) / np.ptp(distances)
+    mean = np.kron(shares @ at_knots, np.eye(len(rates) // at_knots.shape[1]))
+    return np.asarray(mean @ rates, np.float64), np.sqrt(np.diag(mean @ covariance @ mean.T)).astype(np.float64)
 
 
 def rate_roots(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.geometry import se2
 from lslam.core.geometry.noise import quantile
 from lslam.core.types.arrays import Bools, Floats
 
@@ -63,7 +64,8 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
     def off(offset: float) -> Floats:
         """(P, 2) residuals after the best turn."""
         there = antenna_at(seconds + offset)[:, :2]
-        return moved - _turned(there[last] - there[first], moved)
+        own = there[last] - there[first]
+        return np.asarray(moved - (se2.rotation(_turn(own, moved)) @ own.T).T)
 
     offsets = np.arange(-LARGEST_S, LARGEST_S + 0.5 * STEP_S, STEP_S)
     sizes = np.stack([np.linalg.norm(off(float(offset)), axis=1) for offset in offsets])
@@ -80,12 +82,12 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
         return None
     # Displacements that share a second share their errors.
     shared = max(float(np.median(last - first)), 1.0)
-    noise = _spread(off(float(offsets[best]))[both])
+    noise = _robust_sigma(off(float(offsets[best]))[both])
     at, sigma, is_curved = float(offsets[best]), 2.0 * STEP_S, False
     for _ in range(4):
         around = at + 4.0 * max(sigma, 1e-3) * np.linspace(-1.0, 1.0, 17)
         there = [off(float(offset)) for offset in around]
-        sums = np.array([_squared(np.linalg.norm(one, axis=1)[both] / noise) / shared for one in there])
+        sums = np.array([_sum_of_squares(np.linalg.norm(one, axis=1)[both] / noise) / shared for one in there])
         curve, slope, _ = np.polyfit(around, sums, 2)
         is_curved = curve > 0
         if not is_curved:
@@ -93,11 +95,11 @@ def clock_offset(seconds: Floats, positions: Floats, antenna_at: Callable[[Float
             continue
         at = float(np.clip(-slope / (2 * curve), around[0], around[-1]))
         sigma = float(1.0 / np.sqrt(curve))
-        noise = _spread(there[int(np.argmin(sums))][both])
+        noise = _robust_sigma(there[int(np.argmin(sums))][both])
     if not is_curved:
         return None
-    reached = _squared(np.linalg.norm(off(at), axis=1)[both] / noise) / shared
-    return ClockOffset(at, sigma, _squared(unmoved[both] / noise) / shared - reached)
+    reached = _sum_of_squares(np.linalg.norm(off(at), axis=1)[both] / noise) / shared
+    return ClockOffset(at, sigma, _sum_of_squares(unmoved[both] / noise) / shared - reached)
 
 
 def _pairs(seconds: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -109,36 +111,32 @@ def _pairs(seconds: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return first[near], last[first][near]
 
 
-def _turned(own: Floats, moved: Floats) -> Floats:
-    """`own` (P, 2) turned to fit `moved` (P, 2); pairs without one of odometry, or that are far too long, have no say."""
-    return np.asarray((_rotation(_turn(own, moved)) @ own.T).T)
-
-
-def _turn(own: Floats, moved: Floats) -> float:
-    """rad, by which `own` (P, 2) is turned to fit `moved` (P, 2)."""
+def _turn(own: Floats, displacements: Floats) -> float:
+    """rad, by which `own` (P, 2) is turned to fit `displacements` (P, 2); pairs without odometry, or too long, do not count."""
     ok = np.isfinite(own).all(1)
     turn, weights = 0.0, ok.astype(float)
     for _ in range(4):
-        a, b, w = own[ok], moved[ok], weights[ok]
-        turn = float(np.arctan2(w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), w @ (a * b).sum(1)))
-        rotated = _rotation(turn) @ np.nan_to_num(own).T
-        off = np.linalg.norm(moved - rotated.T, axis=1)
+        a, b, w = own[ok], displacements[ok], weights[ok]
+        turn = heading_change(a, b, w)
+        off = np.linalg.norm(displacements - (se2.rotation(turn) @ np.nan_to_num(own).T).T, axis=1)
         scale = max(float(np.median(off[ok])) if ok.any() else 1.0, 1e-4)
         weights = ok / (1.0 + (off / (2.0 * scale)) ** 2)
     return turn
 
 
-def _rotation(turn: float) -> Floats:
-    return np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+def heading_change(a: Floats, b: Floats, weights: Floats) -> float:
+    """rad, by which vectors `a` (P, 2 or 3) are turned about z to fit `b`: least squares with the `weights` (P,)."""
+    across = weights @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return float(np.arctan2(across, weights @ (a[:, :2] * b[:, :2]).sum(1)))
 
 
-def _spread(residuals: Floats) -> float:
+def _robust_sigma(residuals: Floats) -> float:
     """m; sigma of residuals (N, 2), outliers aside."""
     ok = np.isfinite(residuals).all(1)
     return max(float(MAD * np.median(np.abs(residuals[ok]))), 1e-4) if ok.any() else 1.0
 
 
-def _squared(sizes: Floats) -> float:
+def _sum_of_squares(sizes: Floats) -> float:
     """Sum of squares of sizes in sigmas, an outlier counted as five; those without one as all others."""
     ok = np.isfinite(sizes)
     return float((np.minimum(sizes[ok], 5.0) ** 2).sum() * len(sizes) / max(ok.sum(), 1))
@@ -196,7 +194,8 @@ def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floa
     far = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     first, last = _pairs(seconds)
     R = np.eye(3)
-    R[:2, :2] = _rotation(_turn((antenna[last] - antenna[first])[:, :2], (positions[last] - positions[first])[:, :2]))
+    own, moved = ((places[last] - places[first])[:, :2] for places in (antenna, positions))
+    R[:2, :2] = se2.rotation(_turn(own, moved))
     off = positions - antenna @ R.T
     for _ in range(20):
         off = off - np.median(off, axis=0)
@@ -205,8 +204,7 @@ def rough_residuals(seconds: Floats, antenna: Floats, positions: Floats) -> Floa
         weights = (far < 1e5) / (1.0 + (size / (2.0 * scale)) ** 2)
         w = weights / weights.sum()
         a, b = antenna - w @ antenna, positions - w @ positions
-        across = w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-        R[:2, :2] = _rotation(float(np.arctan2(across, w @ (a[:, :2] * b[:, :2]).sum(1))))
+        R[:2, :2] = se2.rotation(heading_change(a, b, w))
         off = b - a @ R.T
     return off - np.median(off, axis=0)
 

@@ -51,12 +51,12 @@ class GaussMarkovNoise:
 class DriftOfFixes:
     """Covariance of odometry at F fixes.
 
-    known, unit : (K, 6, 6) of K keyframes, axes east, north, up, as of `drift.chains`: odometry's own, and drift of factor 1
+    odometry, unit : (K, 6, 6) of K keyframes, axes east, north, up, as of `drift.chains`: odometry's own, and drift of factor 1
     places : (K, 3) m, of the keyframes; metre : (6, 6) of the drift over one metre, `drift.drift_covariance`
     keyframes : (F,) from which each fix is seen, ascending
     """
 
-    known: Floats
+    odometry: Floats
     unit: Floats
     places: Floats
     metre: Floats
@@ -110,17 +110,17 @@ def fit_gauss_markov(
     return GaussMarkovNoise(seconds[:: -(-len(seconds) // INSTANTS)], np.sqrt(variance) * typical, memory), factor
 
 
-def _near_neighbours(scaled: Floats, probability: float) -> Bools:
-    """(F,) inliers of `scaled` (F, 2) residuals about their running median."""
+def _near_neighbours(ratios: Floats, probability: float) -> Bools:
+    """(F,) inliers of `ratios` (F, 2) residuals about their running median."""
     from scipy.ndimage import median_filter
 
-    off = scaled - median_filter(scaled, size=(SMOOTHED_FIXES, 1), mode="reflect")
+    off = ratios - median_filter(ratios, size=(SMOOTHED_FIXES, 1), mode="reflect")
     return np.asarray((off**2).sum(axis=1) <= quantile(probability, 2))
 
 
 def _likeliest(
     seconds: Floats,
-    scaled: Floats,
+    ratios: Floats,
     sigmas: Floats,
     antenna: Floats,
     white: float,
@@ -128,7 +128,7 @@ def _likeliest(
     drift: DriftOfFixes,
     least_gain: float,
 ) -> tuple[float, float, float]:
-    """Time constant, s, and variance of what residuals `scaled` (F, 3) have beside their `white` part, and drift factor.
+    """Time constant, s, and variance of what residuals `ratios` (F, 3) have beside their `white` part, and drift factor.
 
     slow : (V,) variances that are tried; a single one is known
     least_gain : logarithm of the likelihood that drift must gain
@@ -136,14 +136,14 @@ def _likeliest(
     marginal over time constants, gains enough.
     """
     groups = np.array_split(np.arange(len(seconds)), min(len(seconds), MOST))
-    t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, scaled, antenna, sigmas))
+    t, r, a, s = (np.stack([values[g].mean(axis=0) for g in groups]) for values in (seconds, ratios, antenna, sigmas))
     keyframes = drift.keyframes[[group[len(group) // 2] for group in groups]]
     places, weights = drift.places[keyframes], (1.0 / s).ravel()
     known, walk, rate = (
         part * np.outer(weights, weights)
         for part in (
-            _shared(drift.known[keyframes], places),
-            _shared(drift.unit[keyframes], places),
+            _joint_covariance(drift.odometry[keyframes], places),
+            _joint_covariance(drift.unit[keyframes], places),
             _lasting(drift.metre, a),
         )
     )
@@ -167,8 +167,8 @@ def _likeliest(
             for exponential in (np.kron(np.exp(-apart / memory), np.eye(3)) for memory in memories)
         ]
     )
-    memories, likelihoods = _interpolated(memories, tried, 0)
-    slow, likelihoods = _interpolated(slow, likelihoods, 1)
+    memories, likelihoods = _interpolate(memories, tried, 0)
+    slow, likelihoods = _interpolate(slow, likelihoods, 1)
     # Both drifts are as probable, and so are all time constants.
     marginal = np.logaddexp.reduce(likelihoods, axis=(0, 2))
     has_drift = marginal[:, 1:].max() - marginal[:, 0].max() > least_gain
@@ -178,7 +178,7 @@ def _likeliest(
     return float(memories[m]), float(slow[v]), float(FACTORS[possible][f])
 
 
-def _interpolated(grid: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, Floats]:
+def _interpolate(grid: Floats, likelihoods: Floats, axis: int) -> tuple[Floats, Floats]:
     """Positive numbers between those `grid`, and a cubic spline of the logarithms of their likelihoods along `axis`."""
     from scipy.interpolate import CubicSpline
 
@@ -232,7 +232,7 @@ def _beside_white(values: Floats, axes: Floats, sides: Floats) -> Floats:
     return np.asarray(-0.5 * (squared + np.log(spread).sum(axis=1) + np.linalg.slogdet(information)[1]))
 
 
-def _shared(chain: Floats, places: Floats) -> Floats:
+def _joint_covariance(chain: Floats, places: Floats) -> Floats:
     """(3 F, 3 F) m2 of F poses at `places` (F, 3), m, world axes, one after the other.
 
     chain : (F, 6, 6) of each pose, world axes, as of `drift.chains`

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from lslam.backend.graph.factors import well_conditioned
-from lslam.backend.graph.inertial_factors import preintegrated
+from lslam.backend.graph.factors import preintegrate, regularise
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats
@@ -58,7 +57,7 @@ class InertialSmoother(Stateful):
         """The state at the end of `step`. Raises GraphError when the graph cannot be solved."""
         if len(self._steps) >= self._reset:
             assert self.newest is not None
-            self.begin(self._walked(self.newest))
+            self.begin(self._next_prior(self.newest))
         return self._take(step)
 
     def withdraw(self) -> None:
@@ -88,13 +87,13 @@ class InertialSmoother(Stateful):
         before = self.newest
         assert before is not None
         k = len(self._steps)
-        increments = preintegrated(step, before.accel_bias, before.gyro_bias, before.gravity, self._noise)
+        increments = preintegrate(step, before.accel_bias, before.gyro_bias, before.gravity, self._noise)
         names = (4 * k, 4 * k + 1, 4 * k + 4, 4 * k + 5, 4 * k + 2, 4 * k + 6)
         factors = gtsam.NonlinearFactorGraph()
         factors.add(gtsam.CombinedImuFactorWithGravityVector(*names, GRAVITY_KEY, increments))
-        T, velocity = _predicted(before, increments)
+        T, velocity = _predict(before, increments)
         if step.T_world_imu is not None and step.covariance is not None:
-            body = noise.to_body(well_conditioned(step.covariance), step.T_world_imu)
+            body = noise.to_body(regularise(step.covariance), step.T_world_imu)
             model = gtsam.noiseModel.Gaussian.Covariance(body)
             factors.add(gtsam.PriorFactorPose3(4 * k + 4, gtsam.Pose3(step.T_world_imu), model))
         values = gtsam.Values()
@@ -126,7 +125,7 @@ class InertialSmoother(Stateful):
             0.5 * (covariance + covariance.T),
         )
 
-    def _walked(self, state: InertialState) -> InertialState:
+    def _next_prior(self, state: InertialState) -> InertialState:
         """The state as a prior of the next graph: gravity has turned with the world of the map while this one held it."""
         seconds = sum(float(step.seconds.sum()) for step in self._steps)
         covariance = state.covariance.copy()
@@ -145,7 +144,7 @@ def _values(k: int, state: InertialState) -> Any:
     return values
 
 
-def _predicted(before: InertialState, increments: Any) -> tuple[Floats, Floats]:
+def _predict(before: InertialState, increments: Any) -> tuple[Floats, Floats]:
     """Pose (4, 4) and velocity (3,) at the end of what was `increments`, by the mean of the state before."""
     import gtsam
 

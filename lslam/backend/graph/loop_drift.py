@@ -13,9 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.graph.consistency import Ends, judge_loops, moved
-from lslam.backend.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basis, rate_roots
-from lslam.backend.graph.pose_graph import check_graph, with_distances
+from lslam.backend.graph.drift import LASTING, SIZES, chains, correct_drift, linear_basis, mean_rates, rate_roots
+from lslam.backend.graph.pose_graph import Ends, check_graph, judge_loops, transport_twists, with_distances
 from lslam.backend.graph.problem import EstimatedDrift, PoseGraph
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3
@@ -67,22 +66,20 @@ def without_loop_drift(graph: PoseGraph, config: GraphConfig) -> PoseGraph:
             return graph
         drift, covariance, walk = fit.likeliest()
         rates = at_knots @ drift.reshape(-1, 6)
-        turned = _turned(rates[:, 3:], np.diff(graph.distances))
+        turned = _accumulate_turns(rates[:, 3:], np.diff(graph.distances))
         straight = correct_drift(graph, np.column_stack([np.einsum("kij,kj->ki", turned, rates[:, :3]), rates[:, 3:]]))
     chance = quantile(RIGHT_PROBABILITY, 6)
     if gain <= chance:
         return graph
-    share = np.diff(graph.distances) / np.ptp(graph.distances)
-    mean = np.kron(share @ at_knots, np.eye(6))
-    sigma = np.sqrt(np.diag(mean @ covariance @ mean.T)).astype(np.float64)
-    estimated_drift = EstimatedDrift(-np.asarray(mean @ drift, np.float64), sigma, gain, chance)
-    return replace(straight, spread=fit.spread(covariance, walk), walk=walk, estimated_drift=estimated_drift)
+    mean, sigma = mean_rates(graph.distances, at_knots, drift, covariance)
+    estimated_drift = EstimatedDrift(-mean, sigma, gain, chance)
+    return replace(straight, spread=fit.pose_covariances(covariance, walk), walk=walk, estimated_drift=estimated_drift)
 
 
 class _Fit:
-    """Likelihood of rates given loop closures, for the odometry of `graph` corrected by `found` (6 n,), rates at the knots.
+    """Likelihood of rates given loop closures, for the odometry of `graph` corrected by `rates` (6 n,) at the knots.
 
-    Rates are along the axes of the odometry given, which `turned` (K-1, 3, 3) takes into those of the graph.
+    Rates are along the axes of the odometry given, which `rotations` (K-1, 3, 3) takes into those of the graph.
     Errors are twists of the world about the middle of the way, where those of parts of the way add up.
     negative_log_likelihood : (walks, 1 + LASTS * SIZES) twice, up to a constant; column 0 is the null hypothesis without rates
     """
@@ -91,49 +88,52 @@ class _Fit:
         self,
         graph: PoseGraph,
         loops: Sequence[Constraint],
-        found: Floats,
-        turned: Floats,
+        rates: Floats,
+        rotations: Floats,
         config: GraphConfig,
     ) -> None:
         self._poses = se3.make(np.eye(3), -graph.poses[:, :3, 3].mean(0)) @ graph.poses
-        self._ends, self._way = Ends(loops), (graph.distances, turned)
+        self._ends, self._way = Ends(loops), (graph.distances, rotations)
         ends, P = self._ends, self._poses
-        at_ends = np.empty((2, len(loops), 6, len(found)))
+        at_ends = np.empty((2, len(loops), 6, len(rates)))
         for k, effects in _effects(P, *self._way):
             for at_end, end in zip(at_ends, (ends.a, ends.b), strict=True):
                 is_here = (k.start <= end) & (end < k.stop)
                 at_end[is_here] = effects[end[is_here] - k.start]
-        self._rows = (at_ends[1] - at_ends[0]).reshape(-1, len(found))
-        self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ found
+        self._rows = (at_ends[1] - at_ends[0]).reshape(-1, len(rates))
+        self._off = se3.log(P[ends.a] @ ends.T @ se3.inverse(P[ends.b])).ravel() + self._rows @ rates
         self._chains = [noise.transport(chain, -P[:, :3, 3]) for chain in chains(graph, config)]
-        self._known, self._walk = (_shared(chain, ends) for chain in self._chains)
-        self._known += _on_diagonal(moved(ends.covariances, P[ends.a]))
+        self._known, self._walk = (_joint_covariance(chain, ends) for chain in self._chains)
+        self._known += _on_diagonal(transport_twists(ends.covariances, P[ends.a]))
         roots = rate_roots(graph.distances[-1], config, list(range(6)), LASTS, _apart(graph.distances), is_smooth=False)
         self._kinds = [(root, size) for root in roots for size in SIZES]
         seen = [part @ part.T for part in (self._rows @ root for root in roots)]
         drifted = [np.zeros_like(self._known)] + [size**2 * part for part in seen for size in SIZES]
         self.negative_log_likelihood = np.array(
-            [[_negative_log_likelihood(self._walked(walk) + D, self._off) for D in drifted] for walk in checking(WALKS)]
+            [
+                [_negative_log_likelihood(self._with_walk(walk) + D, self._off) for D in drifted]
+                for walk in checking(WALKS)
+            ]
         )
 
     def likeliest(self) -> tuple[Floats, Floats, float]:
         """(6 n,) rates at the knots, their covariance (6 n, 6 n), and the random walk beside them."""
         prior, walk = self._choice()
         design = self._rows @ prior
-        gain = np.linalg.solve(self._walked(walk) + design @ self._rows.T, design).T
+        gain = np.linalg.solve(self._with_walk(walk) + design @ self._rows.T, design).T
         return np.asarray(gain @ self._off), np.asarray(prior - gain @ design), walk
 
-    def spread(self, covariance: Floats, walk: float) -> Floats:
+    def pose_covariances(self, covariance: Floats, walk: float) -> Floats:
         """(K, 6, 6) covariances of poses due to the `covariance` (6 n, 6 n) of the rates, as those of `Solution`.
 
         They add to the covariances given the rates: loop closures then take back a part of the error of wrong rates, since they
         cannot tell it from a random walk.
         """
         known, walked = self._chains
-        chain, weights = known + walk * walked, np.linalg.solve(self._walked(walk), self._rows)
+        chain, weights = known + walk * walked, np.linalg.solve(self._with_walk(walk), self._rows)
         about_middle = np.empty((len(self._poses), 6, 6))
         for k, effects in _effects(self._poses, *self._way):
-            rest = effects - _walked_along(chain, np.arange(len(chain))[k], self._ends) @ weights
+            rest = effects - _walk_along(chain, np.arange(len(chain))[k], self._ends) @ weights
             spread = (rest.reshape(-1, len(covariance)) @ covariance).reshape(rest.shape)
             about_middle[k] = spread @ np.swapaxes(rest, -1, -2)
         return noise.transport(about_middle, self._poses[:, :3, 3])
@@ -144,7 +144,7 @@ class _Fit:
         root, size = self._kinds[int(likely.sum(0).argmax())]
         return size**2 * root @ root.T, float(WALKS @ likely.sum(1) / likely.sum())
 
-    def _walked(self, walk: float) -> Floats:
+    def _with_walk(self, walk: float) -> Floats:
         return np.asarray(self._known + walk * self._walk)
 
 
@@ -162,7 +162,7 @@ def _negative_log_likelihood(S: Floats, off: Floats) -> float:
     return float(2.0 * np.log(np.diag(L)).sum() + whitened @ whitened)
 
 
-def _turned(turns: Floats, ways: Floats) -> Floats:
+def _accumulate_turns(turns: Floats, ways: Floats) -> Floats:
     """(K-1, 3, 3) from the axes of odometry to those of odometry corrected by `turns` (K-1, 3) per m."""
     turned = [np.eye(3)]
     for turn in so3.exp(turns * ways[:, None]):
@@ -170,38 +170,38 @@ def _turned(turns: Floats, ways: Floats) -> Floats:
     return np.stack(turned[1:])
 
 
-def _effects(poses: Floats, distances: Floats, turned: Floats) -> Iterator[tuple[slice, Floats]]:
+def _effects(poses: Floats, distances: Floats, rotations: Floats) -> Iterator[tuple[slice, Floats]]:
     """Keyframes, part after part, and their Jacobians (k, 6, 6 n): twist about the origin by rates at the knots.
 
-    turned : as of `_turned`
+    rotations : as of `_accumulate_turns`
     """
     passed = np.diff(distances)[:, None] * linear_basis(distances, _apart(distances))
-    passed, turned = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, turned))
+    passed, rotations = (np.concatenate([0.0 * rows[:1], rows]) for rows in (passed, rotations))
     before = np.zeros((6, passed.shape[1], 6))
     for begin in checking(range(0, len(poses), BLOCK_KEYFRAMES)):
         k = slice(begin, min(begin + BLOCK_KEYFRAMES, len(poses)))
         step = np.tile(np.eye(6), (k.stop - k.start, 1, 1))
-        step[:, :3, :3] = turned[k]
+        step[:, :3, :3] = rotations[k]
         step[:, :3, 3:] = so3.hat(poses[k, :3, 3])
         effects = before + np.cumsum(step[:, :, None] * passed[k, None, :, None], axis=0)
         before = effects[-1]
         yield k, effects.reshape(len(step), 6, -1)
 
 
-def _walked_along(accumulated: Floats, keyframes: NDArray[np.intp], ends: Ends) -> Floats:
+def _walk_along(chain: Floats, keyframes: NDArray[np.intp], ends: Ends) -> Floats:
     """(k, 6, 6 L) covariance of odometry's errors at keyframes (k,) with those that loop closures, a before b, observe."""
-    last, first = (accumulated[np.minimum.outer(keyframes, end)] for end in (ends.b, ends.a))
+    last, first = (chain[np.minimum.outer(keyframes, end)] for end in (ends.b, ends.a))
     return np.asarray((last - first).transpose(0, 2, 1, 3).reshape(len(keyframes), 6, -1))
 
 
-def _shared(accumulated: Floats, ends: Ends) -> Floats:
+def _joint_covariance(chain: Floats, ends: Ends) -> Floats:
     """(6 L, 6 L) covariance of the residuals of loop closures, a before b: two share the errors of the way in common.
 
-    accumulated : (K, 6, 6) of each pose's twist about the origin by errors of odometry
+    chain : (K, 6, 6) of each pose's twist about the origin by errors of odometry
     """
     first = np.maximum.outer(ends.a, ends.a)
     last = np.maximum(np.minimum.outer(ends.b, ends.b), first)
-    return np.asarray((accumulated[last] - accumulated[first]).transpose(0, 2, 1, 3).reshape(6 * len(first), -1))
+    return np.asarray((chain[last] - chain[first]).transpose(0, 2, 1, 3).reshape(6 * len(first), -1))
 
 
 def _on_diagonal(blocks: Floats) -> Floats:

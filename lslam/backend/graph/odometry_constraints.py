@@ -98,7 +98,7 @@ def growth(a: ScanResult, b: ScanResult, way: float, config: GraphConfig) -> Flo
     return positive(of_b - noise.transport(of_a, b.T_world_lidar[:3, 3] - a.T_world_lidar[:3, 3]))
 
 
-def corrected(
+def correct_scans(
     results: Sequence[ScanResult],
     keyframes: Sequence[Keyframe],
     poses: Floats,
@@ -121,22 +121,22 @@ def corrected(
     return out
 
 
-def bent(results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats) -> list[ScanResult]:
-    """All scans corrected by the keyframes `poses` (K, 4, 4) as in `corrected`, with their own covariances."""
+def bend_scans(results: Sequence[ScanResult], keyframes: Sequence[Keyframe], poses: Floats) -> list[ScanResult]:
+    """All scans corrected by the keyframes `poses` (K, 4, 4) as in `correct_scans`, with their own covariances."""
     final, _ = _bent(results, keyframes, np.stack([r.T_world_lidar for r in results]), poses)
     return [replace(result, T_world_lidar=T) for result, T in zip(results, final, strict=True)]
 
 
 def _bent(
-    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], moved: Floats, poses: Floats
+    results: Sequence[ScanResult], keyframes: Sequence[Keyframe], odometry: Floats, poses: Floats
 ) -> tuple[Floats, NDArray[np.intp]]:
-    """(N, 4, 4) corrected poses of all scans, `moved` by odometry, and the keyframe nearest in time, (N,)."""
+    """(N, 4, 4) corrected poses of all scans, `odometry` by odometry, and the keyframe nearest in time, (N,)."""
     scans = np.array([k.scan for k in keyframes])
     stamps = np.array([k.stamp_ns for k in keyframes], np.int64)
     left = np.clip(np.searchsorted(scans, np.arange(len(results)), side="right") - 1, 0, max(len(scans) - 2, 0))
     right = np.minimum(left + 1, len(scans) - 1)
-    from_left = poses[left] @ se3.relative(moved[scans[left]], moved)
-    from_right = poses[right] @ se3.relative(moved[scans[right]], moved)
+    from_left = poses[left] @ se3.relative(odometry[scans[left]], odometry)
+    from_right = poses[right] @ se3.relative(odometry[scans[right]], odometry)
     span = np.maximum((stamps[right] - stamps[left]).astype(np.float64), 1.0)
     own = np.array([r.stamp_ns for r in results], np.int64)
     share = np.clip((own - stamps[left]).astype(np.float64) / span, 0.0, 1.0)
@@ -156,7 +156,7 @@ def _covariance(
     result: ScanResult,
     keyframe: ScanResult,
     final: Floats,
-    moved: Floats,
+    odometry: Floats,
     pose: Floats,
     covariance: Floats,
     drift: float,
@@ -169,7 +169,7 @@ def _covariance(
     grown = growth(first, last, way, config) + drift * drift_covariance(way, config)
     if result.registration_covariance is not None:
         grown = grown + result.registration_covariance
-    turned = noise.rotate(grown, so3.normalise(final[:3, :3] @ moved[:3, :3].T))
+    turned = noise.rotate(grown, so3.normalise(final[:3, :3] @ odometry[:3, :3].T))
     return np.asarray(noise.transport(covariance, step) + turned)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
-from lslam.backend.graph.pose_prior import PosePrior
+from lslam.backend.graph.marginals import PosePrior
 from lslam.core.types.arrays import Bools, Floats
 from lslam.core.types.constraint import Constraint, LoopStage, Turn
 from lslam.core.types.imu import InertialChain
@@ -33,7 +33,7 @@ class PositionFix:
     share: float = 0.0
     next_arm: Floats = field(default_factory=lambda: np.zeros(3))
 
-    def seen(self, poses: Floats) -> Floats:
+    def predict(self, poses: Floats) -> Floats:
         """(3,) m, where the keyframes at `poses` (K, 4, 4) have the point."""
         here = poses[self.keyframe, :3, :3] @ self.arm + poses[self.keyframe, :3, 3]
         if not self.share:

@@ -1,21 +1,19 @@
-"""gtsam's optimisers, with their exceptions as sentences, and marginal covariances."""
+"""gtsam's optimisers, with their exceptions as sentences."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lslam.backend.graph.factors import FIX_NOISE
-from lslam.backend.graph.inertial_factors import BIAS_KEY, SPEED_KEY, keyframe_of
-from lslam.backend.graph.selected_inverse import selected_inverse
+from lslam.backend.graph.factors import BIAS_KEY, FIX_NOISE, SPEED_KEY, keyframe_of
+from lslam.backend.graph.marginals import first_line
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import GraphError
-from lslam.core.geometry import noise
 from lslam.core.geometry.noise import RIGHT_PROBABILITY, quantile
-from lslam.core.stopping import check_stop, checking
+from lslam.core.stopping import check_stop
 from lslam.core.types.arrays import Floats
 
 # Keyframes that iSAM2 takes in per update.
@@ -45,7 +43,7 @@ def solve(factors: Any, values: Any, config: GraphConfig) -> Any:
         solution = optimizer(factors, values, params).optimize()
         error = float(factors.error(solution))
     except RuntimeError as failure:
-        raise GraphError(f"the pose graph cannot be optimised: {_first_line(failure)}") from None
+        raise GraphError(f"the pose graph cannot be optimised: {first_line(failure)}") from None
     if not np.isfinite(error):
         raise GraphError("the pose graph cannot be optimised: its error is not finite")
     return solution
@@ -121,66 +119,7 @@ def solve_incrementally(factors: Any, values: Any, count: int) -> Any:
             solver.update(part, start)
         return solver.calculateBestEstimate()
     except RuntimeError as failure:
-        raise GraphError(f"the pose graph cannot be optimised: {_first_line(failure)}") from None
-
-
-def marginals(factors: Any, values: Any, poses: Floats) -> Floats:
-    """(K, 6, 6) covariances of the poses with the keys 0..K-1, t' = t + d[:3], R' = exp(d[3:]) R in world axes, m2 and rad2.
-
-    Raises GraphError when the graph is singular.
-    """
-    bodies = marginal_blocks(factors, values, range(len(poses)))
-    world = noise.from_body(bodies, poses)
-    # d of this house is in the parent's axes: the world's.
-    return 0.5 * (world + np.swapaxes(world, -1, -2))
-
-
-def marginal_blocks(factors: Any, values: Any, keys: Iterable[int]) -> Floats:
-    """(K, 6, 6) covariances of the poses with these keys, in gtsam's order and axes.
-
-    Raises GraphError when the graph is singular.
-    """
-    import gtsam
-
-    needed = list(keys)
-    try:
-        net = factors.linearize(values).eliminateSequential(gtsam.Ordering.OrderingType.COLAMD)
-        blocks = dict(checking(selected_inverse(net, needed)))
-        return np.stack([blocks[key] for key in needed])
-    except RuntimeError:
-        # It gives up where neighbouring unknowns are known very differently well, as the roll of a straight path is.
-        return scaled_blocks(factors, values, needed)
-
-
-def scaled_blocks(factors: Any, values: Any, keys: list[int]) -> Floats:
-    """What `marginal_blocks` gives, by normal equations scaled so that each unknown counts alike."""
-    from scipy.sparse import csc_array, diags_array
-    from scipy.sparse.linalg import splu
-
-    # The columns of the Jacobian are in the order of the keys; a floor has less than six.
-    sizes = dict(sorted(values.dims().items()))
-    begins = dict(zip(sizes, np.cumsum([0, *sizes.values()]).tolist(), strict=False))
-    columns = values.dim()
-    rows, cols, entries = factors.linearize(values).sparseJacobian_()
-    A = csc_array((entries, (rows.astype(np.intp) - 1, cols.astype(np.intp) - 1)))[:, :columns]
-    H = (A.T @ A).tocsc()
-    scale = 1.0 / np.sqrt(H.diagonal())
-    try:
-        factor = splu((diags_array(scale) @ H @ diags_array(scale)).tocsc())
-    except RuntimeError as failure:
-        raise GraphError(f"the pose graph has no covariances: {_first_line(failure)}") from None
-    blocks = []
-    for key in checking(keys):
-        begin = begins[key]
-        units = np.zeros((columns, 6))
-        units[begin : begin + 6] = np.diag(scale[begin : begin + 6])
-        blocks.append(scale[begin : begin + 6, None] * factor.solve(units)[begin : begin + 6])
-    return np.stack(blocks)
-
-
-def _first_line(failure: RuntimeError) -> str:
-    text = str(failure).strip()
-    return text.splitlines()[0] if text else type(failure).__name__
+        raise GraphError(f"the pose graph cannot be optimised: {first_line(failure)}") from None
 
 
 @dataclass(frozen=True)
@@ -196,33 +135,33 @@ class GncResult:
     """The solution of a graph.
 
     factors : gtsam's graph of all inliers; values : the solution; weights : (D,) 0..1 per candidate
-    squared : (D,) whitened squared residuals at the solution; limits : (D,) their chi-square quantiles, inliers are below
+    squared_residuals : (D,) whitened, at the solution; limits : (D,) their chi-square quantiles, inliers are below
     rounds : solutions it took
     """
 
     factors: Any
     values: Any
     weights: Floats
-    squared: Floats
+    squared_residuals: Floats
     limits: Floats
     rounds: int
 
 
-def gnc_solve(fixed: Any, candidates: Sequence[OutlierCandidate], values: Any, config: GraphConfig) -> GncResult:
+def gnc_solve(base: Any, candidates: Sequence[OutlierCandidate], values: Any, config: GraphConfig) -> GncResult:
     """Solve, classifying the outlier candidates by the method `config.robust`."""
     limits = np.array([quantile(RIGHT_PROBABILITY, d.dim) for d in candidates])
     plain = [d.make(1.0, None) for d in candidates]
     if config.robust == "gnc":
-        return _graduated(fixed, candidates, plain, limits, values, config)
-    factors = joined(fixed, [d.make(1.0, _kernel(config.robust, d.dim)) for d in candidates])
+        return _solve_gnc(base, candidates, plain, limits, values, config)
+    factors = join_factors(base, [d.make(1.0, _kernel(config.robust, d.dim)) for d in candidates])
     values = solve(factors, values, config)
-    squared = _squared(plain, values)
+    squared = _squared_residuals(plain, values)
     is_inlier = (squared <= limits) | (config.robust == "none")
     return GncResult(factors, values, is_inlier.astype(float), squared, limits, 1)
 
 
-def _graduated(
-    fixed: Any,
+def _solve_gnc(
+    base: Any,
     candidates: Sequence[OutlierCandidate],
     plain: list[Any],
     limits: Floats,
@@ -230,9 +169,9 @@ def _graduated(
     config: GraphConfig,
 ) -> GncResult:
     weights = np.ones(len(plain))
-    factors = joined(fixed, plain)
+    factors = join_factors(base, plain)
     values = solve(factors, values, config)
-    squared = _squared(plain, values)
+    squared = _squared_residuals(plain, values)
     rounds = 1
     ratio = float((squared / limits).max()) if len(plain) else 0.0
     if ratio <= 1:
@@ -240,21 +179,21 @@ def _graduated(
     mu = 1.0 / (2.0 * ratio - 1.0)
     while rounds < ROUNDS:
         weights = truncated_weights(squared / limits, mu)
-        factors = joined(fixed, _weighted(candidates, plain, weights))
+        factors = join_factors(base, _weight(candidates, plain, weights))
         values = refine(factors, values, config)
-        squared = _squared(plain, values)
+        squared = _squared_residuals(plain, values)
         rounds += 1
-        if are_decided(weights):
+        if are_binary(weights):
             break
         mu *= GROWTH
     # Finally inliers have their own covariance, outliers are left out.
     is_inlier = squared <= limits
-    if are_decided(weights) and np.array_equal(is_inlier, weights > IN):
+    if are_binary(weights) and np.array_equal(is_inlier, weights > IN):
         return GncResult(factors, values, is_inlier.astype(float), squared, limits, rounds)
     weights = is_inlier.astype(float)
-    factors = joined(fixed, [f for f, b in zip(plain, is_inlier, strict=True) if b])
+    factors = join_factors(base, [f for f, b in zip(plain, is_inlier, strict=True) if b])
     values = solve(factors, values, config)
-    return GncResult(factors, values, weights, _squared(plain, values), limits, rounds + 1)
+    return GncResult(factors, values, weights, _squared_residuals(plain, values), limits, rounds + 1)
 
 
 def truncated_weights(ratio: Floats, mu: float) -> Floats:
@@ -264,12 +203,12 @@ def truncated_weights(ratio: Floats, mu: float) -> Floats:
     return np.where(ratio <= low, 1.0, np.where(ratio >= high, 0.0, np.clip(middle, 0.0, 1.0)))
 
 
-def are_decided(weights: Floats) -> bool:
+def are_binary(weights: Floats) -> bool:
     """Whether every candidate counts in full or not at all."""
     return bool(np.all((weights == 0) | (weights > IN)))
 
 
-def _weighted(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: Floats) -> list[Any]:
+def _weight(candidates: Sequence[OutlierCandidate], plain: list[Any], weights: Floats) -> list[Any]:
     chosen = []
     for item, factor, weight in zip(candidates, plain, weights, strict=True):
         if weight > 0:
@@ -277,17 +216,17 @@ def _weighted(candidates: Sequence[OutlierCandidate], plain: list[Any], weights:
     return chosen
 
 
-def joined(fixed: Any, more: list[Any]) -> Any:
-    """The factor graph `fixed` and more factors; `fixed` stays as it is."""
+def join_factors(base: Any, more: list[Any]) -> Any:
+    """The factor graph `base` and more factors; `base` stays as it is."""
     import gtsam
 
-    factors = gtsam.NonlinearFactorGraph(fixed)
+    factors = gtsam.NonlinearFactorGraph(base)
     for factor in more:
         factors.add(factor)
     return factors
 
 
-def _squared(factors: list[Any], values: Any) -> Floats:
+def _squared_residuals(factors: list[Any], values: Any) -> Floats:
     """(D,) squared whitened residuals. gtsam's `error` is half of that."""
     return np.array([2.0 * factor.error(values) for factor in factors])
 

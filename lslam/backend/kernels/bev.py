@@ -1,4 +1,8 @@
-"""Bird's-eye views: cells that the points of a cloud fall into, counted and marked, and scores of their correlations."""
+"""Images of a cloud from above.
+
+Bird's-eye views: cells that its points fall into, counted and marked, and scores of their correlations. The polar image that Scan
+Context compares: greatest height per ring and sector round the sensor.
+"""
 
 from __future__ import annotations
 
@@ -30,16 +34,16 @@ def cell_of(x: float, y: float, R: Floats, size: int, edge: float) -> tuple[int,
 
 
 @inline
-def mark(points: Floats, R: Floats, edge: float, seen: Image) -> None:
+def mark(points: Floats, R: Floats, edge: float, visible: Image) -> None:
     """Set the cells (S, S) of the points (N, k), rotated by R (2, 2), and those round them, to 1."""
-    size = len(seen)
+    size = len(visible)
     for i in range(len(points)):
         row, column = cell_of(points[i, 0], points[i, 1], R, size, edge)
         if row == OUTSIDE:
             continue
         for r in range(max(row - 1, 0), min(row + 2, size)):
             for c in range(max(column - 1, 0), min(column + 2, size)):
-                seen[r, c] = np.float32(1.0)
+                visible[r, c] = np.float32(1.0)
 
 
 @kernel
@@ -103,3 +107,32 @@ def fit(
             if own >= least and match > best * math.sqrt(own * other):
                 best, best_row, best_column = match / math.sqrt(own * other), r - row, c - column
     return best, best_row, best_column
+
+
+EMPTY = -np.inf
+
+
+@kernel
+def polar_image(points: NDArray[np.float32], rings: int, sectors: int, reach: float) -> NDArray[np.float32]:
+    """Greatest z of the points (N, 3), m, in each of `rings` x `sectors` cells within `reach` m; -inf where none lies.
+
+    Sector 0 begins at +x and sectors count counter-clockwise (equations 2.34 and 2.35 of Girolimetto).
+    """
+    image = np.empty((rings, sectors), np.float32)
+    image[:] = EMPTY
+    per_metre = rings / reach
+    per_radian = sectors / (2.0 * math.pi)
+    for i in range(len(points)):
+        x, y, z = float(points[i, 0]), float(points[i, 1]), points[i, 2]
+        ring = math.sqrt(x * x + y * y) * per_metre
+        # Also false for NaN.
+        if not (ring < rings and np.isfinite(z)):
+            continue
+        angle = math.atan2(y, x)
+        if angle < 0.0:
+            angle += 2.0 * math.pi
+        # Just below the x axis the sum can round to a whole turn.
+        sector = min(int(angle * per_radian), sectors - 1)
+        if z > image[int(ring), sector]:
+            image[int(ring), sector] = z
+    return image

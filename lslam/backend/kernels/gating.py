@@ -25,7 +25,7 @@ def largest_eigenvalue(a: float, b: float, c: float, d: float, e: float, f: floa
 
 
 @kernel
-def gated(
+def gate(
     b: int,
     among: NDArray[np.int64],
     positions: Floats,

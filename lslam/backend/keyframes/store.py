@@ -1,4 +1,7 @@
-"""The clouds of keyframes, compressed on disk, so that memory does not grow with the length of the run."""
+"""The clouds of keyframes, compressed on disk, so that memory does not grow with the length of the run.
+
+Submaps are clouds of neighbouring keyframes in one frame; they and the mounting tell the up direction.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.config.input import PreprocessConfig
 from lslam.core.errors import InputError, OutputError, cause
-from lslam.core.types.arrays import Points
+from lslam.core.geometry import se3
+from lslam.core.kernels import voxel as voxels
+from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.state import Stateful
 from lslam.core.types.trajectory import Keyframe
 from lslam.io.formats.bag_chunks import zstd
 from lslam.io.formats.state_files import pack_npz, read_npz, write_npz
+from lslam.registration.preprocessing.ground import Z, find_up, world_up_of
+from lslam.registration.preprocessing.prepare import NO_TIMES
 
 Labels = NDArray[np.uint16]
 INDEX = "index.npz"
@@ -44,13 +53,13 @@ class KeyframeStore(Stateful):
     (1, [[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
     """
 
-    def __init__(self, folder: Path | None = None, cached: int = CACHED, deflate: int = 1) -> None:
+    def __init__(self, folder: Path | None = None, cache_size: int = CACHED, deflate: int = 1) -> None:
         self.folder = folder
         self.keyframes: list[Keyframe] = []
         # The number by which the cloud of each was added.
         self._files: list[int] = []
         self._memory: dict[int, bytes] = {}
-        self._cached, self._deflate = cached, deflate
+        self._cached, self._deflate = cache_size, deflate
         self._recent: OrderedDict[int, tuple[Points, Labels | None]] = OrderedDict()
         self._lock = threading.Lock()
         if folder is not None and (folder / INDEX).exists():
@@ -71,7 +80,7 @@ class KeyframeStore(Stateful):
         # Byte by byte and axis by axis: what is alike lies side by side, and zstd takes it down to half.
         planes = np.ascontiguousarray(cloud.T).view(np.uint8).reshape(3, len(cloud), 4).transpose(2, 0, 1)
         arrays: dict[str, NDArray[Any]] = {"planes": planes} if labels is None else {"planes": planes, "labels": labels}
-        arrays = _packed(arrays, self._deflate) if self._deflate else arrays
+        arrays = _pack(arrays, self._deflate) if self._deflate else arrays
         if self.folder is None:
             stream = io.BytesIO()
             pack_npz(stream, arrays, 0)
@@ -85,13 +94,13 @@ class KeyframeStore(Stateful):
 
     def points(self, number: int) -> Points:
         """Cloud (N, 3), m, of keyframe `number`, as it was added; not to be written to."""
-        return self._held(number)[0]
+        return self._load(number)[0]
 
     def labels(self, number: int) -> Labels | None:
         """Classes (N,) of the points of keyframe `number`, as they were added; not to be written to."""
-        return self._held(number)[1]
+        return self._load(number)[1]
 
-    def _held(self, number: int) -> tuple[Points, Labels | None]:
+    def _load(self, number: int) -> tuple[Points, Labels | None]:
         file = self._files[number]
         with self._lock:
             if file in self._recent:
@@ -99,7 +108,7 @@ class KeyframeStore(Stateful):
                 return self._recent[file]
         source = io.BytesIO(self._memory[file]) if self.folder is None else self._path(file)
         name = str(source) if isinstance(source, Path) else "a keyframe"
-        arrays = _unpacked(read_npz(source), name)
+        arrays = _unpack(read_npz(source), name)
         planes, labels = arrays.get("planes", np.zeros(0, np.uint8)), arrays.get("labels")
         if (
             planes.ndim != 3
@@ -189,14 +198,14 @@ class PartOfStore(KeyframeStore):
         return self._store.labels(self.whole[number].number)
 
 
-def _packed(arrays: Mapping[str, NDArray[Any]], level: int) -> dict[str, NDArray[np.uint8]]:
+def _pack(arrays: Mapping[str, NDArray[Any]], level: int) -> dict[str, NDArray[np.uint8]]:
     """The bytes of the arrays as frames of zstd, which packs seven times and unpacks three times as fast as deflate."""
     compress = zstd().compress
     return {f"{name}{ZST}": np.frombuffer(compress(array.tobytes(), level), np.uint8) for name, array in arrays.items()}
 
 
-def _unpacked(arrays: dict[str, NDArray[Any]], name: str) -> dict[str, NDArray[Any]]:
-    """Planes and labels from the file `name`, as `_packed` or an older version wrote them. Raises InputError for others."""
+def _unpack(arrays: dict[str, NDArray[Any]], name: str) -> dict[str, NDArray[Any]]:
+    """Planes and labels from the file `name`, as `_pack` or an older version wrote them. Raises InputError for others."""
     planes, labels = f"planes{ZST}", f"labels{ZST}"
     try:
         if planes in arrays:
@@ -239,3 +248,61 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder} cannot be written: {cause(error)}") from None
+
+
+def neighbours(count: int, number: int, size: int) -> range:
+    """Numbers of the `size` keyframes about `number` out of `count`; fewer where the run begins or ends.
+
+    >>> neighbours(10, 4, 5), neighbours(10, 0, 5), neighbours(10, 9, 4)
+    (range(2, 7), range(0, 3), range(7, 10))
+    """
+    return range(max(number - size // 2, 0), min(number + (size + 1) // 2, count))
+
+
+def submap(
+    store: KeyframeStore,
+    poses: Floats,
+    number: int,
+    size: int,
+    voxel: float | None = None,
+    T_world_frame: Floats | None = None,
+) -> NDArray[np.float32]:
+    """Points (M, 3), m, of the `size` keyframes about keyframe `number`, in its LiDAR frame or in `T_world_frame` (4, 4).
+
+    poses : (K, 4, 4) T_world_lidar of all keyframes, odometry's or optimised ones
+    voxel : m, one averaged point per voxel is left; None leaves all
+    """
+    frame = poses[number] if T_world_frame is None else T_world_frame
+    clouds = {k: store.points(k) for k in neighbours(len(store), number, size)}
+    points = np.empty((sum(map(len, clouds.values())), 3), np.float32)
+    first = 0
+    for k, cloud in clouds.items():
+        transform(cloud, se3.relative(frame, poses[k]), points[first : first + len(cloud)])
+        first += len(cloud)
+    return points if voxel is None else voxels.means(points, NO_TIMES, voxel)[0]
+
+
+def submap_labels(store: KeyframeStore, number: int, size: int) -> NDArray[np.uint16]:
+    """Classes (M,) of the points of `submap` where all are left; 0, unlabeled, of keyframes whose classes are unknown."""
+    parts = []
+    for k in neighbours(len(store), number, size):
+        labels = store.labels(k)
+        parts.append(np.zeros(len(store.points(k)), np.uint16) if labels is None else labels)
+    return np.concatenate(parts)
+
+
+# Keyframes in whose clouds the ground is looked for: rings of a sensor on its side cross it in a line, those of 20 m cover it.
+GROUND_KEYFRAMES = 10
+
+
+def mounted_up(store: KeyframeStore, poses: Floats, config: PreprocessConfig) -> Floats:
+    """(3,) unit vector up in the world of the poses (K, 4, 4), T_world_lidar of all keyframes.
+
+    By `preprocess.up`, or else by the ground about the first keyframes: z unless it is more than 45 deg off.
+    """
+    if config.up is not None or not len(store):
+        return world_up_of(config, poses[0]) if len(poses) else Z
+    middle = min(GROUND_KEYFRAMES, len(store)) // 2
+    frame = np.eye(4)
+    frame[:3, 3] = poses[middle, :3, 3]
+    return find_up(submap(store, poses, middle, GROUND_KEYFRAMES, T_world_frame=frame)).direction

@@ -8,16 +8,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lslam.backend.graph.odometry_constraints import positive
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import mounted_up, submap
-from lslam.backend.localization.place_search import PlaceSearch
-from lslam.backend.localization.prior_map import make_prior_map
-from lslam.backend.localization.start import PlaceFinder, Start, StartPrior
+from lslam.backend.keyframes.store import KeyframeStore, mounted_up, submap
+from lslam.backend.localization.locate import PlaceFinder, Start, StartPrior
+from lslam.backend.localization.prior_map import PlaceSearch, make_prior_map
+from lslam.backend.loops.level_submap import move_points
 from lslam.core.config.config import Config
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import geodesy, noise, se3
 from lslam.core.kernels import voxel
-from lslam.core.kernels.transform import transform
 from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.constraint import Constraint
 from lslam.core.types.gnss import Georeference
@@ -159,19 +157,19 @@ class Vicinity:
 
 def tie(
     session: Session,
-    known: Sequence[Session],
+    others: Sequence[Session],
     config: Config,
     should_stop: Callable[[], bool] = lambda: False,
     vicinity: Vicinity | None = None,
 ) -> tuple[Session | None, str]:
     """The session in the common world of the known ones, or None and why it is not found among them."""
-    cloud = np.concatenate([_cloud_of(s) for s in known])
+    cloud = np.concatenate([_cloud_of(s) for s in others])
     prior_map = make_prior_map(
-        cloud.astype(np.float64), config.registration, source="the sessions before", up=known[0].up
+        cloud.astype(np.float64), config.registration, source="the sessions before", up=others[0].up
     )
     own = config.model_copy(update={"preprocess": session.preprocess})
     finder = PlaceFinder(PlaceSearch(prior_map, config.registration), _AtFinalPoses(session), own)
-    expected = by_georeference(session, known)
+    expected = by_georeference(session, others)
     T_level_map = se3.inverse(prior_map.T_map_level)
     prior = None if expected is None else _prior(T_level_map @ expected, session, config)
     if vicinity is not None:
@@ -185,9 +183,9 @@ def tie(
     return replace(session, T_town_session=prior_map.T_map_level @ start.vote.T_level_odometry, start=start), ""
 
 
-def by_georeference(session: Session, known: Sequence[Session]) -> Floats | None:
+def by_georeference(session: Session, others: Sequence[Session]) -> Floats | None:
     """(4, 4) from its world into the common one, by the first known one that lies on the Earth; None without two that do."""
-    other = next((s for s in known if s.georeference is not None), None)
+    other = next((s for s in others if s.georeference is not None), None)
     if other is None or other.georeference is None or session.georeference is None:
         return None
     T_other_own = geodesy.frame_change(session.georeference.origin, other.georeference.origin)
@@ -217,10 +215,5 @@ class _AtFinalPoses(KeyframeStore):
 
 def _cloud_of(session: Session) -> Points:
     """(N, 3) m, common world: the clouds of its keyframes, one mean per voxel."""
-    parts = []
-    for k, T in enumerate(session.poses):
-        points = session.store.points(k)
-        moved = np.empty_like(points)
-        transform(points, T, moved)
-        parts.append(moved)
+    parts = [move_points(session.store.points(k), T) for k, T in enumerate(session.poses)]
     return np.asarray(voxel.means(np.concatenate(parts), NO_TIMES, FINE)[0])

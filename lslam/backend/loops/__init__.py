@@ -1,16 +1,21 @@
 """Loop closure detection: candidates by gating and descriptors, verification by registration.
 
-A new place descriptor is one file with `create` and one line here; others register an entry point `lslam.descriptors`.
+A place descriptor remembers places by keyframe and finds those that look alike. A new one is one file with `create` and one line
+here; others register an entry point `lslam.descriptors`.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lslam.core.extras import factory, require
+from lslam.core.types.arrays import Longs
 
 if TYPE_CHECKING:
-    from lslam.backend.loops.descriptor import PlaceDescriptor
     from lslam.core.config.backend import LoopsConfig
 
 GROUP = "lslam.descriptors"
@@ -28,3 +33,34 @@ def require_descriptor(name: str) -> None:
 def create_descriptor(config: LoopsConfig) -> PlaceDescriptor:
     """The descriptor `loops.descriptor` names. Raises UsageError with the nearest name when there is none."""
     return cast("PlaceDescriptor", factory(GROUP, DESCRIPTORS, config.descriptor, "place descriptor")(config))
+
+
+@dataclass(frozen=True)
+class PlaceMatch:
+    """A keyframe that looks alike.
+
+    distance : 0 alike to 1, compared with `loops.max_descriptor_distance`
+    yaw : rad; turning the query's cloud by it about z turns it as the match's
+    """
+
+    number: int
+    distance: float
+    yaw: float
+
+
+class PlaceDescriptor(Protocol):
+    """The places seen so far, by keyframe number.
+
+    yaw_error : rad, by which the yaw of a match may be wrong
+    """
+
+    yaw_error: float
+
+    def add(self, number: int, points: NDArray[np.float32]) -> None:
+        """Describe the cloud (N, 3), m, round keyframe `number`, level with z up; keyframes come once, in any order."""
+
+    def nearest(self, number: int, others: Longs, turn: float = np.pi) -> list[PlaceMatch]:
+        """Those of the keyframes `others` that look most like keyframe `number`, the best first; all must be known.
+
+        turn : rad, headings differ by no more
+        """

@@ -12,24 +12,22 @@ from itertools import islice
 
 import numpy as np
 
-from lslam.backend.loops import create_descriptor
-from lslam.backend.loops.descriptor import PlaceMatch
+from lslam.backend.loops import PlaceMatch, create_descriptor
 from lslam.backend.loops.gating import (
     GATE_SIGMAS,
     LoopThrottle,
     OdometryUncertainty,
     RelativeUncertainty,
     SharedResults,
+    WorkingMemory,
     resolve_ambiguity,
 )
-from lslam.backend.loops.level_submap import LevelSubmap, find_up, levelled, make_level_submap
+from lslam.backend.loops.level_submap import find_up, level_keyframes, make_level_submap, move_points
 from lslam.backend.loops.verify import Verification, Verifier
-from lslam.backend.loops.working_memory import WorkingMemory
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InterruptedRunError
-from lslam.core.geometry import se3, so3
-from lslam.core.kernels.transform import transform
+from lslam.core.geometry import noise, se3, so3
 from lslam.core.types.arrays import Floats, Longs, Points
 from lslam.core.types.constraint import Constraint, KnownPair, LoopCandidate, LoopStage, Verdict
 from lslam.core.types.scan_result import KeyframeClocks, StageClock
@@ -78,7 +76,7 @@ class Detector:
         self._index_lock = threading.Lock()
         self._described = SharedResults(self._describe)
         self._clouds = SharedResults(self._make_level, CLOUDS)
-        self._submaps = SharedResults(self._make_submap, KEPT)
+        self._submaps = SharedResults(lambda n: make_level_submap(self._clouds.get(n), self.registration), KEPT)
         # Submaps overlap: the first keyframe of every few metres represents those after it.
         steps = np.floor(self.uncertainty.distances / (NEAR_M / 2))
         self._is_described = np.diff(steps, prepend=-1.0) > 0
@@ -94,7 +92,7 @@ class Detector:
         candidates: list[LoopCandidate] = []
         throttle = LoopThrottle(self.config.spacing)
         count = len(self.keyframes)
-        if any(len(self._gated(b)) for b in range(count)):
+        if any(len(self._gate(b)) for b in range(count)):
             self._level_world()
             if self.config.memory == "bounded" and self.config.rehearsal is not None:
                 places = self._rehearse(1.0 - self.config.rehearsal, should_stop)
@@ -102,27 +100,29 @@ class Detector:
                     places, self.uncertainty.distances, self.config.memory_places, self.config.min_travel
                 )
         # Of thousands of keyframes, each has thousands: those of the next few are held.
-        gated = SharedResults(self._gated, HELD)
+        gated = SharedResults(self._gate, HELD)
         ahead: dict[int, tuple[Longs, Future[list[LoopCandidate]]]] = {}
         with ThreadPoolExecutor(threads, "lslam-loops") as pool:
             try:
                 for b, keyframe in enumerate(self.keyframes):
                     _stop_if(should_stop(), b, count)
                     if self.memory.reach(b):
-                        gated = SharedResults(self._gated, HELD)
+                        gated = SharedResults(self._gate, HELD)
                     older = gated.get(b)
                     if len(older) == 0:
                         throttle.reset()
                         continue
                     if not throttle.is_due(keyframe.distance):
-                        candidates.append(self._thinned(older, b, throttle.wait))
+                        reason = f"the last one tried was less than {throttle.wait:g} m ago"
+                        check = Verification(LoopStage.THINNED, reason)
+                        candidates.append(self._candidate(self._nearest(older, b), b, check))
                         continue
                     # A thread that is done goes on with what waits, although an older keyframe is not.
                     for n in (b, *islice(self._due_after(b, gated, throttle), 2 * (threads - 1))):
                         # What was begun with another memory is begun again.
                         if n not in ahead or (n == b and not np.array_equal(ahead[n][0], older)):
                             compared = gated.get(n)
-                            task = pool.submit(copy_context().run, self._examined, n, compared, clocks[n])
+                            task = pool.submit(copy_context().run, self._examine_all, n, compared, clocks[n])
                             ahead[n] = compared, task
                     examined = ahead.pop(b)[1].result()
                     candidates += examined
@@ -138,7 +138,7 @@ class Detector:
                 pool.shutdown(cancel_futures=True)
         return candidates
 
-    def verify_known(self, pair: KnownPair) -> LoopCandidate:
+    def verify_pair(self, pair: KnownPair) -> LoopCandidate:
         """The pair registered, whatever odometry says of its place; of its heading odometry is believed where it is sure."""
         self._level_world()
         a, b = pair.a, pair.b
@@ -148,32 +148,21 @@ class Detector:
         expected = self.keyframes[a].T_world_lidar[:3, :3] @ pair.place
         within = KNOWN_WITHIN_M if pair.within is None else pair.within
         check = self.verifier.verify(self._submaps.get(a), self._submaps.get(b), expected, within, yaws)
-        closed = self._constraint(a, b, check)
-        return LoopCandidate(
-            a,
-            b,
-            self._away(a, b),
-            float("nan"),
-            Verdict.REJECTED if check.reason else Verdict.ACCEPTED,
-            check.stage if check.reason else LoopStage.MANUAL,
-            check.reason,
-            check.rmse,
-            check.overlap,
-            None if closed is None else replace(closed, is_binding=not check.reason),
-        )
+        check = check if check.reason else replace(check, stage=LoopStage.MANUAL)
+        return self._candidate(a, b, check, is_binding=not check.reason)
 
-    def _due_after(self, b: int, gated: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
+    def _due_after(self, b: int, gates: SharedResults[Longs], throttle: LoopThrottle) -> Iterator[int]:
         """The next keyframes after `b` that are due if all verdicts are as the last one."""
         throttle = copy(throttle)
         throttle.observe(self.keyframes[b].distance, throttle.last or Verdict.ACCEPTED)
         for n in range(b + 1, min(b + HELD, len(self.keyframes))):
-            if len(gated.get(n)) == 0:
+            if len(gates.get(n)) == 0:
                 throttle.reset()
             elif throttle.is_due(self.keyframes[n].distance):
                 yield n
                 throttle.observe(self.keyframes[n].distance, throttle.last or Verdict.ACCEPTED)
 
-    def _examined(self, b: int, older: Longs, clock: StageClock) -> list[LoopCandidate]:
+    def _examine_all(self, b: int, older: Longs, clock: StageClock) -> list[LoopCandidate]:
         """Keyframe `b` verified against the similar ones of the `older`, with verdicts."""
         with clock.stage("loops"):
             alike, fallback = self._choose(b, older)
@@ -191,7 +180,7 @@ class Detector:
         shown = np.unique(np.linspace(0, len(self.keyframes) - 1, LOOKS).round().astype(int))
         maps = [make_level_submap(self._make_level(int(number)), self.registration).fine for number in shown]
         up = find_up(maps, self._mounted)
-        self.keyframes = levelled(self.keyframes, up)
+        self.keyframes = level_keyframes(self.keyframes, up)
         self.uncertainty = OdometryUncertainty(self.keyframes, self.config.drift_percent, self.config.drift_deg)
 
     def _rehearse(self, limit: float, should_stop: Callable[[], bool]) -> Longs:
@@ -204,25 +193,20 @@ class Detector:
             place_of[k] = place_of[k - 1] + (first == k)
         return place_of
 
-    def _gated(self, b: int) -> Longs:
+    def _gate(self, b: int) -> Longs:
         """Older keyframes in the memory within the gate of odometry about `b`, but not on the way just travelled."""
-        among = self._allowed(b, self.memory.before(b))
+        among = self._filter_forbidden(b, self.memory.before(b))
         if self.config.radius is None:
-            return self.uncertainty.gated(b, among, self.config.min_travel, NEAR_M, GATE_SIGMAS)
-        return self.uncertainty.gated(b, among, self.config.min_travel, self.config.radius, 0.0)
+            return self.uncertainty.gate(b, among, self.config.min_travel, NEAR_M, GATE_SIGMAS)
+        return self.uncertainty.gate(b, among, self.config.min_travel, self.config.radius, 0.0)
 
-    def _allowed(self, b: int, among: Longs) -> Longs:
+    def _filter_forbidden(self, b: int, among: Longs) -> Longs:
         """Those that no forbidden pair lies at: so near along the way the same surfaces are taken for the same place."""
         distances = self.uncertainty.distances
         for older, newer in self.forbidden:
             if abs(distances[b] - distances[newer]) <= NEAR_M:
                 among = among[np.abs(distances[among] - distances[older]) > NEAR_M]
         return among
-
-    def _thinned(self, older: Longs, b: int, wait: float) -> LoopCandidate:
-        a = self._nearest(older, b)
-        reason = f"the last one tried was less than {wait:g} m ago"
-        return LoopCandidate(a, b, self._away(a, b), float("nan"), Verdict.REJECTED, LoopStage.THINNED, reason)
 
     def _nearest(self, older: Longs, b: int) -> int:
         away = np.linalg.norm(self.uncertainty.positions[older] - self.uncertainty.positions[b], axis=1)
@@ -250,9 +234,9 @@ class Detector:
             return self._matches(b, nearest), list
         return alike, lambda: self._elsewhere(self._matches(b, nearest), alike)
 
-    def _elsewhere(self, matches: list[PlaceMatch], chosen: list[PlaceMatch]) -> list[PlaceMatch]:
+    def _elsewhere(self, matches: list[PlaceMatch], others: list[PlaceMatch]) -> list[PlaceMatch]:
         """Those of the matches that are not at the place of a chosen one."""
-        return [m for m in matches if all(self._away(m.number, c.number) > NEAR_M / 2 for c in chosen)]
+        return [m for m in matches if all(self._away(m.number, c.number) > NEAR_M / 2 for c in others)]
 
     def _alike(self, b: int, older: Longs) -> list[PlaceMatch]:
         """Those of the `older` that look like keyframe `b`: the most similar and its rivals."""
@@ -285,22 +269,18 @@ class Detector:
         check = self.verifier.verify(
             self._submaps.get(a), self._submaps.get(b), expected, self._reach(uncertainty), yaws
         )
-        stage, reason = check.stage, check.reason
-        if not reason:
-            reason = self._beyond(check, expected, uncertainty)
-            stage = LoopStage.GATE if reason else stage
-        return LoopCandidate(
-            a,
-            b,
-            self._away(a, b),
-            match.distance,
-            Verdict.REJECTED if reason else Verdict.ACCEPTED,
-            stage,
-            reason,
-            check.rmse,
-            check.overlap,
-            self._constraint(a, b, check),
-        )
+        reason = check.reason or self._beyond(check, expected, uncertainty)
+        check = check if reason == check.reason else check.reject(LoopStage.GATE, reason)
+        return self._candidate(a, b, check, match.distance)
+
+    def _candidate(
+        self, a: int, b: int, check: Verification, descriptor_distance: float = float("nan"), is_binding: bool = False
+    ) -> LoopCandidate:
+        """The candidate of keyframes a and b with the verdict of a verification."""
+        verdict = Verdict.REJECTED if check.reason else Verdict.ACCEPTED
+        verdict_facts = (verdict, check.stage, check.reason, check.rmse, check.overlap)
+        constraint = self._constraint(a, b, check, is_binding)
+        return LoopCandidate(a, b, self._away(a, b), descriptor_distance, *verdict_facts, constraint)
 
     def _reach_between(self, older: int, newer: int) -> float:
         """m, gate of odometry between two keyframes."""
@@ -338,24 +318,17 @@ class Detector:
             return f"odometry would be wrong by {np.linalg.norm(shift):.1f} m"
         return ""
 
-    def _constraint(self, a: int, b: int, check: Verification) -> Constraint | None:
+    def _constraint(self, a: int, b: int, check: Verification, is_binding: bool = False) -> Constraint | None:
         """Pose and covariance of the loop closure, from level axes to those of the keyframes."""
         if check.T_a_b is None or check.covariance is None:
             return None
         R_a, R_b = (self.keyframes[k].T_world_lidar[:3, :3] for k in (a, b))
         T = se3.make(R_a.T @ check.T_a_b[:3, :3] @ R_b, R_a.T @ check.T_a_b[:3, 3])
-        turn = np.kron(np.eye(2), R_a.T)
-        return Constraint(a, b, T, turn @ check.covariance @ turn.T)
-
-    def _make_submap(self, number: int) -> LevelSubmap:
-        return make_level_submap(self._clouds.get(number), self.registration)
+        return Constraint(a, b, T, noise.rotate(check.covariance, R_a.T), is_binding=is_binding)
 
     def _make_level(self, number: int) -> Points:
         """The submap about a keyframe in the axes of the world."""
-        points = self.cloud(number)
-        level = np.empty_like(points)
-        transform(points, se3.make(self.keyframes[number].T_world_lidar[:3, :3], np.zeros(3)), level)
-        return level
+        return move_points(self.cloud(number), se3.make(self.keyframes[number].T_world_lidar[:3, :3], np.zeros(3)))
 
     def _describe(self, number: int) -> None:
         points = self._clouds.get(number)
@@ -363,6 +336,6 @@ class Detector:
             self.index.add(number, points)
 
 
-def _stop_if(is_asked: bool, b: int, count: int) -> None:
-    if is_asked:
+def _stop_if(is_stopping: bool, b: int, count: int) -> None:
+    if is_stopping:
         raise InterruptedRunError(f"interrupted during loop closure detection, at keyframe {b} of {count}")

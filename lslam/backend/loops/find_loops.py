@@ -1,4 +1,4 @@
-"""Loop closures of a run: candidates that are searched, pairs that a person knows."""
+"""Loop closures of a run: candidates that are searched, pairs that a person knows, and views of their scans for people."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import submap
+from lslam.backend.keyframes.store import KeyframeStore, submap
 from lslam.backend.loops import create_descriptor
 from lslam.backend.loops.detector import LEAST_REACH, Detector
 from lslam.backend.loops.gating import OdometryUncertainty
-from lslam.backend.loops.level_submap import make_level_submap
+from lslam.backend.loops.level_submap import make_level_submap, move_points
 from lslam.backend.loops.verify import Verifier
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.errors import InterruptedRunError
-from lslam.core.kernels.transform import transform
+from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats, Points
 from lslam.core.types.constraint import KnownPair, LoopCandidate, LoopStage
+from lslam.core.types.run_record import PairView, RunRecord
 from lslam.core.types.scan_result import KeyframeClocks
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.preprocessing.ground import Z
@@ -61,7 +61,7 @@ def find_loops(
     return candidates
 
 
-def verify_known(
+def verify_pairs(
     store: KeyframeStore,
     pairs: Sequence[KnownPair],
     config: LoopsConfig,
@@ -79,7 +79,7 @@ def verify_known(
     for pair in pairs:
         if should_stop():
             raise InterruptedRunError("interrupted while known pairs were verified")
-        loops.append(detector.verify_known(pair))
+        loops.append(detector.verify_pair(pair))
     return loops
 
 
@@ -111,7 +111,36 @@ def warm_up_candidates(config: LoopsConfig) -> Points:
     """Compile or load the kernels by which candidates are found; the room (3000, 3), m, that serves for it."""
     room = np.random.default_rng(0).uniform(-8, 8, (3000, 3)).astype(np.float32)
     room[np.arange(3000), np.arange(3000) % 3] = 8.0
-    transform(room, np.eye(4), np.empty_like(room))
-    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gated(0, np.arange(0), 1.0, 1.0, 1.0)
+    move_points(room, np.eye(4))
+    OdometryUncertainty([Keyframe(0, 0, 0, np.eye(4), np.eye(6))], 0.0, 0.0).gate(0, np.arange(0), 1.0, 1.0, 1.0)
     create_descriptor(config).add(0, room)
     return room
+
+
+# Candidates that a page shows without a server, and points of each of their clouds.
+MOST_VIEWS, FEW_POINTS = 20, 1500
+
+
+def view_pairs(record: RunRecord, store: KeyframeStore, size: int) -> list[PairView]:
+    """The most doubtful candidates of a run; size : keyframes whose clouds make one submap."""
+    tried = [c for c in record.loops if c.stage != LoopStage.THINNED]
+    doubtful = sorted(tried, key=lambda c: (-c.doubt, c.a, c.b))[:MOST_VIEWS]
+    poses = record.trajectory.poses
+    return [view_pair(store, c, poses[record.keyframe_scans[c.a]], size, FEW_POINTS) for c in doubtful]
+
+
+def view_pair(store: KeyframeStore, candidate: LoopCandidate, T_world_a: Floats, size: int, most: int) -> PairView:
+    """The view of a candidate; T_world_a : (4, 4) the older keyframe in a level world; most : points of each cloud."""
+    odometry = np.stack([k.T_world_lidar for k in store.keyframes])
+    a, b = (submap(store, odometry, k, size) for k in (candidate.a, candidate.b))
+    a, b = (points[:: max(1, -(-len(points) // most))] for points in (a, b))
+    R = se3.make(T_world_a[:3, :3], np.zeros(3))
+    before = R @ se3.relative(odometry[candidate.a], odometry[candidate.b])
+    closed = candidate.constraint
+    return PairView(
+        candidate,
+        se3.apply(R, a).astype(np.float32),
+        b,
+        before,
+        None if closed is None else R @ closed.T_a_b,
+    )

@@ -1,8 +1,13 @@
-"""Gating of loop candidates: by the uncertainty of odometry, by how often they are tried, and by what else a keyframe matches."""
+"""Gating of loop candidates: by the uncertainty of odometry, by how often they are tried, and by what else a keyframe matches.
+
+A bounded memory of places says which of those seen earlier are compared with a new one (Labbé and Michaud 2013).
+"""
 
 from __future__ import annotations
 
+import math
 import threading
+from bisect import bisect_left, insort
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -72,13 +77,13 @@ class OdometryUncertainty:
             square = square + np.maximum(np.linalg.eigvalsh(own[:, 3:, 3:])[:, 2], 0.0)
         return RelativeUncertainty(position, np.sqrt(square))
 
-    def gated(self, b: int, among: Longs, least: float, near: float, sigmas: float) -> Longs:
+    def gate(self, b: int, among: Longs, least: float, near: float, sigmas: float) -> Longs:
         """Those `among` the older keyframes (C,) at least `least` m of way ago and no farther from keyframe `b` than `near` m and
         so many times the standard deviation of the position where it is worst (`RelativeUncertainty.reach`).
         """
         covariances = np.zeros((0, 6, 6)) if self.covariances is None else self.covariances
         return np.asarray(
-            gating.gated(
+            gating.gate(
                 b,
                 among,
                 self.positions,
@@ -139,7 +144,7 @@ class LoopThrottle:
 
 
 def resolve_ambiguity(
-    examined: list[LoopCandidate], keyframes: Sequence[Keyframe], reach: Callable[[int, int], float]
+    candidates: list[LoopCandidate], keyframes: Sequence[Keyframe], reach: Callable[[int, int], float]
 ) -> list[LoopCandidate]:
     """Candidates of one newer keyframe, the most similar first, with at most one loop closure accepted.
 
@@ -147,27 +152,27 @@ def resolve_ambiguity(
 
     All are rejected when two imply different poses of the keyframe, or when one of them was ambiguous by itself.
     """
-    accepted = [c for c in examined if c.is_accepted]
-    ambiguous = next((c for c in examined if c.stage == LoopStage.AMBIGUITY), None)
+    accepted = [c for c in candidates if c.is_accepted]
+    ambiguous = next((c for c in candidates if c.stage == LoopStage.AMBIGUITY), None)
     if accepted and ambiguous is not None:
-        return [_ambiguous(c, f"keyframe {ambiguous.a} looks as much alike, and is ambiguous") for c in examined]
+        return [_ambiguous(c, f"keyframe {ambiguous.a} looks as much alike, and is ambiguous") for c in candidates]
     if len(accepted) < 2:
-        return examined
+        return candidates
     first = accepted[0]
     for other in accepted[1:]:
-        gap = float(np.linalg.norm(_put(other, keyframes) - _put(first, keyframes)))
+        gap = float(np.linalg.norm(_closure_position(other, keyframes) - _closure_position(first, keyframes)))
         if gap > reach(min(first.a, other.a), max(first.a, other.a)):
             reason = f"keyframes {first.a} and {other.a} fit, at places {gap:.1f} m apart"
-            return [_ambiguous(c, reason) for c in examined]
+            return [_ambiguous(c, reason) for c in candidates]
     reason = f"closed with keyframe {first.a} already"
     extra = {c.a for c in accepted[1:]}
     return [
         replace(c, verdict=Verdict.REJECTED, stage=LoopStage.THINNED, reason=reason) if c.a in extra else c
-        for c in examined
+        for c in candidates
     ]
 
 
-def _put(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> Floats:
+def _closure_position(candidate: LoopCandidate, keyframes: Sequence[Keyframe]) -> Floats:
     """(3,) m in the world, position of the newer keyframe by the loop closure and odometry's pose of the older one."""
     assert candidate.constraint is not None
     return np.asarray((keyframes[candidate.a].T_world_lidar @ candidate.constraint.T_a_b)[:3, 3])
@@ -186,15 +191,15 @@ T = TypeVar("T")
 class SharedResults(Generic[T]):
     """Results of a function of a number, the last used ones kept; who asks for one that another thread makes waits for it.
 
-    make : the function; kept : how many results, None for all
+    make : the function; size : how many results are kept, None for all
 
-    >>> squares = SharedResults(lambda number: number**2, kept=1)
+    >>> squares = SharedResults(lambda number: number**2, size=1)
     >>> squares.get(3), squares.get(3), squares.get(4)
     (9, 9, 16)
     """
 
-    def __init__(self, make: Callable[[int], T], kept: int | None = None) -> None:
-        self._make, self._kept = make, kept
+    def __init__(self, make: Callable[[int], T], size: int | None = None) -> None:
+        self._make, self._kept = make, size
         self._made: OrderedDict[int, Future[T]] = OrderedDict()
         self._lock = threading.Lock()
 
@@ -213,3 +218,117 @@ class SharedResults(Generic[T]):
             except BaseException as error:
                 result.set_exception(error)
         return result.result()
+
+
+# Places of one verified loop that are retrieved at each new place, as in the paper.
+RETRIEVED = 2
+# Places on either side of a verified loop that it retrieves and protects from transfer.
+LOOP_PLACES = 10
+
+
+class WorkingMemory:
+    """Places are keyframes in a row that look alike; so many of them are compared, the others lie in long-term memory.
+
+    A place enters when the run reaches it. Beyond the bound the place of least weight, of these the one that entered first, is
+    transferred to long-term memory. Weight is how many keyframes a place stands for (rehearsal); a verified loop gives the
+    weight of the older place to the newer one. It also retrieves the neighbours of the older place, the nearest first.
+
+    place_of : (K,) place of each keyframe, from 0 in steps of 0 or 1
+    distances : (K,) m travelled at each keyframe; bound : places compared at most; None: all
+    recent_m : m; places on the way just travelled are not candidates yet and stay (short-term memory)
+    """
+
+    def __init__(self, place_of: Longs, distances: Floats, bound: int | None, recent_m: float) -> None:
+        self.bound = bound
+        self._place_of, self._distances, self._recent_m = place_of, distances, recent_m
+        count = int(place_of[-1]) + 1 if len(place_of) else 0
+        # Keyframes of place p: _begins[p] to _begins[p + 1].
+        self._begins = np.searchsorted(place_of, np.arange(count + 1))
+        self._weights = np.diff(self._begins).tolist()
+        self._members: list[int] = []
+        # Transfer order of the members: weight, which place was the newest when they entered, number.
+        self._order: list[tuple[int, int, int]] = []
+        self._entered = [0] * count
+        self._newest = -1
+        self._loop: int | None = None
+
+    def __len__(self) -> int:
+        return len(self._members)
+
+    def reach(self, keyframe: int) -> bool:
+        """Enter the place of `keyframe`, which comes next; retrieve neighbours of the last loop, transfer what is too much.
+
+        Whether that changed what `before` says.
+        """
+        place = int(self._place_of[keyframe])
+        if self.bound is None or place == self._newest:
+            return False
+        self._newest = place
+        self._enter(place)
+        if self._loop is not None:
+            self._retrieve(self._loop)
+        self._transfer(self.bound)
+        return True
+
+    def close(self, older: int, newer: int) -> None:
+        """Take a verified loop between two keyframes."""
+        if self.bound is None:
+            return
+        self._loop, place = int(self._place_of[older]), int(self._place_of[newer])
+        weight = self._weights[self._loop]
+        self._weigh(place, self._weights[place] + weight)
+        self._weigh(self._loop, 0)
+
+    def before(self, keyframe: int) -> Longs:
+        """Keyframes older than `keyframe`, increasing, that are compared with it.
+
+        Places behind the newest one that was entered count, so that the memory can be asked about keyframes to come.
+        """
+        if self.bound is None:
+            return np.arange(keyframe)
+        after = int(self._begins[self._newest + 1])
+        parts = [np.arange(self._begins[p], self._begins[p + 1]) for p in self._members]
+        searchable = np.concatenate([*parts, np.arange(after, keyframe)])
+        return np.asarray(searchable[searchable < keyframe])
+
+    def _enter(self, place: int) -> None:
+        at = bisect_left(self._members, place)
+        if at == len(self._members) or self._members[at] != place:
+            self._members.insert(at, place)
+            self._entered[place] = self._newest
+            insort(self._order, self._key(place))
+
+    def _key(self, place: int) -> tuple[int, int, int]:
+        return self._weights[place], self._entered[place], place
+
+    def _weigh(self, place: int, weight: int) -> None:
+        at = bisect_left(self._order, self._key(place))
+        is_member = at < len(self._order) and self._order[at] == self._key(place)
+        if is_member:
+            del self._order[at]
+        self._weights[place] = weight
+        if is_member:
+            insort(self._order, self._key(place))
+
+    def _retrieve(self, loop: int) -> None:
+        """Enter a few neighbours of the loop's older place, the nearest along the way first."""
+        entered = 0
+        for step in range(1, LOOP_PLACES + 1):
+            for place in (loop + step, loop - step):
+                before = len(self._members)
+                if entered < RETRIEVED and 0 <= place < self._newest:
+                    self._enter(place)
+                entered += len(self._members) - before
+
+    def _transfer(self, bound: int) -> None:
+        """Transfer the places of least weight beyond the bound, but not recent ones and those about the last loop."""
+        recent = self._distances[self._begins[self._newest]] - self._recent_m
+        about = (math.inf, -math.inf) if self._loop is None else (self._loop - LOOP_PLACES, self._loop + LOOP_PLACES)
+        at = 0
+        while len(self._members) > bound and at < len(self._order):
+            place = self._order[at][-1]
+            if about[0] <= place <= about[1] or self._distances[self._begins[place]] > recent:
+                at += 1
+                continue
+            del self._order[at]
+            del self._members[bisect_left(self._members, place)]

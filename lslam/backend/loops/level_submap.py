@@ -1,4 +1,7 @@
-"""Levelled keyframes, and submaps prepared for loop verification: Gaussian maps, source points, ground and other points."""
+"""Levelled keyframes, and submaps prepared for loop verification: Gaussian maps, source points, ground and other points.
+
+Bird's-eye views (BEV) of submaps are images of height and visibility, correlated by FFT.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from lslam.backend.kernels import bev
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.geometry import se3, so3
+from lslam.core.geometry import noise, se3, so3
 from lslam.core.kernels import gaussians
-from lslam.core.types.arrays import Floats, Longs, Points
+from lslam.core.kernels.transform import transform
+from lslam.core.types.arrays import Bools, Floats, Longs, Points
 from lslam.core.types.trajectory import Keyframe
 from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR
@@ -21,14 +27,14 @@ from lslam.registration.preprocessing.prepare import PreparedPoints
 ROUNDS = tuple(float(np.cos(np.deg2rad(limit))) for limit in (45.0, 30.0, 20.0, 15.0, 15.0))
 
 
-def find_up(maps: Iterable[GaussianMap], mounted: Floats = Z) -> Floats:
+def find_up(maps: Iterable[GaussianMap], prior: Floats = Z) -> Floats:
     """(3,) unit vector: the mean normal of nearly horizontal planes, with a tighter limit each round.
 
-    mounted : (3,) unit vector, up by the mounting of the sensor, which the first round begins with and no plane leaves as it is
+    prior : (3,) unit vector, up by the mounting of the sensor, which the first round begins with and no plane leaves as it is
     """
     planes = [m.planes[m.planes[:, 7] >= 0, 3:6] for m in maps]
     normals = np.concatenate([*planes, np.zeros((0, 3))])
-    up = mounted
+    up = prior
     for limit in ROUNDS:
         along = normals @ up
         near = normals[np.abs(along) > limit] * np.sign(along[np.abs(along) > limit, None])
@@ -48,18 +54,19 @@ def level_rotation(up: Floats) -> Floats:
     return np.eye(3) if sine < 1e-12 else so3.exp(axis / sine * np.arctan2(sine, up[2]))
 
 
-def levelled(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
+def move_points(points: Points, T: Floats) -> Points:
+    """The points (N, 3), m, moved by T (4, 4)."""
+    out = np.empty_like(points)
+    transform(points, T, out)
+    return out
+
+
+def level_keyframes(keyframes: Sequence[Keyframe], up: Floats) -> list[Keyframe]:
     """The keyframes in a world turned so that the unit vector `up` (3,) is its z axis."""
     R = level_rotation(up)
-    T, turn = se3.make(R, np.zeros(3)), np.kron(np.eye(2), R)
-    return [
-        replace(
-            k,
-            T_world_lidar=T @ k.T_world_lidar,
-            covariance=None if k.covariance is None else turn @ k.covariance @ turn.T,
-        )
-        for k in keyframes
-    ]
+    poses = [se3.make(R, np.zeros(3)) @ k.T_world_lidar for k in keyframes]
+    covariances = [None if k.covariance is None else noise.rotate(k.covariance, R) for k in keyframes]
+    return [replace(k, T_world_lidar=T, covariance=S) for k, T, S in zip(keyframes, poses, covariances, strict=True)]
 
 
 # m; larger voxels serve sparse single scans; a submap is dense.
@@ -94,11 +101,7 @@ def make_level_submap(points: Points, config: RegistrationConfig) -> LevelSubmap
 
     Voxels with too few points for a Gaussian give no source points either.
     """
-    fine = GaussianMap(
-        min(config.voxel_size, LARGEST),
-        reach=np.inf,
-        capacity=CAPACITY,
-    )
+    fine = GaussianMap(min(config.voxel_size, LARGEST), reach=np.inf, capacity=CAPACITY)
     for first in range(0, len(points), CAPACITY // 4):
         fine.insert(points[first : first + CAPACITY // 4], np.eye(4))
     kind = fine.planes[:, 7]
@@ -123,3 +126,144 @@ def _source(target: GaussianMap, slots: Longs) -> PreparedPoints:
     outer = mean[:, (0, 0, 0, 1, 1, 2)] * mean[:, (0, 1, 2, 1, 2, 2)]
     points = np.ascontiguousarray(target.planes[slots, :3])
     return PreparedPoints(np.zeros((0, 3), np.float32), points, np.ascontiguousarray(s[:, 4:10] - outer), len(points))
+
+
+Image = NDArray[np.float32]
+Spectrum = NDArray[np.complex64]
+
+# m; a heading error of half a search step moves a wall by one cell at most.
+CELL_M = 1.0
+# Voxels per cell that count, at most: taller structure is no more distinctive.
+MOST_VOXELS = 6.0
+UNTURNED: Floats = np.eye(2)
+
+
+@dataclass(frozen=True)
+class BevGrid:
+    """A BEV grid of `size` x `size` cells of `cell` m centred on the origin, x along rows."""
+
+    size: int
+    cell: float = CELL_M
+
+    def cells_of(self, points: Floats) -> tuple[Longs, Bools]:
+        """Flat cell of each point (N, 3), m, 0 outside, and whether it lies inside."""
+        cells = np.floor(points[:, :2] / self.cell).astype(np.int64) + self.size // 2
+        inside = np.asarray(((cells >= 0) & (cells < self.size)).all(axis=1))
+        return np.where(inside, cells[:, 0] * self.size + cells[:, 1], 0), inside
+
+    def view(self, points: Floats, ground: Floats, R: Floats = UNTURNED) -> Image:
+        """(3, size, size) of what stands there, points (N, 3), m, and of the ground (M, 3), turned by R (2, 2) first.
+
+        Structure: occupied voxels per cell, up to `MOST_VOXELS`; points are means of voxels. Its square. Visibility: 1 in cells
+        that hold a point of either, and in their neighbours, else 0.
+        """
+        images = np.zeros((3, self.size, self.size), np.float32)
+        bev.view(points, ground, R, self.cell, MOST_VOXELS, images)
+        return images
+
+    def lowest(self, points: Floats) -> Floats:
+        """(size * size,) least z per cell, m, inf where there is none."""
+        cells, inside = self.cells_of(points)
+        lowest = np.full(self.size**2, np.inf)
+        np.minimum.at(lowest, cells[inside], points[inside, 2])
+        return lowest
+
+    def shifts(self, cells: Longs) -> Floats:
+        """(K, 2) m that the flat cells (K,) of a correlation stand for."""
+        along = self._along()
+        return np.column_stack([along[part] for part in np.divmod(cells, self.size)])
+
+    def within(self, centre: Floats, radius: float) -> Longs:
+        """Flat cells of a correlation whose shifts lie within `radius` m, or a cell, of `centre` (2,), increasing."""
+        along = self._along()
+        away2 = (along[:, None] - centre[0]) ** 2 + (along[None, :] - centre[1]) ** 2
+        return np.flatnonzero(away2 <= max(radius, self.cell) ** 2)
+
+    def _along(self) -> Floats:
+        """(size,) m that row or column k of a correlation stands for."""
+        return np.asarray(np.fft.fftfreq(self.size, 1 / (self.size * self.cell)))
+
+
+@dataclass(frozen=True)
+class VisibleCells:
+    """Flat cells (size * size,) of a BEV grid that a map was seen in, and the least share of upright points to lie there."""
+
+    grid: BevGrid
+    visible: Bools
+    least_share: float
+
+    def count(self, points: Floats) -> int:
+        """How many of the points (N, 3), m, lie in these cells; 0 for less than the share."""
+        cells, inside = self.grid.cells_of(points)
+        count = int((inside & self.visible[cells]).sum())
+        return 0 if count < self.least_share * len(points) else count
+
+
+def blur(image: Image) -> Image:
+    """Mean over a cell and the eight round it."""
+    from scipy import ndimage
+
+    return np.asarray(ndimage.uniform_filter(image, 3, mode="constant"))
+
+
+def spectra(images: Image) -> Spectrum:
+    """Fourier transforms of images (K, size, size), for `correlate`."""
+    from scipy import fft
+
+    return np.asarray(fft.rfft2(images))
+
+
+def correlate(a: Spectrum, b: Spectrum) -> Image:
+    """(K, size, size) sums over the cells of images a times images b shifted, for all shifts; `size` is even."""
+    from scipy import fft
+
+    product = np.conj(b)
+    product *= a
+    return np.asarray(fft.irfft2(product, overwrite_x=True))
+
+
+class BestShifts:
+    """The best score of shifts over the headings tried so far: a correlation normalised over the cells that both observed.
+
+    Without that the shift with most overlap would win.
+
+    cells : (K,) flat cells of the correlation that are of interest
+    score : (K,) 0 to 1; heading : (K,) that it was reached with
+    """
+
+    def __init__(self, cells: Longs) -> None:
+        self.cells = cells
+        self.score, self.heading = np.zeros((2, len(cells)), np.float32)
+
+    def observe(self, sums: Image, least: float, heading: float) -> None:
+        """Take the correlations (3, size, size) of another heading.
+
+        sums : structure of a times that of b; where a observed, its square of b; where b observed, its square of a
+        least : of the second, below which the score is 0
+        """
+        flat = sums.reshape(3, -1)
+        bev.improve(flat, self.cells, np.float32(least), np.float32(heading), self.score, self.heading)
+
+    def merge(self, other: BestShifts, rows: Longs) -> None:
+        """Take what another one has in the rows (K,) where that is better."""
+        score = other.score[rows]
+        better = score > self.score
+        self.score[better], self.heading[better] = score[better], other.heading[rows[better]]
+
+
+def peaks(shifts: Floats, score: Image, apart: float, most: int, nearly: float = 0.0) -> list[int]:
+    """Numbers of the best of the shifts (K, 2), m, by their score (K,): at most so many, none within `apart` m of another.
+
+    nearly : least score as a part of the best
+
+    Not only local maxima: along a ridge, as of a street, other cells score as well as the maximum.
+    """
+    x, y = np.ascontiguousarray(shifts.T)
+    rest = score.copy()
+    best = float(rest.max(initial=0.0))
+    chosen: list[int] = []
+    while len(chosen) < most and rest.max(initial=0.0) > nearly * best:
+        k = int(rest.argmax())
+        chosen.append(k)
+        rest[(x - x[k]) ** 2 + (y - y[k]) ** 2 < apart**2] = 0
+    return chosen

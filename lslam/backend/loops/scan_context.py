@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.kernels.polar_image import polar_image
-from lslam.backend.loops.descriptor import PlaceMatch
+from lslam.backend.kernels.bev import polar_image
+from lslam.backend.loops import PlaceMatch
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.types.arrays import Bools, Floats, Longs
 

@@ -7,15 +7,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lslam.backend.loops.bev_correlation import CELL_M, BestShifts, BevGrid, blurred, correlate, peaks, spectra, turning
-from lslam.backend.loops.level_submap import LevelSubmap
+from lslam.backend.loops.level_submap import (
+    CELL_M,
+    BestShifts,
+    BevGrid,
+    LevelSubmap,
+    VisibleCells,
+    blur,
+    correlate,
+    peaks,
+    spectra,
+)
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
-from lslam.core.geometry import se3, so3
-from lslam.core.types.arrays import Bools, Floats
+from lslam.core.geometry import se2, se3, so3
+from lslam.core.types.arrays import Floats
 from lslam.core.types.constraint import LoopStage
 from lslam.registration.acceptance import Acceptance
 from lslam.registration.alignment import solve
+from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.optimiser import COARSE_DECAY, KERNEL_DECAY, KERNEL_MIN_M, Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints, thin
 from lslam.registration.result import RegistrationResult
@@ -49,13 +59,13 @@ def find_initial_guesses(
     grid = _grid(far)
     window = min(grid.size * CELL_M / 2 - far, WIDEST)
     there = grid.view(a.non_ground, a.ground)
-    image = blurred(there[0])
+    image = blur(there[0])
     seen = spectra(np.stack([image, there[2], image**2]))
     near, floor = (p[(p[:, :2] ** 2).sum(axis=1) < max(window, NARROWEST) ** 2] for p in (b.non_ground, b.ground))
     best = BestShifts(grid.within(expected[:2], reach))
     shifts = grid.shifts(best.cells)
     for yaw in yaws:
-        view = grid.view(near, floor, turning(yaw))
+        view = grid.view(near, floor, se2.rotation(yaw))
         best.observe(correlate(seen, spectra(view)), SHARED_SHARE * max(float(view[1].sum()), 1.0), yaw)
     return [
         InitialGuess(_pose(grid, a, b, shifts[k], float(best.heading[k]), float(expected[2])), float(best.score[k]))
@@ -87,6 +97,64 @@ def _pose(grid: BevGrid, a: LevelSubmap, b: LevelSubmap, shift: Floats, yaw: flo
 FEW = 4
 # m; kernel widths: at an initial guess, and for rmse and overlap.
 CATCH, JUDGED = 2.5, 1.0
+# m and rad from which on a place is another.
+ELSEWHERE_M, ELSEWHERE_RAD = 1.0, np.deg2rad(5.0)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A registration from one initial guess: inlier share of the upright points, 0 to 1, and pose T_a_b (4, 4)."""
+
+    support: float
+    T_a_b: Floats
+
+
+class SubmapRegistration:
+    """Registers submaps b in a submap or whole map a by the sections `loops` and `registration` of the configuration."""
+
+    def __init__(self, a: LevelSubmap, config: LoopsConfig, registration: RegistrationConfig) -> None:
+        self.a, self.config, self.registration = a, config, registration
+
+    def try_guesses(self, b: LevelSubmap, guesses: Iterable[Floats], cells: VisibleCells) -> tuple[Trial, Trial | None]:
+        """The trial of largest support, and of those elsewhere the one of largest support; at least one guess (4, 4)."""
+        best, *others = sorted((self._try(b, guess, cells) for guess in guesses), key=lambda trial: -trial.support)
+        return best, next((other for other in others if is_elsewhere(best.T_a_b, other.T_a_b)), None)
+
+    def support(self, b: LevelSubmap, T_a_b: Floats, cells: VisibleCells) -> float:
+        """Inlier share among the upright points in the cells: unlike their number, it does not depend on the shift."""
+        comparable = cells.count(se3.apply(T_a_b, b.upright.source))
+        width = 2 * KERNEL_MIN_M
+        inliers = self._solve(b.upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
+        return inliers / comparable if comparable else 0.0
+
+    def refine(self, b: LevelSubmap, start: Floats) -> RegistrationResult:
+        """All source points of b registered from the pose of a trial."""
+        r = self.registration
+        annealing = Annealing(r.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, self.config.max_iterations)
+        return self._solve(b.source, start, annealing)
+
+    def match(self, b: LevelSubmap, T_a_b: Floats) -> RegistrationResult:
+        """The residuals of b at a pose, within `JUDGED` m."""
+        return self._solve(b.source, T_a_b, Annealing(JUDGED, JUDGED, 0.5, 1))
+
+    def _try(self, b: LevelSubmap, guess: Floats, cells: VisibleCells) -> Trial:
+        r, few = self.registration, thin(b.source, FEW)
+        slow = Annealing(CATCH, r.kernel_max / 2, COARSE_DECAY, self.config.max_iterations)
+        coarse = self._solve(few, guess, slow, self.a.coarse)
+        T = self._solve(few, coarse.T_world_lidar, Annealing(r.kernel_max, KERNEL_MIN_M, 0.7, 15)).T_world_lidar
+        return Trial(self.support(b, T, cells), T)
+
+    def _solve(
+        self, points: PreparedPoints, start: Floats, annealing: Annealing, target: GaussianMap | None = None
+    ) -> RegistrationResult:
+        """Points registered in the fine map of a, or in another `target`."""
+        return solve((self.a.fine if target is None else target,), points, start, annealing, self.registration)
+
+
+def is_elsewhere(T: Floats, other: Floats) -> bool:
+    """Whether two poses (4, 4) are of different places."""
+    delta = se3.relative(T, other)
+    return float(np.linalg.norm(delta[:3, 3])) > ELSEWHERE_M or float(so3.angle(delta[:3, :3])) > ELSEWHERE_RAD
 
 
 @dataclass(frozen=True)
@@ -104,8 +172,8 @@ class Verification:
     rmse: float = float("nan")
     overlap: float = float("nan")
 
-    def rejected(self, stage: LoopStage, reason: str) -> Verification:
-        """The same, rejected."""
+    def reject(self, stage: LoopStage, reason: str) -> Verification:
+        """The same, with the stage and the reason of a rejection."""
         return replace(self, stage=stage, reason=reason)
 
 
@@ -122,57 +190,26 @@ class Verifier:
         starts = find_initial_guesses(a, b, expected, reach, yaws)
         if not starts:
             return Verification(LoopStage.OVERLAP, "nothing stands up there")
-        view = LARGE.view(a.non_ground, a.ground)[2].ravel() > 0
-        tried = sorted((self._try(a, b, view, start.T_a_b) for start in starts), key=lambda found: -found[0])
-        support, rough = tried[0]
-        others = [(s, T) for s, T in tried[1:] if _is_elsewhere(rough, T)]
-        forward = self._refine(a, b, rough)
-        facts = self._judge(a, b, forward)
+        cells = VisibleCells(LARGE, LARGE.view(a.non_ground, a.ground)[2].ravel() > 0, SHARED_SHARE)
+        in_a, in_b = (SubmapRegistration(submap, self.config, self.registration) for submap in (a, b))
+        best, rival = in_a.try_guesses(b, [start.T_a_b for start in starts], cells)
+        forward = in_a.refine(b, best.T_a_b)
+        facts = self._judge(in_a, in_b, forward)
         if facts.reason:
             return facts
-        if others and others[0][0] > self.config.max_ambiguity * support:
-            away = float(np.linalg.norm(others[0][1][:3, 3] - rough[:3, 3]))
-            return facts.rejected(
-                LoopStage.AMBIGUITY, f"{away:.1f} m away it fits {others[0][0] / support:.0%} as well"
-            )
-        backward = self._refine(b, a, se3.inverse(rough))
-        return self._agree(facts, forward, backward)
+        if rival is not None and rival.support > self.config.max_ambiguity * best.support:
+            away = float(np.linalg.norm(rival.T_a_b[:3, 3] - best.T_a_b[:3, 3]))
+            reason = f"{away:.1f} m away it fits {rival.support / best.support:.0%} as well"
+            return facts.reject(LoopStage.AMBIGUITY, reason)
+        return self._agree(facts, forward, in_b.refine(a, se3.inverse(best.T_a_b)))
 
-    def _try(self, a: LevelSubmap, b: LevelSubmap, view: Bools, start: Floats) -> tuple[float, Floats]:
-        """Inlier share of the upright points after registration from `start`, 0 to 1, and the pose found."""
-        r = self.registration
-        few = thin(b.source, FEW)
-        slow = Annealing(CATCH, r.kernel_max / 2, COARSE_DECAY, self.config.max_iterations)
-        coarse = self._solve(a, few, start, slow, coarse_only=True)
-        fine = self._solve(a, few, coarse.T_world_lidar, Annealing(r.kernel_max, KERNEL_MIN_M, 0.7, 15))
-        return self._support(a, b.upright, view, fine.T_world_lidar), fine.T_world_lidar
-
-    def _refine(self, a: LevelSubmap, b: LevelSubmap, start: Floats) -> RegistrationResult:
-        r = self.registration
-        annealing = Annealing(r.kernel_max, KERNEL_MIN_M, KERNEL_DECAY, self.config.max_iterations)
-        return self._solve(a, b.source, start, annealing)
-
-    def _solve(
-        self, a: LevelSubmap, points: PreparedPoints, start: Floats, annealing: Annealing, *, coarse_only: bool = False
-    ) -> RegistrationResult:
-        return solve((a.coarse if coarse_only else a.fine,), points, start, annealing, self.registration)
-
-    def _support(self, a: LevelSubmap, upright: PreparedPoints, view: Bools, T_a_b: Floats) -> float:
-        """Inlier share among the points in cells that a observed: unlike their number, it does not depend on the shift."""
-        cells, inside = LARGE.cells_of(se3.apply(T_a_b, upright.source))
-        comparable = int((inside & view[cells]).sum())
-        width = 2 * KERNEL_MIN_M
-        inliers = self._solve(a, upright, T_a_b, Annealing(width, width, 0.5, 1)).inliers
-        return 0.0 if comparable < SHARED_SHARE * len(upright.source) else inliers / comparable
-
-    def _judge(self, a: LevelSubmap, b: LevelSubmap, result: RegistrationResult) -> Verification:
+    def _judge(self, in_a: SubmapRegistration, in_b: SubmapRegistration, result: RegistrationResult) -> Verification:
         """Tests of a registration by itself: degeneracy, rmse, overlap both ways."""
         c = self.config
         if not result.ok or result.covariance is None:
             return Verification(LoopStage.REGISTRATION, result.reason or "nothing matches")
         T = result.T_world_lidar
-        there = self._solve(a, b.source, T, Annealing(JUDGED, JUDGED, 0.5, 1))
-        back = self._solve(b, a.source, se3.inverse(T), Annealing(JUDGED, JUDGED, 0.5, 1))
+        there, back = in_a.match(in_b.a, T), in_b.match(in_a.a, se3.inverse(T))
         worse = min(there, back, key=lambda one: one.overlap)
         both = replace(
             result, rmse=max(there.rmse, back.rmse), matched=worse.matched, source_points=worse.source_points
@@ -183,18 +220,18 @@ class Verifier:
         if rejection is None:
             return facts
         stage = LoopStage.OVERLAP if rejection.test == "overlap" else LoopStage.REGISTRATION
-        return facts.rejected(stage, rejection.reason)
+        return facts.reject(stage, rejection.reason)
 
     def _agree(self, facts: Verification, forward: RegistrationResult, backward: RegistrationResult) -> Verification:
         """Forward and backward must agree; their difference is added to the covariance of the loop closure."""
         c = self.config
         if not backward.ok:
-            return facts.rejected(LoopStage.AGREEMENT, f"new to old: {backward.reason or 'nothing matches'}")
+            return facts.reject(LoopStage.AGREEMENT, f"new to old: {backward.reason or 'nothing matches'}")
         gap = se3.log(forward.T_world_lidar @ backward.T_world_lidar)
         move, turn = float(np.linalg.norm(gap[:3])), float(np.linalg.norm(gap[3:]))
         if move > c.max_disagreement_m or np.rad2deg(turn) > c.max_disagreement_deg:
             reason = f"old to new and new to old differ by {move:.2f} m and {np.rad2deg(turn):.2f} deg"
-            return facts.rejected(LoopStage.AGREEMENT, reason)
+            return facts.reject(LoopStage.AGREEMENT, reason)
         floor = np.diag([c.sigma_m**2] * 3 + [np.deg2rad(c.sigma_deg) ** 2] * 3)
         assert forward.covariance is not None
         disagreement = np.diag([move**2 / 3] * 3 + [turn**2 / 3] * 3)
@@ -202,8 +239,3 @@ class Verifier:
         # The mean of both.
         T = se3.exp(-0.5 * gap) @ forward.T_world_lidar
         return Verification(LoopStage.AGREEMENT, "", se3.normalise(T), covariance, facts.rmse, facts.overlap)
-
-
-def _is_elsewhere(T: Floats, other: Floats) -> bool:
-    delta = se3.relative(T, other)
-    return float(np.linalg.norm(delta[:3, 3])) > 1.0 or float(so3.angle(delta[:3, :3])) > np.deg2rad(5)

@@ -21,32 +21,29 @@ Ints = NDArray[np.int32]
 
 @inline
 def upright_plane(
-    ix: int, iy: int, iz: int, table: Ints, keys: Longs, sums: Floats, tilt: float, thickness: float
+    ix: int, iy: int, iz: int, table: Ints, keys: Longs, sums: Floats, tilt: float, thickness: float, total: Floats
 ) -> tuple[float, float]:
-    """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 where they are no wall."""
-    n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    """Horizontal unit normal of the points in the eight cells about a corner of the lattice; 0, 0 where they are no wall.
+
+    total : (10,) workspace for the sum of the moments
+    """
+    for i in range(10):
+        total[i] = 0.0
     for a in range(2):
         for b in range(2):
             for c in range(2):
                 h = place_of(pack(ix - a, iy - b, iz - c), keys, table)
                 if table[h] >= 0:
-                    s = sums[table[h]]
-                    n += s[0]
-                    sx += s[1]
-                    sy += s[2]
-                    sz += s[3]
-                    xx += s[4]
-                    xy += s[5]
-                    xz += s[6]
-                    yy += s[7]
-                    yz += s[8]
-                    zz += s[9]
-    if n < 5.0:
+                    for i in range(10):
+                        total[i] += sums[table[h], i]
+    if total[0] < 5.0:
         return 0.0, 0.0
-    w = 1.0 / n
-    mx, my, mz = sx * w, sy * w, sz * w
+    w = 1.0 / total[0]
+    for i in range(1, 10):
+        total[i] *= w
+    mx, my, mz, xx, xy, xz = total[1], total[2], total[3], total[4], total[5], total[6]
     l0, l1, _, nx, ny, nz = plane_of(
-        xx * w - mx * mx, xy * w - mx * my, xz * w - mx * mz, yy * w - my * my, yz * w - my * mz, zz * w - mz * mz
+        xx - mx * mx, xy - mx * my, xz - mx * mz, total[7] - my * my, total[8] - my * mz, total[9] - mz * mz
     )
     # The second eigenvalue decides how well the normal is known: points of one ring lie on a line on every surface.
     if abs(nz) > tilt or l0 > thickness * thickness or l1 < 6.0 * l0 or l1 < 4.0 * thickness * thickness:
@@ -57,17 +54,17 @@ def upright_plane(
 
 @kernel
 def flat_walls(
-    points: NDArray[np.float32], kept: Longs, cell: float, tilt: float, thickness: float, thin: float
+    points: NDArray[np.float32], used_points: Longs, cell: float, tilt: float, thickness: float, thin: float
 ) -> tuple[Floats, Floats]:
     """Rows of `flat` (M, 5) for the points on vertical planes, one row per cell of `thin`, m; and all points thinned likewise.
 
-    points : (N, 3), m; kept : (K,) indices of the points that are used
+    points : (N, 3), m; used_points : (K,) their indices in `points`
     cell : m; the neighbourhood of a point is the eight cells about the nearest corner of their lattice
     tilt : largest vertical component of the unit normal; thickness : largest standard deviation across the plane, m
 
     The second result (L, 3) has x, y and number of the points in each cell.
     """
-    n = len(kept)
+    n = len(used_points)
     entries = table_size(n)
     table = np.full(entries, -1, np.int32)
     keys = np.empty(n, np.int64)
@@ -75,7 +72,7 @@ def flat_walls(
     inverse = 1.0 / cell
     count = 0
     for k in range(n):
-        p = points[kept[k]]
+        p = points[used_points[k]]
         x, y, z = float(p[0]), float(p[1]), float(p[2])
         key = pack(index_of(x, inverse), index_of(y, inverse), index_of(z, inverse))
         h = place_of(key, keys, table)
@@ -83,20 +80,12 @@ def flat_walls(
             table[h] = count
             keys[count] = key
             count += 1
-        s = sums[table[h]]
-        s[0] += 1.0
-        s[1] += x
-        s[2] += y
-        s[3] += z
-        s[4] += x * x
-        s[5] += x * y
-        s[6] += x * z
-        s[7] += y * y
-        s[8] += y * z
-        s[9] += z * z
+        moments = (np.float32(1.0), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+        for i in range(10):
+            sums[table[h], i] += moments[i]
     corner_table = np.full(entries, -1, np.int32)
     corner_keys = np.empty(n, np.int64)
-    normals = np.empty((n, 2))
+    normals, total = np.empty((n, 2)), np.empty(10)
     corners = 0
     flat_table = np.full(entries, -1, np.int32)
     flat_keys = np.empty(n, np.int64)
@@ -104,7 +93,7 @@ def flat_walls(
     every = np.zeros((n, 3))
     rows = 0
     for k in range(n):
-        p = points[kept[k]]
+        p = points[used_points[k]]
         x, y, z = float(p[0]), float(p[1]), float(p[2])
         key = pack(index_of(x, 1.0 / thin), index_of(y, 1.0 / thin), 0)
         h = place_of(key, flat_keys, flat_table)
@@ -123,7 +112,7 @@ def flat_walls(
         if corner_table[h] < 0:
             corner_table[h] = corners
             corner_keys[corners] = key
-            nx, ny = upright_plane(ix, iy, iz, table, keys, sums, tilt, thickness)
+            nx, ny = upright_plane(ix, iy, iz, table, keys, sums, tilt, thickness, total)
             normals[corners, 0], normals[corners, 1] = nx, ny
             corners += 1
         nx, ny = normals[corner_table[h], 0], normals[corner_table[h], 1]
@@ -288,8 +277,7 @@ def find_segments(
         if len(flat) < 2 or total < min_cluster:
             break
         first = best_line(flat, tries, r, tolerance, agreement)
-        for i in range(4):
-            line[i] = flat[first, i]
+        line[:] = flat[first, :4]
         rms = 0.0
         for _ in range(3):
             low, high, _ = heaviest_run(flat, line, tolerance, agreement, gap, bins)
@@ -308,8 +296,7 @@ def find_segments(
             dx, dy = flat[j, 0] - px, flat[j, 1] - py
             s = dy * nx - dx * ny
             if abs(dx * nx + dy * ny) > tolerance or s < low - tolerance or s > high + tolerance:
-                for i in range(5):
-                    flat[kept, i] = flat[j, i]
+                flat[kept] = flat[j]
                 kept += 1
         if kept == len(flat):
             kept -= 1  # no point is left on the line after the fit: remove one, so that the search ends

@@ -20,7 +20,7 @@ Longs = NDArray[np.int64]
 
 
 @inline
-def wrapped(angle: float) -> float:
+def wrap(angle: float) -> float:
     """The same angle within -pi .. pi."""
     return angle - 2.0 * math.pi * math.floor(angle / (2.0 * math.pi) + 0.5)
 
@@ -62,11 +62,13 @@ def corners(segments: Floats, reach: float, sharpest: float) -> Floats:
 
 
 @kernel
-def votes(source: Floats, target: Floats, prior: Floats, window: Floats, cell: Floats, spread: float) -> Floats:
+def votes(
+    source: Floats, target: Floats, prior: Floats, window: Floats, cell: Floats, angle_tolerance: float
+) -> Floats:
     """Votes (X, Y, A, 4) of pairs of corners for poses: sum of weights, and weighted sums of x, y, m, and yaw, rad.
 
     Poses lie within `window` (3,), m, m, rad, of `prior`, in cells of `cell` (3,). The angles of the two corners of a pair
-    differ by `spread`, rad, at most.
+    differ by `angle_tolerance`, rad, at most.
     """
     nx, ny = int(2.0 * window[0] / cell[0]) + 1, int(2.0 * window[1] / cell[1]) + 1
     na = int(2.0 * window[2] / cell[2]) + 1
@@ -75,12 +77,12 @@ def votes(source: Floats, target: Floats, prior: Floats, window: Floats, cell: F
         s = source[i]
         for j in range(len(target)):
             t = target[j]
-            first, second = wrapped(t[2] - s[2]), wrapped(t[3] - s[3])
-            apart = wrapped(second - first)
-            if abs(apart) > spread:
+            first, second = wrap(t[2] - s[2]), wrap(t[3] - s[3])
+            apart = wrap(second - first)
+            if abs(apart) > angle_tolerance:
                 continue
             yaw = first + 0.5 * apart
-            da = wrapped(yaw - prior[2])
+            da = wrap(yaw - prior[2])
             if abs(da) > window[2]:
                 continue
             c, sn = math.cos(yaw), math.sin(yaw)
@@ -130,8 +132,7 @@ def peaks(grid: Floats, prior: Floats, count: int, is_round: bool) -> Floats:
                     continue
                 place = count - 1
                 while place > 0 and best[place - 1, 0] < own:
-                    for q in range(4):
-                        best[place, q] = best[place - 1, q]
+                    best[place, :4] = best[place - 1, :4]
                     place -= 1
                 best[place, 0] = own
                 best[place, 1], best[place, 2], best[place, 3] = sx / total, sy / total, sa / total
@@ -141,13 +142,13 @@ def peaks(grid: Floats, prior: Floats, count: int, is_round: bool) -> Floats:
         if best[p, 0] > 0.0:
             for q in range(3):
                 poses[found, q] = prior[q] + best[p, 1 + q]
-            poses[found, 2] = wrapped(poses[found, 2])
+            poses[found, 2] = wrap(poses[found, 2])
             found += 1
     return poses[:found]
 
 
 @inline
-def moved(segment: Floats, pose: Floats) -> tuple[float, float, float, float]:
+def move(segment: Floats, pose: Floats) -> tuple[float, float, float, float]:
     """End points x y x y, m, of a segment that is moved by a pose."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return (
@@ -200,7 +201,7 @@ def fit(
     distance = covered = total = 0.0
     pair = np.full(len(source), -1, np.int64)
     for i in range(len(source)):
-        ax, ay, bx, by = moved(source[i], pose)
+        ax, ay, bx, by = move(source[i], pose)
         best, best_cover = farthest, 0.0
         for j in range(len(target)):
             d, cover = line_distance(ax, ay, bx, by, target[j], farthest, likeness, by_coverage)
@@ -245,7 +246,7 @@ def refine(
         sw = cx = cy = 0.0
         for i in range(len(source)):
             if pair[i] >= 0:
-                ax, ay, bx, by = moved(source[i], pose)
+                ax, ay, bx, by = move(source[i], pose)
                 w = math.hypot(bx - ax, by - ay)
                 sw += w
                 cx += 0.5 * w * (ax + bx)
@@ -260,7 +261,7 @@ def refine(
             if pair[i] < 0:
                 continue
             t = target[pair[i]]
-            ax, ay, bx, by = moved(source[i], pose)
+            ax, ay, bx, by = move(source[i], pose)
             lt, length = math.hypot(t[2] - t[0], t[3] - t[1]), math.hypot(bx - ax, by - ay)
             nx, ny = -(t[3] - t[1]) / lt, (t[2] - t[0]) / lt
             for side in range(2):
@@ -270,15 +271,11 @@ def refine(
                 scale = gate * gate / (gate * gate + 4.0 * e * e)
                 w = 0.5 * length / (length + short) * scale * scale
                 turn = ny * (x - centre[0]) - nx * (y - centre[1])
-                normal[0, 0] += w * nx * nx
-                normal[0, 1] += w * nx * ny
-                normal[0, 2] += w * nx * turn
-                normal[1, 1] += w * ny * ny
-                normal[1, 2] += w * ny * turn
-                normal[2, 2] += w * turn * turn
-                gradient[0] += w * nx * e
-                gradient[1] += w * ny * e
-                gradient[2] += w * turn * e
+                effect = (nx, ny, turn)
+                for p in range(3):
+                    gradient[p] += w * effect[p] * e
+                    for q in range(p, 3):
+                        normal[p, q] += w * effect[p] * effect[q]
                 total += w
                 squares += w * e * e
         normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
@@ -288,7 +285,7 @@ def refine(
         dx, dy = pose[0] - centre[0], pose[1] - centre[1]
         pose[0] = centre[0] + c * dx - s * dy + step[0]
         pose[1] = centre[1] + s * dx + c * dy + step[1]
-        pose[2] = wrapped(pose[2] + step[2])
+        pose[2] = wrap(pose[2] + step[2])
         if r >= len(gates) and math.hypot(step[0], step[1]) < STAYS and abs(step[2]) < STAYS_RAD:
             break
     return pose, normal, centre, rms, pair
@@ -301,7 +298,7 @@ def damped_step(normal: Floats, gradient: Floats, trust: Floats, pose: Floats, p
     # Jacobian of the pose by the centre's x, y and yaw: the prior is one of the pose.
     jacobian = np.eye(3)
     jacobian[0, 2], jacobian[1, 2] = -arm_y, arm_x
-    away = np.array([pose[0] - prior[0], pose[1] - prior[1], wrapped(pose[2] - prior[2])])
+    away = np.array([pose[0] - prior[0], pose[1] - prior[1], wrap(pose[2] - prior[2])])
     a = normal.copy()
     b = gradient.copy()
     for i in range(3):

@@ -18,7 +18,7 @@ from lslam.core.types.arrays import Floats
 from lslam.core.types.gnss import OutputCrs
 from lslam.io.formats.text_tables import utc_of
 from lslam.maps.georeference import LocalFrame, Projection, in_crs
-from lslam.osm.buildings_geojson import read_corrected
+from lslam.osm.buildings_geojson import read_buildings_geojson
 from lslam.pipeline.convert import staged
 from lslam.pipeline.convert.convert_trajectory import georeference_beside
 from lslam.pipeline.rebuild import EarlierRun, covariances_of, read_run, results_of
@@ -247,7 +247,7 @@ def building_layers(folder: Path, projection: Projection) -> list[GeoLayer]:
     """Layers of buildings at their georeferenced places, as in buildings.geojson of the run's folder; none without it."""
     if not (folder / "buildings.geojson").is_file():
         return []
-    found = read_corrected(folder / "buildings.geojson")
+    found = read_buildings_geojson(folder / "buildings.geojson")
     # Buildings lie in the local frame of their own origin.
     there = Projection(
         replace(projection.georeference, origin=found.origin, T_enu_world=np.eye(4), epsg=projection.epsg)

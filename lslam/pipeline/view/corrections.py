@@ -14,10 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import mounted_up
-from lslam.backend.loops.find_loops import verify_known
-from lslam.backend.loops.pair_view import view_pair
+from lslam.backend.keyframes.store import KeyframeStore, mounted_up
+from lslam.backend.loops.find_loops import verify_pairs, view_pair
 from lslam.backend.manual import keyframe_pairs, read_control_points, read_named_pairs, stamp_of
 from lslam.core.errors import InputError, UsageError
 from lslam.core.geometry.geodesy import crs_name, parse_crs
@@ -157,7 +155,7 @@ class Corrections:
             poses = np.stack([k.T_world_lidar for k in store.keyframes])
             size = config.keyframes.submap_size
             up = mounted_up(store, poses, config.preprocess)
-            (candidate,) = verify_known(store, [known], config.loops, config.registration, size, up=up)
+            (candidate,) = verify_pairs(store, [known], config.loops, config.registration, size, up=up)
             at = {result.stamp_ns: k for k, result in enumerate(self._results)}
             scans = [at[store.keyframes[k].stamp_ns] for k in (known.a, known.b)]
             T = self.run.trajectory.poses[scans[0]]

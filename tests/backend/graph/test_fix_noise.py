@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.backend.fix_faults import align
 from lslam.backend.graph import factors, fix_noise
 from lslam.backend.graph.fix_noise import DriftOfFixes, GaussMarkovNoise, fit_gauss_markov
-from lslam.backend.graph.gnss_alignment import align
 from lslam.backend.graph.problem import PositionFix
 from lslam.core.geometry import se3
 
@@ -173,7 +173,7 @@ def test_the_covariance_of_drift_along_a_path_is_that_of_drawn_drives() -> None:
         drawn[:, i + 1] = drawn[:, i] + np.cross(turn, step) + d[:, :3]
         turn += d[:, 3:]
     flat = drawn.reshape(20_000, -1)
-    expected = 1e4 * fix_noise._shared(drift_of(path, metre).unit, path)
+    expected = 1e4 * fix_noise._joint_covariance(drift_of(path, metre).unit, path)
     np.testing.assert_allclose(flat.T @ flat / 20_000, expected, atol=0.04 * expected.max())
     way = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     lasting = fix_noise._lasting(np.diag([1e-4] * 3 + [0.0] * 3), path)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from lslam.backend.graph.consistency import judge_loops
 from lslam.backend.graph.drift import drift_factor
+from lslam.backend.graph.pose_graph import judge_loops
 from lslam.backend.graph.problem import PoseGraph, UpDirection
 from lslam.backend.graph.solve import GncResult, OutlierCandidate, gnc_solve
 from lslam.core.config.backend import GraphConfig
@@ -126,7 +126,7 @@ def test_gnc_ends_with_the_chi_square_gate() -> None:
     assert found.weights.tolist() == [1, 1, 0, 0, 0, 0]
     assert pulled([0.5, 1.05 * limit]).weights.tolist() == [1, 0]
     np.testing.assert_allclose(found.limits, limit**2, rtol=1e-4)
-    np.testing.assert_allclose(np.sqrt(found.squared) / limit, [0.5 / limit, 0.95, 1.05, 2, 5, 30], rtol=1e-4)
+    np.testing.assert_allclose(np.sqrt(found.squared_residuals) / limit, [0.5 / limit, 0.95, 1.05, 2, 5, 30], rtol=1e-4)
 
 
 def test_gnc_doubles_its_control_parameter_up_to_convergence() -> None:

@@ -70,7 +70,7 @@ def test_control_points_anchor_a_run_and_hold_an_instant_between_two_keyframes()
         fixes.append(PositionFix(k, at, np.full(3, 0.01), arms[0], is_binding=True, share=share, next_arm=arms[1]))
     out = optimise(replace(graph, fixes=fixes, is_anchored=False, tilt_sigma=0.2), GraphConfig())
     assert out.fix_inliers.all()
-    off = np.array([fix.seen(out.poses) - fix.position for fix in fixes])
+    off = np.array([fix.predict(out.poses) - fix.position for fix in fixes])
     assert np.abs(off).max() < 0.01
     assert ate(out.poses, REAL) < 0.25 * ate(graph.poses, REAL)
 

@@ -10,9 +10,10 @@ from graph_builders import STEP_SIGMAS, measured
 from numpy.typing import NDArray
 from test_building_graph import across
 
-from lslam.backend.graph import building_graph, solve
+from lslam.backend.graph import building_graph
 from lslam.backend.graph.building_graph import MapPrior, optimise_jointly
 from lslam.backend.graph.drift import with_drift
+from lslam.backend.graph.marginals import scaled_blocks
 from lslam.backend.graph.odometry_constraints import in_plane
 from lslam.backend.graph.problem import FloorPlane, PoseGraph
 from lslam.core.config.backend import GraphConfig
@@ -132,7 +133,7 @@ def test_covariances_of_buildings_do_not_depend_on_how_they_are_had(monkeypatch:
         config = GraphConfig(robust="none")
         by_gtsam = optimise_jointly(known, middles, matches, MAP_PRIOR, config)
         with monkeypatch.context() as without:
-            without.setattr(building_graph, "marginal_blocks", lambda f, v, keys: solve.scaled_blocks(f, v, list(keys)))
+            without.setattr(building_graph, "marginal_blocks", lambda f, v, keys: scaled_blocks(f, v, list(keys)))
             by_scaling = optimise_jointly(known, middles, matches, MAP_PRIOR, config)
         np.testing.assert_allclose(
             by_scaling.buildings.covariances, by_gtsam.buildings.covariances, rtol=1e-4, atol=1e-9

@@ -186,7 +186,7 @@ def test_a_long_way_takes_little_memory() -> None:
     tracemalloc.start()
     fit = loop_drift._Fit(graph, graph.loops, np.zeros(columns), np.tile(np.eye(3), (len(graph) - 1, 1, 1)), CONFIG)
     _, covariance, walk = fit.likeliest()
-    spread = fit.spread(covariance, walk)
+    spread = fit.pose_covariances(covariance, walk)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert np.isfinite(spread).all()
@@ -207,7 +207,7 @@ def test_estimation_in_parts_equals_estimation_at_once(monkeypatch: pytest.Monke
         monkeypatch.setattr(loop_drift, "BLOCK_KEYFRAMES", part)
         fit = loop_drift._Fit(graph, loops, found, turned, CONFIG)
         rates, covariance, walk = fit.likeliest()
-        told.append((fit.negative_log_likelihood, rates, fit.spread(covariance, walk)))
+        told.append((fit.negative_log_likelihood, rates, fit.pose_covariances(covariance, walk)))
     for whole, in_parts in zip(*told, strict=True):
         np.testing.assert_allclose(in_parts, whole, rtol=1e-6, atol=1e-6 * np.abs(whole).max())
 
@@ -312,6 +312,6 @@ def test_likelihood_and_rates_equal_those_of_all_errors_written_out() -> None:
     E = np.stack([moved(set_by(knot)[-1]) for knot in range(count)], axis=1)
     by_known, by_walk = np.sum(at_last, axis=0)
     left = E - (by_known + mean_walk * by_walk) @ np.linalg.solve(known + mean_walk * walk, G)
-    spread, expected = fit.spread(covariance, mean_walk)[-1], left @ covariance @ left.T
+    spread, expected = fit.pose_covariances(covariance, mean_walk)[-1], left @ covariance @ left.T
     sigma = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(spread / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=5e-3)

@@ -9,7 +9,7 @@ import pytest
 from graph_builders import STEP_SIGMAS, measured, truth
 
 from lslam.backend.graph.odometry_constraints import (
-    corrected,
+    correct_scans,
     fitness_covariance,
     fitness_score,
     growth,
@@ -111,7 +111,7 @@ def test_a_correction_that_is_rigid_moves_all_scans_alike() -> None:
     keyframes = keyframes_of(results)
     D = se3.exp(np.array([3.0, -2.0, 1.0, 0.02, -0.01, 0.3]))
     poses = np.stack([D @ k.T_world_lidar for k in keyframes])
-    final = corrected(results, keyframes, poses, np.zeros((12, 6, 6)), 0.0, GraphConfig())
+    final = correct_scans(results, keyframes, poses, np.zeros((12, 6, 6)), 0.0, GraphConfig())
     np.testing.assert_allclose(np.stack([r.T_world_lidar for r in final]), D @ POSES, atol=1e-9)
 
 
@@ -120,7 +120,7 @@ def test_between_keyframes_corrections_blend_without_a_seam() -> None:
     results = results_of(POSES)
     keyframes = keyframes_of(results, 6)
     poses = measured(np.stack([k.T_world_lidar for k in keyframes]), 10 * STEP_SIGMAS, rng)
-    final = corrected(results, keyframes, poses, np.zeros((len(keyframes), 6, 6)), 0.0, GraphConfig())
+    final = correct_scans(results, keyframes, poses, np.zeros((len(keyframes), 6, 6)), 0.0, GraphConfig())
     for keyframe, pose in zip(keyframes, poses, strict=True):
         np.testing.assert_allclose(final[keyframe.scan].T_world_lidar, pose, atol=1e-12)
     before = se3.relative(POSES[:-1], POSES[1:])
@@ -137,7 +137,7 @@ def test_covariances_of_scans_grow_from_their_keyframe() -> None:
     results = results_of(POSES)
     keyframes = keyframes_of(results, 10)
     known = np.stack([np.diag([1e-2] * 3 + [1e-5] * 3)] * 6)
-    final = corrected(results, keyframes, np.stack([k.T_world_lidar for k in keyframes]), known, 4.0, GraphConfig())
+    final = correct_scans(results, keyframes, np.stack([k.T_world_lidar for k in keyframes]), known, 4.0, GraphConfig())
     traces = [float(np.trace(r.covariance[:3, :3])) for r in final]
     assert traces[0] < traces[2] < traces[4]
     assert traces[10] < traces[8]
@@ -150,7 +150,7 @@ def test_the_covariance_of_a_scan_includes_the_path_to_its_keyframe() -> None:
     """Keyframes that are known without an error: what is left is the steps between and the scan's own registration."""
     results = results_of(POSES)
     keyframes = keyframes_of(results, 10)
-    final = corrected(
+    final = correct_scans(
         results, keyframes, np.stack([k.T_world_lidar for k in keyframes]), np.zeros((6, 6, 6)), 0.0, GraphConfig()
     )
     np.testing.assert_allclose(final[24].covariance, results_of(POSES[20:25])[-1].covariance, atol=1e-10)

@@ -8,9 +8,10 @@ from graph_builders import graph_of, truth
 
 from lslam.backend.graph import factors
 from lslam.backend.graph.drift import drift_factor
+from lslam.backend.graph.marginals import marginal_blocks, scaled_blocks
 from lslam.backend.graph.pose_graph import optimise
 from lslam.backend.graph.problem import PlanarPrior, PoseGraph, PositionFix
-from lslam.backend.graph.solve import joined, marginal_blocks, scaled_blocks
+from lslam.backend.graph.solve import join_factors
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import se2, se3
 from lslam.core.types.constraint import Constraint
@@ -148,7 +149,7 @@ def test_covariances_do_not_depend_on_how_they_are_had() -> None:
     """The scaled normal equations against gtsam's elimination; the frame of the map is the last of the unknowns."""
     graph = held(9)
     values = factors.start_values(graph, graph.poses)
-    whole = joined(
+    whole = join_factors(
         factors.fixed_part(replace(graph, start_sigma=np.full(3, 0.1), shift_sigma=1.0)),
         [factors.planar(p, graph.poses[p.keyframe], factors.map_key(graph)) for p in graph.map_priors],
     )

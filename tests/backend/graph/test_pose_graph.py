@@ -123,8 +123,8 @@ def test_up_directions_level_the_graph() -> None:
     assert np.abs(after[:, 2]).max() < 0.7 * np.abs(before[:, 2]).max()
 
 
-@pytest.mark.parametrize(("is_doubted", "x"), [(True, 0.4), (False, 0.0)])
-def test_a_start_that_is_doubted_moves_though_up_is_seen(is_doubted: bool, x: float) -> None:
+@pytest.mark.parametrize(("is_doubtful", "x"), [(True, 0.4), (False, 0.0)])
+def test_a_start_that_is_doubted_moves_though_up_is_seen(is_doubtful: bool, x: float) -> None:
     """A map puts all poses 0.4 m ahead; where nothing doubts the first one it stays, whatever gravity does to the tilt."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = 10.0 * np.arange(3)
@@ -136,8 +136,8 @@ def test_a_start_that_is_doubted_moves_though_up_is_seen(is_doubted: bool, x: fl
         ups=[UpDirection(k, np.array([0.0, 0.0, 1.0]), 0.01) for k in range(3)],
         distances=poses[:, 0, 3],
         map_priors=priors,
-        start_sigma=np.array([5.0, 5.0, 0.1]) if is_doubted else None,
-        shift_sigma=1e-4 if is_doubted else 5.0,
+        start_sigma=np.array([5.0, 5.0, 0.1]) if is_doubtful else None,
+        shift_sigma=1e-4 if is_doubtful else 5.0,
         map_sigma=1e-3,
     )
     solution = optimise(graph, GraphConfig())

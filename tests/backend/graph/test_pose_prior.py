@@ -7,8 +7,8 @@ import numpy as np
 
 from lslam.backend.graph import factors
 from lslam.backend.graph.fix_noise import GaussMarkovNoise
+from lslam.backend.graph.marginals import pose_prior
 from lslam.backend.graph.pose_graph import optimise
-from lslam.backend.graph.pose_prior import pose_prior
 from lslam.backend.graph.problem import PoseGraph, PositionFix
 from lslam.core.config.backend import GraphConfig
 from lslam.core.geometry import noise, se3, so3

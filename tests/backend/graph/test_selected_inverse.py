@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from lslam.backend.graph.selected_inverse import selected_inverse
+from lslam.backend.graph.marginals import selected_inverse
 
 POSES, POINTS = range(30), range(100, 110)
 

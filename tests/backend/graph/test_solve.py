@@ -9,7 +9,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from lslam.backend.graph.solve import marginal_blocks, refine, solve, solve_incrementally
+from lslam.backend.graph.marginals import marginal_blocks
+from lslam.backend.graph.solve import refine, solve, solve_incrementally
 from lslam.core.config.backend import GraphConfig
 from lslam.core.errors import GraphError
 

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from lslam.backend.keyframes.select import GRAIN, keyframe_cloud
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import neighbours, submap
+from lslam.backend.keyframes.store import KeyframeStore, neighbours, submap
 from lslam.core.config.backend import KeyframesConfig
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3

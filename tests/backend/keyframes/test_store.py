@@ -34,8 +34,8 @@ def cloud(seed: int, count: int = 500) -> NDArray[np.float32]:
     return np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
 
 
-def filled(folder: Path | None, count: int, cached: int = 2) -> KeyframeStore:
-    store = KeyframeStore(folder, cached)
+def filled(folder: Path | None, count: int, cache_size: int = 2) -> KeyframeStore:
+    store = KeyframeStore(folder, cache_size)
     for k in range(count):
         store.add(keyframe(k, k % 2 == 0), cloud(k))
     return store
@@ -46,7 +46,7 @@ def filled(folder: Path | None, count: int, cached: int = 2) -> KeyframeStore:
 def test_every_bit_comes_back(clouds: list[NDArray[np.float32]]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         for home in (None, Path(folder) / "keyframes"):
-            store = KeyframeStore(home, cached=0)
+            store = KeyframeStore(home, cache_size=0)
             for k, points in enumerate(clouds):
                 store.add(keyframe(k), points)
             for k, points in enumerate(clouds):
@@ -78,7 +78,7 @@ def test_the_same_clouds_make_the_same_bytes(tmp_path: Path) -> None:
 def test_clouds_that_are_not_packed_are_larger_and_the_same(tmp_path: Path) -> None:
     points = np.round(cloud(0) * 512) / 512
     packed, plain, in_memory = (
-        KeyframeStore(home, cached=0, deflate=deflate)
+        KeyframeStore(home, cache_size=0, deflate=deflate)
         for home, deflate in ((tmp_path / "packed", 1), (tmp_path / "plain", 0), (None, 0))
     )
     for store in (packed, plain, in_memory):
@@ -90,7 +90,7 @@ def test_clouds_that_are_not_packed_are_larger_and_the_same(tmp_path: Path) -> N
 @pytest.mark.parametrize("packing", [0, 1])
 def test_classes_are_packed_with_their_cloud(tmp_path: Path, packing: int) -> None:
     points, labels = cloud(3), np.arange(len(cloud(3)), dtype=np.uint16)
-    store = KeyframeStore(tmp_path / "keyframes", cached=0, deflate=packing)
+    store = KeyframeStore(tmp_path / "keyframes", cache_size=0, deflate=packing)
     store.add(keyframe(0), points, labels)
     np.testing.assert_array_equal(store.points(0), points)
     np.testing.assert_array_equal(np.asarray(store.labels(0)), labels)
@@ -101,7 +101,7 @@ def test_clouds_of_an_older_version_are_read(tmp_path: Path) -> None:
     filled(tmp_path, 2).save()
     planes = np.ascontiguousarray(cloud(1).T).view(np.uint8).reshape(3, -1, 4).transpose(2, 0, 1)
     write_npz(tmp_path / "000001.npz", {"planes": planes}, 1)
-    np.testing.assert_array_equal(KeyframeStore(tmp_path, cached=0).points(1), cloud(1))
+    np.testing.assert_array_equal(KeyframeStore(tmp_path, cache_size=0).points(1), cloud(1))
 
 
 @pytest.mark.parametrize("data", [b"", b"no zstd", bytes(zstd().compress(b"x" * 25))])
@@ -109,11 +109,11 @@ def test_a_cloud_that_was_packed_otherwise_is_damaged(tmp_path: Path, data: byte
     filled(tmp_path, 2).save()
     write_npz(tmp_path / "000001.npz", {"planes.zst": np.frombuffer(data, np.uint8)}, 0)
     with pytest.raises(InputError, match=r"000001\.npz is damaged"):
-        KeyframeStore(tmp_path, cached=0).points(1)
+        KeyframeStore(tmp_path, cache_size=0).points(1)
 
 
 def test_few_clouds_stay_in_memory(tmp_path: Path) -> None:
-    store = filled(tmp_path / "keyframes", 6, cached=2)
+    store = filled(tmp_path / "keyframes", 6, cache_size=2)
     for file in (tmp_path / "keyframes").iterdir():
         file.unlink()
     for recent in (4, 5):
@@ -145,7 +145,7 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, how: str) -> None:
     flipped = data[:middle] + bytes([data[middle] ^ 255]) + data[middle + 1 :]
     file.write_bytes({"cut": data[:middle], "flip": flipped, "other": other, "empty": b""}[how])
     with pytest.raises(InputError, match=rf"{name}|index of keyframes"):
-        KeyframeStore(tmp_path, cached=0).points(1)
+        KeyframeStore(tmp_path, cache_size=0).points(1)
 
 
 def test_an_index_without_its_clouds_is_refused(tmp_path: Path) -> None:

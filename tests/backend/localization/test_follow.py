@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from revisited import CONFIG, Revisited, error_of, revisit
 
-from lslam.backend.localization.follow import MapFollower, doubted
-from lslam.backend.localization.place_search import PlaceSearch
-from lslam.backend.localization.prior_map import LocalView, PriorMap, make_prior_map
+from lslam.backend.localization.locate import MapFollower, mark_doubts
+from lslam.backend.localization.prior_map import LocalView, PlaceSearch, PriorMap, make_prior_map
 from lslam.core.geometry import se3
 from lslam.core.types.constraint import MapFix
 from lslam.registration.preprocessing.prepare import prepare_points
@@ -82,7 +81,7 @@ def test_a_street_that_was_rebuilt_is_flagged_and_does_not_drag(world: Revisited
     out = np.sign(ahead[:, 1])[:, None] * world.true_poses[30, :3, 1]
     changed[is_moved] -= 1.2 * out[is_moved]
     prior_map, fixes = followed(world, changed)
-    marked = doubted(fixes)
+    marked = mark_doubts(fixes)
     assert sum(fix.is_doubtful for fix in marked[25:36]) > 5
     assert not any(fix.is_doubtful for fix in marked[45:])
     assert errors(world, prior_map, fixes).max() < 0.1

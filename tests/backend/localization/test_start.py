@@ -10,10 +10,9 @@ from revisited import CONFIG, Revisited, error_of, revisit, town_map
 from turned_sensor import TURNS, turn, turned_pose, turned_store
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.localization.place_search import PlaceSearch, Region
-from lslam.backend.localization.prior_map import make_prior_map
+from lslam.backend.localization.locate import SPACING_M, PlaceFinder, Start, StartPrior, Vote
+from lslam.backend.localization.prior_map import PlaceSearch, Region, make_prior_map
 from lslam.backend.localization.sessions import Session, tie
-from lslam.backend.localization.start import SPACING_M, PlaceFinder, Start, StartPrior, Vote
 from lslam.backend.loops.level_submap import make_level_submap
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.kernels import bev
-from lslam.backend.loops.bev_correlation import (
+from lslam.backend.loops.level_submap import (
     CELL_M,
     MOST_VOXELS,
     BestShifts,
@@ -14,8 +14,8 @@ from lslam.backend.loops.bev_correlation import (
     correlate,
     peaks,
     spectra,
-    turning,
 )
+from lslam.core.geometry import se2
 
 RASTER = BevGrid(16)
 
@@ -47,7 +47,7 @@ def test_columns_count_up_to_the_tallest_and_what_lies_outside_does_not(edge: fl
 
 def test_a_view_is_of_the_points_turned() -> None:
     points, ground = clouds()
-    R = turning(0.6)
+    R = se2.rotation(0.6)
     np.testing.assert_allclose(R @ [1.0, 0.0], [np.cos(0.6), np.sin(0.6)])
     turned = [np.column_stack([p[:, :2] @ R.T, p[:, 2]]) for p in (points, ground)]
     np.testing.assert_array_equal(RASTER.view(points, ground, R), RASTER.view(*turned))

@@ -12,9 +12,9 @@ import pytest
 from known_town import Points, keyframes_of, pose, round_the_square, seen, terrace, town
 from numpy.typing import NDArray
 
-from lslam.backend.kernels import gating, polar_image
+from lslam.backend.kernels import bev, gating
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.loops.descriptor import PlaceMatch
+from lslam.backend.loops import PlaceMatch
 from lslam.backend.loops.detector import Detector
 from lslam.backend.loops.find_loops import find_loops, warm_up
 from lslam.core.config.backend import LoopsConfig
@@ -191,8 +191,8 @@ def test_joins_the_clouds_of_a_store(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_after_a_warm_start_nothing_is_left_to_compile() -> None:
     warm_up(LoopsConfig())
-    kernels: list[Any] = [polar_image.polar_image, gaussians.insert, gaussians.coarsen, residuals.linearise,
-                          gauss_newton.step, gating.gated, transform.transform]  # fmt: skip
+    kernels: list[Any] = [bev.polar_image, gaussians.insert, gaussians.coarsen, residuals.linearise,
+                          gauss_newton.step, gating.gate, transform.transform]  # fmt: skip
     before = [len(kernel.signatures) for kernel in kernels]
     assert all(before)
     true = np.array([round_the_square(d) for d in np.arange(0, 380, 10.0)])

@@ -94,9 +94,9 @@ def test_within_the_gate_is_what_the_uncertainty_between_says(is_known: bool) ->
         older = np.flatnonzero(uncertainty.distances[b] - uncertainty.distances[:b] >= least)
         away = np.linalg.norm(uncertainty.positions[older] - uncertainty.positions[b], axis=1)
         expected = older[away <= near + sigmas * uncertainty.between(b, older).reach] if len(older) else older
-        np.testing.assert_array_equal(uncertainty.gated(b, np.arange(b), least, near, sigmas), expected)
+        np.testing.assert_array_equal(uncertainty.gate(b, np.arange(b), least, near, sigmas), expected)
         among = np.arange(b)[rng.random(b) < 0.5]
-        some = uncertainty.gated(b, among, least, near, sigmas)
+        some = uncertainty.gate(b, among, least, near, sigmas)
         np.testing.assert_array_equal(some, np.intersect1d(expected, among))
         seen += 0 < len(expected) < len(older)
     assert seen > 10

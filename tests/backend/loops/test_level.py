@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from known_town import keyframes_of, pose, round_the_square, seen, town
 
-from lslam.backend.loops.level_submap import find_up, levelled, make_level_submap
+from lslam.backend.loops.level_submap import find_up, level_keyframes, make_level_submap
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
 
@@ -46,7 +46,7 @@ def test_levelled_keyframes_have_the_same_relative_poses_and_turned_covariances(
     keyframes = [replace(k, covariance=np.diag([1.0, 2, 3, 4, 5, 6])) for k in
                  keyframes_of(np.array([round_the_square(d) for d in (0.0, 30.0, 120.0)]))]  # fmt: skip
     up = so3.exp(np.array([0.3, -0.2, 0.0]))[:, 2]
-    turned = levelled(keyframes, up)
+    turned = level_keyframes(keyframes, up)
     for before, after in zip(keyframes, turned, strict=True):
         relative = se3.relative(turned[0].T_world_lidar, after.T_world_lidar)
         assert np.allclose(relative, se3.relative(keyframes[0].T_world_lidar, before.T_world_lidar))

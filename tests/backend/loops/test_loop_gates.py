@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lslam.backend.loops.detector import LEAST_REACH, TURN_STEP, WIDEST_TURN, Detector
 from lslam.backend.loops.gating import RelativeUncertainty, SharedResults
 from lslam.backend.loops.scan_context import SECTORS, PlaceMatch
-from lslam.backend.loops.verify import Verification, Verifier, _is_elsewhere
+from lslam.backend.loops.verify import Verification, Verifier, is_elsewhere
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
@@ -178,7 +178,7 @@ def test_the_fallback_candidate_is_tried_after_rejections_without_ambiguity(
     gate = detector()
     gate._choose = lambda b, older: ([PlaceMatch(0, 0.1, 0.0)], lambda: [PlaceMatch(1, 0.2, 0.0)])  # type: ignore[method-assign]
     gate._examine = lambda match, b: LoopCandidate(match.number, b, 0.0, match.distance, verdict, stage)  # type: ignore[method-assign]
-    examined = gate._examined(2, np.arange(2), StageClock())
+    examined = gate._examine_all(2, np.arange(2), StageClock())
     assert [(c.a, c.verdict, c.stage) for c in examined] == [(a, verdict, stage) for a in range(1 + is_asked)]
 
 
@@ -226,4 +226,4 @@ def test_a_failed_registration_back_is_reported() -> None:
     ("x", "yaw_deg", "expected"), [(0.9, 0, False), (1.1, 0, True), (0.0, 4.5, False), (0.0, 5.5, True)]
 )
 def test_poses_differ_from_a_metre_or_five_degrees(x: float, yaw_deg: float, expected: bool) -> None:
-    assert _is_elsewhere(pose(0, 0), pose(x, 0, yaw_deg)) == expected
+    assert is_elsewhere(pose(0, 0), pose(x, 0, yaw_deg)) == expected

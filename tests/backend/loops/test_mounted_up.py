@@ -7,8 +7,7 @@ import pytest
 from known_town import pose, seen, town
 from numpy.typing import NDArray
 
-from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.keyframes.submaps import GROUND_KEYFRAMES, mounted_up
+from lslam.backend.keyframes.store import GROUND_KEYFRAMES, KeyframeStore, mounted_up
 from lslam.core.config.input import PreprocessConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.trajectory import Keyframe

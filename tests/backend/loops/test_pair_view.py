@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lslam.backend.keyframes.store import KeyframeStore
-from lslam.backend.loops.pair_view import FEW_POINTS, MOST_VIEWS, view_pair, view_pairs
+from lslam.backend.loops.find_loops import FEW_POINTS, MOST_VIEWS, view_pair, view_pairs
 from lslam.core.geometry import se3, so3
 from lslam.core.types.constraint import Constraint, LoopCandidate, LoopStage, Verdict
 from lslam.core.types.run_record import RunRecord

@@ -32,7 +32,7 @@ def test_whoever_asks_meanwhile_waits_for_the_one_that_makes_it() -> None:
 
 def test_the_last_used_ones_are_kept() -> None:
     made: list[int] = []
-    results = SharedResults(lambda number: made.append(number), kept=2)
+    results = SharedResults(lambda number: made.append(number), size=2)
     for number in (1, 2, 1, 3, 1, 2):
         results.get(number)
     assert made == [1, 2, 3, 2]

@@ -8,8 +8,18 @@ from known_town import NOISE, box, pose, seen, terrace, town
 from numpy.typing import NDArray
 
 from lslam.backend.loops import verify
-from lslam.backend.loops.level_submap import LevelSubmap, make_level_submap
-from lslam.backend.loops.verify import LARGE, NARROWEST, WIDEST, Verification, Verifier, _grid, find_initial_guesses
+from lslam.backend.loops.level_submap import LevelSubmap, VisibleCells, make_level_submap
+from lslam.backend.loops.verify import (
+    LARGE,
+    NARROWEST,
+    SHARED_SHARE,
+    WIDEST,
+    SubmapRegistration,
+    Verification,
+    Verifier,
+    _grid,
+    find_initial_guesses,
+)
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.geometry import se3, so3
@@ -207,9 +217,9 @@ def test_vertical_surfaces_support_a_start_within_two_kernels(metres: float, sup
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
     a, b = (make_level_submap(wall, RegistrationConfig()) for _ in range(2))
-    seen = LARGE.view(a.non_ground, a.ground)[2].ravel() > 0
+    cells = VisibleCells(LARGE, LARGE.view(a.non_ground, a.ground)[2].ravel() > 0, SHARED_SHARE)
     T = se3.make(np.eye(3), np.array([0.0, metres, 0.0]))
-    found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, T)
+    found = SubmapRegistration(a, LoopsConfig(), RegistrationConfig()).support(b, T, cells)
     assert found == pytest.approx(support, abs=0.05)
 
 
@@ -219,6 +229,6 @@ def test_a_start_is_supported_when_a_quarter_of_its_vertical_surfaces_was_seen(m
     along, up = np.mgrid[-12:12:0.1, 0:6:0.1].reshape(2, -1)
     wall = np.column_stack([along, np.full_like(along, 8.05), up]).astype(np.float32)
     a, b = (make_level_submap(part, RegistrationConfig()) for part in (wall[along < metres - 12], wall))
-    seen = LARGE.view(a.non_ground, a.ground)[2].ravel() > 0
-    found = Verifier(LoopsConfig(), RegistrationConfig())._support(a, b.upright, seen, np.eye(4))
+    cells = VisibleCells(LARGE, LARGE.view(a.non_ground, a.ground)[2].ravel() > 0, SHARED_SHARE)
+    found = SubmapRegistration(a, LoopsConfig(), RegistrationConfig()).support(b, np.eye(4), cells)
     assert found == pytest.approx(support, abs=0.2)

@@ -7,9 +7,9 @@ import pytest
 from known_town import Points, keyframes_of, round_the_square, seen, town
 from numpy.typing import NDArray
 
-from lslam.backend.loops.descriptor import PlaceMatch
+from lslam.backend.loops import PlaceMatch
 from lslam.backend.loops.detector import NEAR_M, Detector
-from lslam.backend.loops.working_memory import LOOP_PLACES, RETRIEVED, WorkingMemory
+from lslam.backend.loops.gating import LOOP_PLACES, RETRIEVED, WorkingMemory
 from lslam.core.config.backend import LoopsConfig
 from lslam.core.config.odometry import RegistrationConfig
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from lslam.backend.kernels.polar_image import polar_image
+from lslam.backend.kernels.bev import polar_image
 
 
 def by_hand(points: NDArray[np.float32], rings: int, sectors: int, reach: float) -> NDArray[np.float64]:

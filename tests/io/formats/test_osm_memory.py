@@ -13,7 +13,7 @@ import pytest
 from lslam.io.formats.osm_data import OsmData
 from lslam.io.formats.osm_files import read_osm, write_osm
 from lslam.osm.bounds import Bounds
-from lslam.osm.overpass import OverpassReply, _file_name, from_overpass, kept_reply, merged
+from lslam.osm.overpass import OverpassReply, _file_name, from_overpass, kept_reply, merge_replies
 
 HOUSES = 6_000
 BOX = Bounds(48.95, 8.35, 49.05, 8.45)
@@ -77,7 +77,7 @@ def test_a_reply_is_held_as_its_text(extracts: Path) -> None:
 
 def test_many_replies_make_one_extract_that_costs_what_it_holds(extracts: Path) -> None:
     text = (extracts / "town.json").read_bytes()
-    data, held, peak = cost(lambda: merged([OverpassReply(text)] * 3))
+    data, held, peak = cost(lambda: merge_replies([OverpassReply(text)] * 3))
     assert isinstance(data, OsmData)
     assert len(data.ways) == HOUSES
     assert peak < 1.1 * held + 1
