@@ -145,9 +145,9 @@ def _print(rows: list[StudyRow], out: Path, as_json: bool) -> None:
         show(json.dumps({"folder": str(out), "results": str(out / "results.csv"), "runs": rows_document(rows)}) + "\n")
         return
     from lslam.reports.study_table import batch_table
-    from lslam.reports.text import aligned
+    from lslam.reports.text import text_table
 
-    show(aligned(batch_table(rows), 3) + "\n")
+    show(text_table(batch_table(rows), 3) + "\n")
 
 
 def _judge(rows: list[StudyRow], is_strict: bool) -> None:

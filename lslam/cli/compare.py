@@ -251,7 +251,7 @@ def _print_rich(comparison: Comparison) -> None:
         shown = Table(
             title=table.title or None, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False
         )
-        for k, name in enumerate(table.folded):
+        for k, name in enumerate(table.header_lines):
             side: Literal["left", "right"] = "left" if k < table.names else "right"
             shown.add_column(name, justify=side, overflow="fold", no_wrap=k == 1, vertical="bottom")
         room = max((len(row[0]) for row in table.rows), default=0) - max(table.width - console.width, 0)

@@ -238,7 +238,7 @@ def _draw_map(
 
 
 def _write_plan(path: Path, plan: ScenePlan) -> Written:
-    from lslam.reports.scene_plan import write_plan
+    from lslam.reports.plans import write_plan
 
     write_plan(path, plan)
     width, depth = plan.high - plan.low

@@ -119,9 +119,9 @@ def _sweep(word: str, given: dict[str, Any]) -> Sweep:
 
 def _print(rows: list[StudyRow]) -> None:
     from lslam.reports.study_table import best_table
-    from lslam.reports.text import aligned
+    from lslam.reports.text import text_table
 
-    show(aligned(best_table(rows), 2) + "\n")
+    show(text_table(best_table(rows), 2) + "\n")
 
 
 def _report(folder: Path) -> list[str]:

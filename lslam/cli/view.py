@@ -57,7 +57,7 @@ def record(run: Path, path: Path, overwrite: bool) -> None:
     """Write the recording."""
     from lslam.core.errors import OutputError, OutputExistsError
     from lslam.pipeline.run_folder import require_run
-    from lslam.reports.recording import require_rerun, write_recording
+    from lslam.reports.figures import require_rerun, write_recording
 
     require_rerun()
     if path.exists() and not overwrite:

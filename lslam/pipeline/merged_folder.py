@@ -35,7 +35,7 @@ from lslam.pipeline.outputs import config_text, write_loops
 from lslam.pipeline.rebuild import EarlierRun, is_gone, open_scans
 from lslam.pipeline.run_folder import CHECKPOINT, SESSIONS, RunFolder
 from lslam.pipeline.watch import Watch
-from lslam.reports.merge_html import SessionView, write_page
+from lslam.reports.compare_html import SessionView, write_merge_page
 
 log = logging.getLogger("lslam")
 SCHEMA = 1
@@ -128,7 +128,7 @@ def _fill(folder: RunFolder, merged: Merged, config: Config, watch: Watch) -> di
         about["map_points"] = len(built.merged)
     watch.on_start("report", 0)
     views, shown = _views(merged, trajectories), (None, None) if built is None else (built.view, built.sample)
-    write_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, _ties(merged), *shown)
+    write_merge_page(folder.path / "report.html", views, [vars(row) for row in rows], problems, _ties(merged), *shown)
     for problem in problems:
         log.warning("%s", problem)
     return about | {

@@ -62,8 +62,8 @@ from lslam.pipeline.run_folder import MANIFEST, SPOOL, held, require_run
 from lslam.registration.preprocessing.sweep_clock import SweepClock
 from lslam.registration.preprocessing.views import ClockView, WithoutClasses
 from lslam.reports.evaluations import run_document
+from lslam.reports.figures import PlottedRun
 from lslam.reports.html import with_new_map
-from lslam.reports.recording import ViewedRun
 
 log = logging.getLogger("lslam")
 EVALUATION, REPORT = "evaluation.json", "report.html"
@@ -377,7 +377,7 @@ def write_renewed(target: Path, folder: Path, record: RunRecord) -> None:
     write_json(target / MANIFEST, record.manifest)
 
 
-def viewed_run(folder: Path) -> ViewedRun:
+def viewed_run(folder: Path) -> PlottedRun:
     """Trajectory, odometry if there was a back end, and map, all in the run's world.
 
     Raises InputError naming what is missing or broken; a run without a map is shown without one.
@@ -387,7 +387,7 @@ def viewed_run(folder: Path) -> ViewedRun:
     if (folder / "trajectory_odometry.tum").is_file():
         odometry = read_trajectory(folder / "trajectory_odometry.tum", "tum")
     name = str(run.manifest.get("sequence", {}).get("name", folder.name))
-    return ViewedRun(f"{name} ({folder.name})", run.trajectory, _cloud(folder), odometry)
+    return PlottedRun(f"{name} ({folder.name})", run.trajectory, odometry, cloud=_cloud(folder))
 
 
 def _cloud(folder: Path) -> ArrayCloud | None:

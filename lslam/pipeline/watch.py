@@ -16,7 +16,7 @@ from lslam.evaluation.evaluate import Evaluation
 from lslam.io.formats.point_files import read_cloud
 from lslam.pipeline.map_files import in_own_world
 from lslam.reports.figures import ON_THE_MAP, PlottedRun, draw_figure
-from lslam.reports.picture import WIDTH, as_html, drawn
+from lslam.reports.picture import WIDTH, as_html, draw_svg
 from lslam.reports.plots import first_available
 from lslam.reports.text import summary
 
@@ -74,7 +74,7 @@ class RunOutcome:
     def _repr_html_(self) -> str:
         """Summary and trajectory, for notebooks."""
         return as_html(
-            summary(self.record, self.evaluation), drawn(lambda: draw_figure(self._plotted(), "trajectory", WIDTH))
+            summary(self.record, self.evaluation), draw_svg(lambda: draw_figure(self._plotted(), "trajectory", WIDTH))
         )
 
 

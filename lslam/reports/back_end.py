@@ -1,22 +1,27 @@
-"""Results of the pose graph for the summary and the report: loops, fixes, errors before and after, uncertainty."""
+"""Results of the pose graph for the summary and the report: loops, fixes, errors before and after, uncertainty.
+
+Of a drive in a map that exists: where the map holds its scans, and where odometry carries them.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lslam.core.geometry import se3
 from lslam.core.printable import count_of, metres
 from lslam.core.types.arrays import Floats
+from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.comparison import Table
+from lslam.core.types.constraint import MapFix
 from lslam.core.types.run_record import LoopView, RunRecord
 from lslam.reports import svg
 from lslam.reports.buildings import drift_tables
-from lslam.reports.crops import PIXELS, Crop, crop_images
-from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, Figure, first_available
-from lslam.reports.png import data_uri, density_png
-from lslam.reports.svg import WIDTH, By, Track, plane_chart
+from lslam.reports.plots import ALIGNED, DISTANCE, PLAN_HEIGHT, WAY, Figure, first_available, line_figure
+from lslam.reports.png import PIXELS, Crop, crop_images, data_uri, density_png
+from lslam.reports.svg import MOST_POINTS, WIDTH, By, Track, plane_chart
 
 if TYPE_CHECKING:
     from lslam.evaluation.metric import Evaluation
@@ -54,23 +59,14 @@ def back_end_rows(record: RunRecord, evaluation: Evaluation | None) -> list[tupl
         rows.append(("georeference", f"origin {lat:.7f}, {lon:.7f}, {height:.1f} m; {said}"))
     control = record.manifest.get("graph", {}).get("control_points")
     if control is not None:
-        rows.append(
-            (
-                "control",
-                f"{count_of(control['count'], 'point')}, {metres(control['rms_horizontal_m'])} m rms horizontally and "
-                f"{metres(control['rms_vertical_m'])} m vertically, the worst {control['worst_sigmas']:.1f} sigmas off",
-            )
-        )
+        horizontal, vertical = (metres(control[f"rms_{axes}_m"]) for axes in ("horizontal", "vertical"))
+        text = f"{count_of(control['count'], 'point')}, {horizontal} m rms horizontally and {vertical} m vertically, "
+        rows.append(("control", f"{text}the worst {control['worst_sigmas']:.1f} sigmas off"))
     if record.osm is not None:
         (east, north), sigma = -record.osm.shift, float(record.osm.shift_sigma.max())
-        rows.append(
-            (
-                "OpenStreetMap",
-                f"{len(record.osm.accepted_matches)} of {len(record.osm.keyframes)} keyframes held by "
-                f"{len(record.osm.buildings)} buildings, "
-                f"which lie {east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)",
-            )
-        )
+        osm, shift = record.osm, f"{east:+.2f} m east and {north:+.2f} m north of the run (sigma {sigma:.2f} m)"
+        text = f"{len(osm.accepted_matches)} of {len(osm.keyframes)} keyframes held by {len(osm.buildings)} buildings"
+        rows.append(("OpenStreetMap", f"{text}, which lie {shift}"))
     rows += [_drift_row(table) for table in drift_tables(record)]
     if record.buildings is not None:
         found = record.buildings
@@ -105,7 +101,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
         legend.append(("gt", "ground truth"))
     captions = ["Estimate in its own world" + ("; ground truth moved to it." if tracks else ".")]
     what = "localisation" if record.map_fixes else "the pose graph"
-    moved, pixel = most_moved(record), _extent(record) / WIDTH
+    moved, pixel = largest_correction(record), _extent(record) / WIDTH
     is_seen = moved > pixel
     if is_seen:
         before = se3.apply(record.T_final_odometry, odometry.positions)[:, :2]
@@ -132,7 +128,7 @@ def back_end_figures(record: RunRecord, evaluation: Evaluation | None) -> list[F
     return [whole, *_error_figures(evaluation, what), *loop_figures(record.loop_view)]
 
 
-def most_moved(record: RunRecord) -> float:
+def largest_correction(record: RunRecord) -> float:
     """Largest displacement of a pose by the back end, m, with both trajectories in the world of the final one."""
     if record.odometry is None or len(record.odometry) != len(record.trajectory):
         return 0.0
@@ -180,9 +176,9 @@ def _error_figures(evaluation: Evaluation | None, what: str) -> list[Figure]:
         for word, part, style in (("odometry", before, "s2"), (f"after {what}", evaluation, "s1"))
     ]
     title = f"Position error before and after {what}"
-    chart = svg.line_chart(lines, DISTANCE, "position error, m", title, by="truth")
     caption = f"{before_and_after(evaluation, before, what)}; {ALIGNED.get(name, name)}."
-    return [Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)] if chart else []
+    figure = line_figure(title, lines, DISTANCE, "position error, m", caption, by="truth")
+    return [figure] if figure.svg else []
 
 
 def _common(record: RunRecord) -> Floats:
@@ -234,3 +230,76 @@ def loop_figures(view: LoopView | None) -> list[Figure]:
         chart = plane_chart(tracks, f"map at a loop, {word} the pose graph", backdrop=backdrop, by=by)
         figures.append(Figure(f"Map at a loop, {word} the pose graph", chart, legend, caption))
     return figures
+
+
+# What became of a scan, for people, in the order of the codes that the page's script gets; the style of its line.
+STATES = {
+    "held": ("held by the map", "s2"),
+    "doubted": ("held, the map has changed there", "s4"),
+    "changed": ("carried by odometry: the map has changed", "carried"),
+    "beyond": ("carried by odometry: beyond the map", "carried"),
+    "unread": ("carried by odometry: without points", "carried"),
+}
+WORDS = {"gone": "gone", "appeared": "not in the map"}
+
+
+def state_of(fix: MapFix) -> str:
+    """Key of `STATES` of a scan."""
+    return "doubted" if fix.is_binding and fix.is_doubtful else fix.status
+
+
+def state_codes(record: RunRecord) -> NDArray[np.uint8]:
+    """(N,) place in `STATES` of each scan against the map."""
+    names = list(STATES)
+    return np.array([names.index(state_of(fix)) for fix in record.map_fixes], np.uint8)
+
+
+def localization_tracks(record: RunRecord) -> tuple[list[Track], list[tuple[str, str]]]:
+    """Parts of the trajectory by state with their legend: held, held in doubt, carried; each reaches to the next scan."""
+    xy, codes = record.trajectory.positions[:, :2], state_codes(record)
+    styles = np.array([style for _, style in STATES.values()])[codes]
+    words = {"s2": "held by the map", "s4": "held, the map has changed there", "carried": "carried by odometry"}
+    tracks, legend = [], []
+    for style, word in words.items():
+        own = styles == style
+        if own.any():
+            reach = own | np.append(False, own[:-1])
+            tracks.append(Track(word, np.where(reach[:, None], xy, np.nan), style))
+            legend.append((style, f"{word}, {count_of(int(own.sum()), 'scan')}"))
+    return tracks, legend
+
+
+def changed_dots(sample: ArrayCloud | None) -> list[tuple[str, NDArray[Any]]]:
+    """Places (K, 2), m, of what is gone and what is not in the map, by style, some of each; empty where nothing is known."""
+    if sample is None or "change" not in sample.columns:
+        return []
+    dots = []
+    for style, code in (("gone", -1), ("appeared", 1)):
+        own = sample.points[sample.columns["change"] == code, :2]
+        if len(own):
+            dots.append((style, own[:: -(-len(own) // MOST_POINTS)]))
+    return dots
+
+
+def localization_figures(record: RunRecord) -> list[Figure]:
+    """Agreement with the map and correction by it over the distance travelled; scans that odometry carries are marked."""
+    fixes = record.map_fixes
+    if not fixes:
+        return []
+    way, is_binding = record.trajectory.path_lengths, np.array([fix.is_binding for fix in fixes])
+    carried = way[~is_binding]
+    share = np.array([fix.inlier_share for fix in fixes])
+    moved = np.array([fix.innovation[0] for fix in fixes])
+    legend = (("failed", f"carried by odometry, {count_of(len(carried), 'scan')}"),) if len(carried) else ()
+
+    def figure(title: str, label: str, values: NDArray[Any], caption: str) -> Figure:
+        line = svg.Line("held by the map", way, np.where(is_binding, values, np.nan), "s1")
+        chart: dict[str, Any] = {"spoken": title.lower(), "marks": carried, "by": "way"}
+        return line_figure(title, [line], WAY, label, caption, more=legend, **chart)
+
+    return [
+        figure(
+            "Agreement with the map", "share of points", share, "Points within the kernel, of those that find the map."
+        ),
+        figure("Correction by the map", "m", moved, "How far the map moved each scan from where odometry carried it."),
+    ]

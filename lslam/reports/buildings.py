@@ -41,12 +41,13 @@ def building_pages(record: RunRecord) -> BuildingPages | None:
     return BuildingPages(building_figures(record.buildings, record.osm, poses), tables)
 
 
-def building_figures(found: CorrectedMap, matches: OsmMatches, poses: Floats) -> list[Figure]:
+def building_figures(result: CorrectedMap, matches: OsmMatches, poses: Floats) -> list[Figure]:
     """Plans: buildings before and after with the observed walls, and where the map constrained the trajectory.
 
     poses : (K, 3) x, y (m), yaw (rad) of all keyframes in the map frame
     """
-    near = [c for c in found.buildings if _is_near(c.building, poses[:, :2])]
+    low, high = poses[:, :2].min(axis=0) - DRAWN_M, poses[:, :2].max(axis=0) + DRAWN_M
+    near = [c for c in result.buildings if ((c.building.middle >= low) & (c.building.middle <= high)).all()]
     walls = _seen_walls(matches.keyframes, poses)
     gone = [c for c in near if c.status == "absent"]
     drawn = [
@@ -54,11 +55,13 @@ def building_figures(found: CorrectedMap, matches: OsmMatches, poses: Floats) ->
         ("gt", "buildings on the map", _outlines(c.building for c in near)),
         ("s1", "where they stand", _outlines(c.real_building for c in near if c.status != "absent")),
         ("s2", "absent in the scans", _outlines(c.real_building for c in gone)),
-        ("s4", "new: walls without a building", _segments(found.new_walls)),
+        ("s4", "new: walls without a building", _segments(result.new_walls)),
     ]
     tracks = [Track(label, part, style) for style, label, lines in drawn for part in _parts(lines)]
     legend = tuple((style, label) for style, label, lines in drawn if len(lines))
-    caption = f"x east, y north of the run's origin. Mode {found.mode}. {found.attribution or 'A map nobody surveyed.'}"
+    caption = (
+        f"x east, y north of the run's origin. Mode {result.mode}. {result.attribution or 'A map nobody surveyed.'}"
+    )
     plan = plane_chart(tracks, "buildings from above, before and after", width=720, tallest=760, by="own")
     return [Figure("Buildings before and after, from above", plan, legend, caption, wide=True), _holds(matches, poses)]
 
@@ -98,22 +101,26 @@ def drift_tables(record: RunRecord) -> list[Table]:
     return [Table(f"{kind.capitalize()} drift of odometry", header, rows, recipe)]
 
 
-def building_tables(found: CorrectedMap, matches: OsmMatches) -> list[Table]:
+def building_tables(result: CorrectedMap, matches: OsmMatches) -> list[Table]:
     """Tables of displacements, largest first, and of the reasons why matches were rejected."""
-    order = sorted(found.buildings, key=lambda c: (c.status == "unseen", -float(np.linalg.norm(c.displacement[:2]))))
+    order = sorted(result.buildings, key=lambda c: (c.status == "unseen", -float(np.linalg.norm(c.displacement[:2]))))
     rows = tuple(_row(c) for c in order[:MOST_ROWS])
-    counts = Counter(c.status for c in found.buildings)
-    east, north = -found.shift
+    counts = Counter(c.status for c in result.buildings)
+    east, north = -result.shift
     recipe = (
-        f"Real minus map, about the middle of each building; {count_of(len(found.buildings), 'building')}: {counts['seen']} "
-        f"seen, {counts['unseen']} not, {counts['absent']} absent; the map as a whole lies {east:+.2f} m east and {north:+.2f} m "
-        f"north of the run; {count_of(len(found.overlaps), 'pair')} still overlap. Confidence: to stand within 0.5 m of there."
+        f"Real minus map, about the middle of each building; {count_of(len(result.buildings), 'building')}: "
+        f"{counts['seen']} seen, {counts['unseen']} not, {counts['absent']} absent; the map as a whole lies {east:+.2f} m east "
+        f"and {north:+.2f} m north of the run; {count_of(len(result.overlaps), 'pair')} still overlap. Confidence: to stand "
+        "within 0.5 m of there."
     )
     header = ("building", "status", "east, m", "north, m", "turn, deg", "confidence", "matches", "given up")
     tables = [Table("Displacement of buildings", header, rows, recipe)]
     reasons: Counter[tuple[str, str]] = Counter()
     for kind, held in (("keyframe on the map", matches.keyframes), ("building on the walls seen", matches.local)):
-        reasons.update((kind, "used" if match.is_accepted else _plain(match.reason)) for match in held)
+        for match in held:
+            # Without its number, so that equal ones can be counted.
+            reason = re.sub(r"^[\d.]+ times", "… times", match.reason) or "given up"
+            reasons[kind, "used" if match.is_accepted else reason] += 1
     rows = tuple((kind, reason, str(number)) for (kind, reason), number in reasons.most_common())
     recipe = "A keyframe's match holds the trajectory, a building's only moves that building."
     return [*tables, Table("Matches of walls", ("match", "what became of it", "how many"), rows, recipe)]
@@ -132,11 +139,6 @@ def _row(correction: BuildingCorrection) -> tuple[str, ...]:
         str(correction.used_matches),
         str(correction.rejected_matches),
     )
-
-
-def _plain(reason: str) -> str:
-    """Reason without its number, so that equal ones can be counted."""
-    return re.sub(r"^[\d.]+ times", "… times", reason) or "given up"
 
 
 def _holds(matches: OsmMatches, poses: Floats) -> Figure:
@@ -160,11 +162,6 @@ def _holds(matches: OsmMatches, poses: Floats) -> Figure:
 def _dots(xy: Floats) -> Floats:
     """Points that are drawn without connecting lines."""
     return np.stack([xy, np.full_like(xy, np.nan)], axis=1).reshape(-1, 2)
-
-
-def _is_near(building: Building, way: Floats) -> bool:
-    low, high = way.min(axis=0) - DRAWN_M, way.max(axis=0) + DRAWN_M
-    return bool(((building.middle >= low) & (building.middle <= high)).all())
 
 
 def _seen_walls(sights: Sequence[KeyframeMatch], poses: Floats) -> Floats:

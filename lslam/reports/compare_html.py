@@ -1,8 +1,8 @@
-"""compare.html: one self-contained page about a comparison. No second file, no network; whole without its script."""
+"""Pages about several runs, of a comparison and of merged sessions: each one file, whole without its script."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -12,19 +12,19 @@ from urllib.parse import quote
 import numpy as np
 
 from lslam.core.errors import LslamError
-from lslam.core.types.arrays import Floats
+from lslam.core.printable import metres
+from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import ArrayCloud, thin_out
-from lslam.core.types.comparison import Comparison, Drawing, DrawnRun, RunScore
-from lslam.io.formats.atomic import atomic_write
+from lslam.core.types.comparison import Comparison, Drawing, DrawnRun, RunScore, Table
+from lslam.io.formats.atomic import write_text
 from lslam.io.formats.point_files import read_cloud
-from lslam.maps.floor_plan import top_view
+from lslam.maps.floor_plan import TopView, top_view
 from lslam.reports import svg
 from lslam.reports.compare_table import TITLES, recipes, stage_times, tables
-from lslam.reports.crops import Crop, choose_crops, crop_images
 from lslam.reports.html import flatten
-from lslam.reports.page_data import cloud_data, map_figure, ways_data
-from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure
-from lslam.reports.png import VIRIDIS, data_uri, density_png
+from lslam.reports.page_data import MapFigure, cloud_data, map_figure, pack, ways_data
+from lslam.reports.plots import DISTANCE, LIMIT_IN_VIEW, Figure, legend_of, line_figure
+from lslam.reports.png import VIRIDIS, Crop, choose_crops, crop_images, data_uri, density_png
 from lslam.reports.shell import MAP, render
 from lslam.reports.svg import Track, plane_chart
 
@@ -58,8 +58,7 @@ def write_page(
 
     Raises OutputError when it cannot be written.
     """
-    with atomic_write(path) as stream:
-        stream.write(render_page(path.parent, comparison, drawings, crop).encode("utf-8", "replace"))
+    write_text(path, render_page(path.parent, comparison, drawings, crop))
 
 
 def render_page(
@@ -123,10 +122,9 @@ def method_map(drawing: Drawing, methods: Sequence[str], clouds: Sequence[Floats
     if not known:
         return None
     method, points = known[0]
-    view, tracks = top_view(points), _tracks(drawing, methods)
+    view = top_view(points)
     about = f"{_sentence(f'seed {drawing.seed}, {drawing.recipe}')} Points: map of {method}."
-    legend = [(track.style, track.label) for track in tracks]
-    figure = map_figure(view.image, view.heights, view.extent, tracks, legend, about)
+    figure = _tracks_on_map(view, _tracks(drawing, methods), about)
     if figure is None:
         return None
     ways = [(run.method, style_of(run.method, methods), run.positions) for run in drawing.runs]
@@ -144,7 +142,7 @@ def _machine(comparison: Comparison) -> list[tuple[str, list[str]]]:
     found: dict[str, dict[str, None]] = {}
     for run in comparison.runs:
         for name, value in run.machine.items():
-            found.setdefault(name, {})[_text(value)] = None
+            found.setdefault(name, {})["absent" if value is None else str(value)] = None
     return [(name, list(values)) for name, values in found.items()]
 
 
@@ -160,10 +158,6 @@ def _configs(comparison: Comparison) -> list[tuple[str, list[str], bool]]:
     return sorted(rows, key=lambda row: not row[2])
 
 
-def _text(value: Any) -> str:
-    return "absent" if value is None else str(value)
-
-
 def style_of(method: str, methods: Sequence[str]) -> str:
     """Style sheet class of a method, the same everywhere on the page."""
     return f"s{methods.index(method) % STYLES + 1}"
@@ -171,18 +165,30 @@ def style_of(method: str, methods: Sequence[str]) -> str:
 
 def _tracks(drawing: Drawing, methods: Sequence[str]) -> list[Track]:
     """Trajectories of a drawing, ground truth last, dashed."""
-    tracks = [Track(run.method, run.positions[:, :2], style_of(run.method, methods)) for run in drawing.runs]
-    return (
-        tracks if drawing.gt_positions is None else [*tracks, Track("ground truth", drawing.gt_positions[:, :2], "gt")]
-    )
+    tracks = _named_tracks([run.method for run in drawing.runs], [run.positions for run in drawing.runs], methods)
+    truth = drawing.gt_positions
+    return tracks if truth is None else [*tracks, Track("ground truth", truth[:, :2], "gt")]
+
+
+def _named_tracks(names: Sequence[str], positions: Sequence[Floats], among: Sequence[str]) -> list[Track]:
+    return [Track(name, p[:, :2], style_of(name, among)) for name, p in zip(names, positions, strict=True)]
+
+
+def _tracks_on_map(view: TopView, tracks: list[Track], about: str) -> MapFigure | None:
+    return map_figure(view.image, view.heights, view.extent, tracks, legend_of(tracks), about)
+
+
+def _plan(title: str, tracks: list[Track], caption: str = "", spoken: str = "") -> Figure:
+    return Figure(title, plane_chart(tracks, spoken or title.lower()), legend_of(tracks), caption)
 
 
 def trajectory_figure(drawing: Drawing, methods: Sequence[str]) -> Figure:
     """All trajectories of a drawing from above, ground truth dashed."""
-    tracks = _tracks(drawing, methods)
-    chart = plane_chart(tracks, f"trajectories on {drawing.sequence} from above")
-    legend = tuple((track.style, track.label) for track in tracks)
-    return Figure("Trajectories from above", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
+    caption, spoken = (
+        _sentence(f"Seed {drawing.seed}, {drawing.recipe}"),
+        f"trajectories on {drawing.sequence} from above",
+    )
+    return _plan("Trajectories from above", _tracks(drawing, methods), caption, spoken)
 
 
 def error_figure(drawing: Drawing, methods: Sequence[str]) -> Figure | None:
@@ -194,14 +200,15 @@ def error_figure(drawing: Drawing, methods: Sequence[str]) -> Figure | None:
     ]
     if not lines:
         return None
-    legend = tuple((line.style, line.label) for line in lines)
     if not drawing.reference:
-        chart = svg.line_chart(lines, DISTANCE, "position error, m", f"position error on {drawing.sequence}")
-        return Figure("Position error", chart, legend, _sentence(f"Seed {drawing.seed}, {drawing.recipe}"))
+        caption, spoken = _sentence(f"Seed {drawing.seed}, {drawing.recipe}"), f"position error on {drawing.sequence}"
+        return line_figure("Position error", lines, DISTANCE, "position error, m", caption, spoken=spoken)
     title, along = f"Distance from {drawing.reference}", f"distance along {drawing.reference}, m"
-    chart = svg.line_chart(lines, along, "distance, m", f"{title} on {drawing.sequence}")
-    said = f"Seed {drawing.seed}. No ground truth: from the same start, how far each is from {drawing.reference}, which"
-    return Figure(title, chart, legend, f"{said} may be the one that is wrong.")
+    caption = (
+        f"Seed {drawing.seed}. No ground truth: from the same start, how far each is from {drawing.reference}, which may be "
+        "the one that is wrong."
+    )
+    return line_figure(title, lines, along, "distance, m", caption, spoken=f"{title} on {drawing.sequence}")
 
 
 def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
@@ -223,13 +230,8 @@ def time_figure(comparison: Comparison, sequence: str) -> Figure | None:
     )
     if any(run.jobs > 1 for run in runs):
         caption += " Marked ~: several runs shared the machine, so these times cannot be compared."
-    return Figure(
-        "Mean time per scan",
-        chart,
-        tuple((f"t{i % SHADES + 1}", name) for i, name in enumerate(stages)),
-        caption,
-        is_area=True,
-    )
+    legend = tuple((f"t{i % SHADES + 1}", name) for i, name in enumerate(stages))
+    return Figure("Mean time per scan", chart, legend, caption, is_area=True)
 
 
 def crop_figures(drawing: Drawing, crop: Crop | None, clouds: Sequence[Floats | None]) -> list[list[Figure]]:
@@ -266,12 +268,9 @@ def _cloud(run: DrawnRun) -> Floats | None:
 
 def _bar_label(method: str, runs: Sequence[RunScore]) -> str:
     mark = "~" if any(run.jobs > 1 for run in runs) else ""
-    mean, p95 = (_mean_of(runs, f"time.{name}") for name in ("mean", "p95"))
+    keys = ("time.mean", "time.p95")
+    mean, p95 = (float(np.mean([run.values[key] for run in runs if key in run.values])) for key in keys)
     return f"{method}: mean {mark}{mean:.1f} ms, p95 {mark}{p95:.1f}"
-
-
-def _mean_of(runs: Sequence[RunScore], key: str) -> float:
-    return float(np.mean([run.values[key] for run in runs if key in run.values]))
 
 
 def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], limit: float, title: str) -> str:
@@ -316,3 +315,70 @@ def _bars(bars: Sequence[tuple[str, dict[str, float]]], stages: Sequence[str], l
 
 def _sentence(text: str) -> str:
     return f"{text[0].upper()}{text[1:]}."
+
+
+SESSION_RECIPE = "ATE of each session by itself, se3, m rmse; found by keyframes that agree, of those tried."
+
+
+@dataclass(frozen=True)
+class SessionView:
+    """One session in the common world.
+
+    Positions (N, 3), m, as it was connected to the others and after the pose graph; numbers (N,) of its scans.
+    """
+
+    name: str
+    before: Floats
+    after: Floats
+    scans: Longs
+
+
+def write_merge_page(
+    path: Path,
+    sessions: Sequence[SessionView],
+    rows: Sequence[Mapping[str, Any]],
+    problems: Sequence[str],
+    ties: Floats,
+    view: TopView | None,
+    sample: ArrayCloud | None,
+) -> None:
+    """Write the page atomically; raises OutputError when it cannot be written.
+
+    rows : of the manifest's `sessions`; view, sample : of the merged map, from above and some of its points
+    ties : (K, 2, 3) m, both ends of each loop between two sessions
+    """
+    names = [s.name for s in sessions]
+    before, after = ([getattr(s, when) for s in sessions] for when in ("before", "after"))
+    tracks, known = _named_tracks(names, after, names), "Each session moved as a whole to where it was found."
+    shown = None if view is None else _tracks_on_map(view, tracks, f"World of {names[0]}.")
+    figures = [] if shown else [_plan("After the pose graph, from above", tracks)]
+    figures.append(_plan("Before the pose graph, from above", _named_tracks(names, before, names), known))
+    styles = [(name, style_of(name, names)) for name in names]
+    ways = [(*style, positions) for style, positions in zip(styles, after, strict=True)]
+    sessions_data = ways_data(ways, [s.scans for s in sessions], before)
+    page = render(
+        "merge.html.j2",
+        MAP,
+        names=names,
+        problems=problems,
+        figures=figures,
+        styles=styles,
+        table=_session_table(rows),
+        sessions_data={"sessions": sessions_data, "ties": pack(ties, "<f4"), "tied": len(ties)},
+        map_figure=shown,
+        map_extent=None if view is None else view.extent,
+        map_note="",
+        cloud_data=cloud_data(sample, sessions=after),
+        colours=VIRIDIS,
+    )
+    write_text(path, page)
+
+
+def _session_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    header = ("session", "scans", "keyframes", "found by", "loops with others", "ATE alone, m", "ATE merged, m")
+    texts = []
+    for row in rows:
+        found = f"{row['votes']} of {row['tried']}" if row["tried"] else "gives the world"
+        errors = ("" if error is None else metres(error) for error in row["ate"] or (None, None))
+        texts.append((row["name"], str(row["scans"]), str(row["keyframes"]), found, str(row["loops_between"]), *errors))
+    return Table("Sessions", header, tuple(texts), SESSION_RECIPE)

@@ -11,10 +11,10 @@ from typing import Any
 
 from lslam.core import __version__
 from lslam.core.printable import count_of, metres, with_decimals
-from lslam.core.types.comparison import Comparison, Metric, RunScore, SeedStatistics, SummaryRow
+from lslam.core.types.comparison import Comparison, Metric, RunScore, SummaryRow
 from lslam.io.formats.atomic import write_text
 from lslam.reports.evaluations import strict
-from lslam.reports.text import Grid, aligned, comma_separated, latex, markdown
+from lslam.reports.text import Grid, csv_table, latex, markdown, text_table
 
 STYLES = ("md", "csv", "tex")
 TITLES = {"error": "errors", "time": "mean time per scan", "health": "scans and runs"}
@@ -39,14 +39,14 @@ class CompareTable:
         return [list(self.header), *(list(row) for row in self.rows)]
 
     @property
-    def folded(self) -> tuple[str, ...]:
+    def header_lines(self) -> tuple[str, ...]:
         """Header split into several lines: units and long lists below."""
         return tuple(name.replace(", ", "\n").replace("/", "/\n") for name in self.header)
 
     @property
     def width(self) -> int:
         """Width in characters on a terminal, with the folded header and three spaces between columns."""
-        heads = [max(len(line) for line in name.split("\n")) for name in self.folded]
+        heads = [max(len(line) for line in name.split("\n")) for name in self.header_lines]
         cells = [max((len(row[k]) for row in self.rows), default=0) for k in range(len(self.header))]
         return sum(max(pair) + 3 for pair in zip(heads, cells, strict=True))
 
@@ -63,14 +63,10 @@ def tables(comparison: Comparison, width: int | None = None) -> list[CompareTabl
         out = [_methods_table(comparison, groups, title) for groups, title in zip(split, titles, strict=True)]
         if width is None or all(table.width <= width for table in out):
             break
-    return [
-        *(CompareTable(t.title, t.header, t.rows, 2) for t in comparison.beside if t.rows),
-        *out,
-    ] + [
-        table
-        for table in (_pairs(comparison), _differences(comparison), _doubts(comparison), _failures(comparison))
-        if table.rows
-    ]
+    doubts = _runs_table(comparison.degraded, "degraded: part of it is doubted", "sequence", "method", "seed", "reason")
+    failures = _runs_table(comparison.failed, "failed", "sequence", "method", "seed", "status", "reason")
+    out = [*(CompareTable(t.title, t.header, t.rows, 2) for t in comparison.beside if t.rows), *out]
+    return out + [t for t in (_pairs(comparison), _differences(comparison), doubts, failures) if t.rows]
 
 
 def stage_times(comparison: Comparison) -> tuple[Comparison, CompareTable]:
@@ -106,7 +102,7 @@ def recipes(comparison: Comparison) -> list[str]:
 def render(comparison: Comparison, style: str = "text") -> str:
     """All tables as text; `style` is `text` or one of STYLES. Ends without a line break. Raises ValueError otherwise."""
     if style == "csv":
-        return comma_separated(_runs_grid(comparison))
+        return csv_table(_runs_grid(comparison))
     parts = as_text(tables(comparison), style)
     prefix = {"text": "  ", "md": "- ", "tex": "% "}[style]
     parts += ["\n".join(prefix + note for note in comparison.notes)] if comparison.notes else []
@@ -114,14 +110,14 @@ def render(comparison: Comparison, style: str = "text") -> str:
     return "\n\n".join(parts)
 
 
-def as_text(shown: Sequence[CompareTable], style: str) -> list[str]:
+def as_text(contents: Sequence[CompareTable], style: str) -> list[str]:
     """One text per table under its title; `style` is `text`, `md` or `tex`. Raises ValueError otherwise."""
-    writers: dict[str, Callable[[Grid, int], str]] = {"text": aligned, "md": markdown, "tex": latex}
+    writers: dict[str, Callable[[Grid, int], str]] = {"text": text_table, "md": markdown, "tex": latex}
     if style not in writers:
         raise ValueError(f"table style {style!r}: text or one of {', '.join(STYLES)}")
     title = {"text": "{}", "md": "### {}\n", "tex": "% {}"}[style]
     parts = []
-    for table in shown:
+    for table in contents:
         text = writers[style](table.grid, table.names)
         parts.append(f"{title.format(table.title)}\n{text}" if table.title else text)
     return parts
@@ -134,7 +130,7 @@ def write_files(out: Path, comparison: Comparison) -> None:
     if comparison.beside:
         shown = [CompareTable(t.title, t.header, t.rows, 2) for t in comparison.beside]
         write_text(out / "beside.md", "\n\n".join(as_text(shown, "md")) + "\n")
-        write_text(out / "beside.csv", "\n\n".join(comma_separated(table.grid) for table in shown) + "\n")
+        write_text(out / "beside.csv", "\n\n".join(csv_table(table.grid) for table in shown) + "\n")
 
 
 def _methods_table(comparison: Comparison, groups: Sequence[str], title: str) -> CompareTable:
@@ -160,15 +156,12 @@ def _cell(metric: Metric, row: SummaryRow) -> str:
     if value is None:
         return "-"
     if metric.group == "error":
-        text = _with_spread(metres(value.mean) if metric.unit == "m" else with_decimals(value.mean, 3), value)
+        text = metres(value.mean) if metric.unit == "m" else with_decimals(value.mean, 3)
+        # The standard deviation over seeds, with equal decimals.
+        text += "" if value.n < 2 else f" ± {with_decimals(value.std, len(text.partition('.')[2]))}"
     else:
         text = f"{value.mean:.1f}"
     return text if metric.group != "time" or row.is_timed_alone else f"~{text}"
-
-
-def _with_spread(mean: str, value: SeedStatistics) -> str:
-    """Text of the mean with the standard deviation over seeds, with equal decimals."""
-    return mean if value.n < 2 else f"{mean} ± {with_decimals(value.std, len(mean.partition('.')[2]))}"
 
 
 def _health(row: SummaryRow) -> str:
@@ -211,16 +204,11 @@ def _differences(comparison: Comparison) -> CompareTable:
     return CompareTable("distance between trajectories, without ground truth", header, tuple(rows), 3)
 
 
-def _doubts(comparison: Comparison) -> CompareTable:
-    rows = tuple((r.sequence, r.method, str(r.seed), r.reason) for r in comparison.degraded)
-    title = f"{count_of(len(rows), 'run')} degraded: part of it is doubted"
-    return CompareTable(title, ("sequence", "method", "seed", "reason"), rows, 4)
-
-
-def _failures(comparison: Comparison) -> CompareTable:
-    rows = tuple((r.sequence, r.method, str(r.seed), r.status, r.reason) for r in comparison.failed)
-    title = f"{count_of(len(rows), 'run')} failed"
-    return CompareTable(title, ("sequence", "method", "seed", "outcome", "reason"), rows, 5)
+def _runs_table(runs: Sequence[RunScore], what: str, *names: str) -> CompareTable:
+    """These fields of some runs."""
+    rows = tuple(tuple(str(getattr(run, name)) for name in names) for run in runs)
+    header = tuple("outcome" if name == "status" else name for name in names)
+    return CompareTable(f"{count_of(len(rows), 'run')} {what}", header, rows, len(names))
 
 
 def _runs_grid(comparison: Comparison) -> Grid:

@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from typing import Any
 
 from lslam.core import __version__
@@ -18,7 +19,7 @@ from lslam.core.types.run_record import Crispness, RunRecord
 from lslam.evaluation.evaluate import METRICS, shown_metrics
 from lslam.evaluation.metric import Evaluation, MetricRow
 from lslam.evaluation.timing import StageTime, Timing
-from lslam.reports.text import comma_separated, latex, markdown
+from lslam.reports.text import csv_table, latex, markdown, text_table
 
 SCHEMA, VERSION = "lslam-evaluation", 1
 Document = dict[str, Any]
@@ -76,8 +77,7 @@ def crispness_document(score: Crispness) -> Document:
 
 def to_json(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] = ()) -> str:
     """One JSON object: the document of one evaluation, or a list of them under `evaluations`."""
-    padded = [*timings, *[None] * (len(evaluations) - len(timings))]
-    documents = [to_document(e, t) for e, t in zip(evaluations, padded, strict=True)]
+    documents = [to_document(e, t) for e, t in zip_longest(evaluations, timings)]
     whole = documents[0] if len(documents) == 1 else {"schema": SCHEMA, "version": VERSION, "evaluations": documents}
     return json.dumps(whole, indent=2, allow_nan=False)
 
@@ -98,30 +98,22 @@ def render(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None] =
 
     Raises ValueError for an unknown style.
     """
-    padded = [*timings, *[None] * (len(evaluations) - len(timings))]
-    rows = _rows(evaluations, padded)
+    rows = [row for metric in shown_metrics(evaluations[0]) for row in metric.rows(evaluations)]
+    if any(timings):
+        rows += _timing_rows([*timings, *[None] * (len(evaluations) - len(timings))])
     names = short_names([e.estimate for e in evaluations])
     if style == "text":
         return "\n".join([*_head(evaluations, names), "", *_text(rows, names), "", *_recipes(evaluations)])
-    grid = [["metric", "unit", *names], *([_in_full(row), row.unit, *row.cells] for row in rows)]
-    writers: dict[str, Callable[[list[list[str]], int], str]] = {"md": markdown, "csv": comma_separated, "tex": latex}
+    labels = [f"{row.under}, {row.label}" if row.under else row.label for row in rows]
+    body = [[label, row.unit, *row.cells] for label, row in zip(labels, rows, strict=True)]
+    grid = [["metric", "unit", *names], *body]
+    writers: dict[str, Callable[[list[list[str]], int], str]] = {"md": markdown, "csv": csv_table, "tex": latex}
     if style not in writers:
         raise ValueError(f"table style {style!r}: one of {', '.join(STYLES)}")
     table = writers[style](grid, 2)
     # A CSV is for programs, which have no use for sentences; --json holds values and recipes.
     how = {"md": "- {}", "tex": "% {}"}.get(style)
     return "\n".join([table, "", *(how.format(line.strip()) for line in _recipes(evaluations)[1:])]) if how else table
-
-
-def _rows(evaluations: Sequence[Evaluation], timings: Sequence[Timing | None]) -> list[MetricRow]:
-    """All rows of the table, one cell per estimate."""
-    rows = [row for metric in shown_metrics(evaluations[0]) for row in metric.rows(evaluations)]
-    return rows + _timing_rows(timings) if any(timings) else rows
-
-
-def _in_full(row: MetricRow) -> str:
-    """Label of a row with the name of the row that it belongs to."""
-    return f"{row.under}, {row.label}" if row.under else row.label
 
 
 def _timing_rows(timings: Sequence[Timing | None]) -> list[MetricRow]:
@@ -157,17 +149,9 @@ def _recipes(evaluations: Sequence[Evaluation]) -> list[str]:
 
 
 def _text(rows: list[MetricRow], names: list[str]) -> list[str]:
-    labels = [f"  {row.label}" if row.under else row.label for row in rows]
-    label, unit = max(map(len, labels)), max(len(row.unit) for row in rows)
-    widths = [max(len(name), *(len(row.cells[k]) for row in rows)) for k, name in enumerate(names)]
-
-    def line(a: str, b: str, cells: list[str]) -> str:
-        return (
-            f"{a:<{label}}  {b:<{unit}}  {'  '.join(f'{c:>{w}}' for c, w in zip(cells, widths, strict=True))}".rstrip()
-        )
-
-    head = [line("", "", names)] if len(names) > 1 else []
-    return [*head, *(line(text, row.unit, row.cells) for text, row in zip(labels, rows, strict=True))]
+    grid = [[f"  {row.label}" if row.under else row.label, row.unit, *row.cells] for row in rows]
+    lines = text_table([["", "", *names], *grid], 2).split("\n")
+    return lines if len(names) > 1 else lines[1:]
 
 
 def short_names(names: list[str]) -> list[str]:

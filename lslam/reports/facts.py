@@ -1,37 +1,29 @@
-"""Numbers and sentences about a run from its record, for the summary on stdout and the HTML report."""
+"""Numbers and sentences about a run from its record, for the summary on stdout and the HTML report.
+
+The tiles of its page are six numbers at most that somebody acts on. Everything else stands in the sections below.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lslam.core.geometry import se3
+from lslam.core.printable import count_of, metres
 from lslam.core.types.arrays import Floats
 from lslam.core.types.run_record import RunRecord
 from lslam.core.types.scan_result import ScanResult
+from lslam.evaluation.evaluate import shown_metrics
 from lslam.evaluation.timing import StageTime, summarise
 
+if TYPE_CHECKING:
+    from lslam.evaluation.metric import Evaluation
+
 DIRECTIONS = ("along x", "along y", "along z", "about x", "about y", "about z")
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A scan that was bridged or skipped, and the reason."""
-
-    index: int
-    status: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Degeneracy:
-    """A pose with directions that the scan did not constrain."""
-
-    index: int
-    directions: str
 
 
 @dataclass(frozen=True)
@@ -41,6 +33,7 @@ class RunFacts:
     status : the manifest's word: `done`, `degraded`, `diverged`, `interrupted`, `failed`; reasons : why, one sentence each
     registered, bridged, skipped : scans that were registered, followed the motion prior, could not be read
     standing : scans of a sensor at rest, registered or not
+    failures : scans that were bridged or skipped; degenerate : index of each pose with directions that its scan did not constrain
     stand_ins : number of scans by fallback that posed them in place of the method, in order of first use
     path_length : m; duration : s between the first and the last pose
     stages : in the order they ran; total : the sum of stages per scan
@@ -55,8 +48,8 @@ class RunFacts:
     bridged: int
     skipped: int
     standing: int
-    failures: tuple[Failure, ...]
-    degenerate: tuple[Degeneracy, ...]
+    failures: tuple[ScanResult, ...]
+    degenerate: tuple[tuple[int, str], ...]
     stand_ins: dict[str, int]
     path_length: float
     duration: float
@@ -84,9 +77,10 @@ def run_facts(record: RunRecord) -> RunFacts:
     totals = seconds.sum(1)
     limit = record.real_time_limit
     spent = float(totals.sum())
-    failures = tuple(Failure(r.index, r.status, r.reason) for r in results if r.status != "ok")
-    degenerate = tuple(Degeneracy(r.index, describe(r.degenerate)) for r in results if len(r.degenerate))
+    failures = tuple(r for r in results if r.status != "ok")
+    degenerate = tuple((r.index, describe(r.degenerate)) for r in results if len(r.degenerate))
     status, reasons = _status(record, bool(failures))
+    steps = np.linalg.norm(np.diff(record.trajectory.positions, axis=0), axis=1)
     return RunFacts(
         status=status,
         reasons=reasons,
@@ -98,7 +92,7 @@ def run_facts(record: RunRecord) -> RunFacts:
         failures=failures,
         degenerate=degenerate,
         stand_ins=dict(Counter(who for r in results if (who := r.poser(record.method)) != record.method)),
-        path_length=_path_length(record),
+        path_length=float(steps[np.isfinite(steps)].sum()),
         duration=float(record.trajectory.stamps_ns[-1] - record.trajectory.stamps_ns[0]) * 1e-9
         if len(record.trajectory)
         else 0.0,
@@ -131,7 +125,7 @@ def describe(degenerate: NDArray[Any]) -> str:
     return ", ".join(DIRECTIONS[int(np.argmax(np.abs(twist)))] for twist in np.asarray(degenerate))
 
 
-def _status(record: RunRecord, failed: bool) -> tuple[str, tuple[str, ...]]:
+def _status(record: RunRecord, has_failures: bool) -> tuple[str, tuple[str, ...]]:
     """Status in the manifest, else derived from the record."""
     reasons = [str(problem) for problem in record.problems]
     more = record.manifest.get("problems")
@@ -141,10 +135,71 @@ def _status(record: RunRecord, failed: bool) -> tuple[str, tuple[str, ...]]:
         reasons.append(str(record.manifest["why"]))
     word = record.manifest.get("status")
     if not isinstance(word, str) or not word:
-        word = "degraded" if failed or reasons else "done"
+        word = "degraded" if has_failures or reasons else "done"
     return word, tuple(dict.fromkeys(reasons))
 
 
-def _path_length(record: RunRecord) -> float:
-    steps = np.linalg.norm(np.diff(record.trajectory.positions, axis=0), axis=1)
-    return float(steps[np.isfinite(steps)].sum())
+@dataclass(frozen=True)
+class Card:
+    """A headline number."""
+
+    value: str
+    unit: str
+    name: str
+
+
+def run_cards(record: RunRecord, facts: RunFacts, evaluation: Evaluation | None) -> list[Card]:
+    """Status of registration, path, error, doubtful scans, speed: those that are known."""
+    held = sum(fix.is_binding for fix in record.map_fixes)
+    registered = (
+        Card(f"{held}/{len(record.map_fixes)}", "", "scans held by the map")
+        if record.map_fixes
+        else Card(f"{facts.registered}/{facts.scans}", "", "scans registered")
+    )
+    doubtful = sum(r.status != "ok" or r.may_be_elsewhere or len(r.degenerate) > 0 for r in record.results)
+    cards = [registered, Card(f"{facts.path_length:.1f}", "m", f"path in {facts.duration:.1f} s")]
+    cards += _error_card(record, evaluation)
+    share = 100 * doubtful / max(facts.scans, 1)
+    cards.append(Card(f"{share:.1f}", "%", "scans bridged, skipped or degenerate"))
+    if facts.real_time_factor:
+        cards.append(Card(f"{facts.real_time_factor:.1f}", "×", "real time"))
+    return cards
+
+
+def _error_card(record: RunRecord, evaluation: Evaluation | None) -> list[Card]:
+    """The first number against ground truth; without, what the run was checked by; empty where nothing checks it."""
+    if evaluation is not None:
+        scores = [Card(*card) for metric in shown_metrics(evaluation) for card in metric.cards(evaluation)]
+        return scores[:1]
+    control = record.manifest.get("graph", {}).get("control_points")
+    if control is not None:
+        name = f"rms at {count_of(control['count'], 'control point')}, horizontally"
+        return [Card(metres(control["rms_horizontal_m"]), "m", name)]
+    moves = [fix.innovation[0] for fix in record.map_fixes if fix.is_binding]
+    if moves:
+        return [Card(metres(float(np.median(moves))), "m", "correction by the map a scan, median")]
+    residuals = loop_residuals(record)
+    if len(residuals):
+        return [Card(metres(float(np.median(residuals))), "m", f"left at {count_of(len(residuals), 'loop')}, median")]
+    return []
+
+
+def loop_residuals(record: RunRecord) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """(K,) m between where the final poses have the far end of each closed loop and where its registration put it."""
+    left = []
+    for loop in record.loops:
+        if loop.is_accepted and loop.constraint is not None:
+            a, b = record.trajectory.poses[record.keyframe_scans[[loop.constraint.a, loop.constraint.b]]]
+            left.append(float(np.linalg.norm((se3.relative(a, b) - loop.constraint.T_a_b)[:3, 3])))
+    return np.array(left)
+
+
+def map_cards(record: RunRecord) -> list[Card]:
+    """How sharp the run's own map is; of a drive in an old map, what differs there."""
+    found = record.manifest.get("localization", {}).get("differences")
+    if found is not None and "map" not in record.manifest:
+        return [Card(f"{found['gone']} + {found['not_in_the_map']}", "", "things gone + not in the map")]
+    crispness = record.crispness
+    if crispness is None or crispness.plane_variance is None:
+        return []
+    return [Card(f"{100 * crispness.plane_variance**0.5:.1f}", "cm", "thickness of planes in the map")]

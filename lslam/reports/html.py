@@ -13,18 +13,22 @@ from lslam.core.printable import count_of
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.comparison import Table
 from lslam.core.types.imu import XYZ
-from lslam.core.types.run_record import Crispness, RunRecord
+from lslam.core.types.run_record import RunRecord
 from lslam.evaluation.evaluate import shown_metrics
-from lslam.io.formats.atomic import atomic_write
+from lslam.io.formats.atomic import write_text
 from lslam.reports import plots, svg
-from lslam.reports.back_end import back_end_figures, back_end_rows
+from lslam.reports.back_end import (
+    WORDS,
+    back_end_figures,
+    back_end_rows,
+    changed_dots,
+    localization_figures,
+    localization_tracks,
+)
 from lslam.reports.buildings import building_pages
-from lslam.reports.candidates import candidate_data
-from lslam.reports.cards import map_cards, run_cards
-from lslam.reports.facts import run_facts
-from lslam.reports.localization import WORDS, changed_dots, localization_figures, localization_tracks
-from lslam.reports.page_data import MapFigure, cloud_data, feature_figures, map_figure, scan_data
-from lslam.reports.plots import Figure
+from lslam.reports.facts import map_cards, run_cards, run_facts
+from lslam.reports.page_data import MapFigure, candidate_data, cloud_data, feature_figures, map_figure, scan_data
+from lslam.reports.plots import Figure, line_figure, numbered_lines
 from lslam.reports.png import VIRIDIS
 from lslam.reports.shell import RUN, render, template
 from lslam.reports.svg import Track
@@ -76,15 +80,11 @@ def imu_figures(record: RunRecord) -> list[Figure]:
 
 
 def _course(course: _Course, seconds: Floats, values: Floats, sigmas: Floats) -> Figure:
-    lines, bands = [], []
-    for k, name in enumerate(course.names):
-        style = f"s{k + 1}"
-        lines.append(svg.Line(name, seconds, values[:, k], style))
-        reach = BAND_SIGMAS * sigmas[:, k]
-        bands.append(svg.Band(seconds, values[:, k] - reach, values[:, k] + reach, style))
-    chart = svg.line_chart(lines, TIME, course.y_label, course.title, zero=False, bands=bands, by="time")
-    legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
-    return Figure(course.title, chart, legend, f"{course.recipe} Band: {BAND_SIGMAS:g} sigma.".strip())
+    lines, reach = numbered_lines(course.names, seconds, values.T), BAND_SIGMAS * sigmas.T
+    bands = [svg.Band(line.x, line.y - r, line.y + r, line.style) for line, r in zip(lines, reach, strict=True)]
+    caption, legend = f"{course.recipe} Band: {BAND_SIGMAS:g} sigma.".strip(), None if len(lines) > 1 else ()
+    chart: dict[str, Any] = {"zero": False, "bands": bands, "by": "time"}
+    return line_figure(course.title, lines, TIME, course.y_label, caption, legend=legend, **chart)
 
 
 def _readings(record: RunRecord) -> list[Figure]:
@@ -96,15 +96,13 @@ def _readings(record: RunRecord) -> list[Figure]:
     during = (imu.stamps_ns >= first) & (imu.stamps_ns <= last)
     seconds = _seconds(imu.stamps_ns[during], record)
     recipe = "As recorded, in IMU axes; of a long recording the least and the largest of each stretch."
-    figures = []
-    for title, y_label, values in (
-        ("Specific force", "as recorded (m/s² if it is right)", imu.accel[during]),
-        ("Angular rate", "as recorded (rad/s if it is right)", imu.gyro[during]),
-    ):
-        lines = [svg.Line(name, seconds, values[:, k], f"s{k + 1}") for k, name in enumerate(XYZ)]
-        chart = svg.line_chart(lines, TIME, y_label, title, by="time")
-        figures.append(Figure(title, chart, tuple((line.style, line.label) for line in lines), recipe))
-    return figures
+    return [
+        line_figure(title, numbered_lines(XYZ, seconds, values.T), TIME, y_label, recipe, by="time")
+        for title, y_label, values in (
+            ("Specific force", "as recorded (m/s² if it is right)", imu.accel[during]),
+            ("Angular rate", "as recorded (rad/s if it is right)", imu.gyro[during]),
+        )
+    ]
 
 
 def _seconds(stamps_ns: Longs, record: RunRecord) -> Floats:
@@ -128,14 +126,14 @@ def write_report(path: Path, record: RunRecord, evaluation: Evaluation | None) -
     ------
     OutputError : the file cannot be written
     """
-    page = render_report(record, evaluation).encode("utf-8", "replace")
-    with atomic_write(path) as stream:
-        stream.write(page)
+    write_text(path, render_report(record, evaluation))
 
 
 def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
     """Report page as text."""
-    facts = run_facts(record)
+    facts, tables = run_facts(record), list[Table]()
+    if evaluation is not None:
+        tables = [table for metric in shown_metrics(evaluation) for table in metric.tables(evaluation)]
     return render(
         "report.html.j2",
         RUN,
@@ -154,7 +152,7 @@ def render_report(record: RunRecord, evaluation: Evaluation | None) -> str:
         back_end_title="In the map" if record.map_fixes else "Pose graph",
         back_end_said=localization_rows(record, evaluation) + back_end_rows(record, evaluation),
         errors=plots.error_figures(evaluation) if evaluation is not None else [],
-        tables=[] if evaluation is None else _metric_tables(evaluation),
+        tables=[table for table in tables if table.rows],
         buildings=building_pages(record),
         time=plots.time_figure(record, facts) if facts.stages else None,
         share_bar=plots.share_bar(facts) if facts.stages else "",
@@ -186,7 +184,9 @@ def _map_figure(record: RunRecord) -> MapFigure | None:
     if record.map_image is None:
         return None
     tracks, legend = [Track("trajectory", record.trajectory.positions[:, :2], "s2", ends=True)], [("s2", "trajectory")]
-    about = f"World of the estimate.{_entropy(record.crispness)}"
+    about, score = "World of the estimate.", record.crispness
+    if score is not None and score.entropy is not None:
+        about += f" Map entropy {score.entropy:.2f}: lower is crisper."
     if record.map_fixes:
         tracks, legend = localization_tracks(record)
         tracks.append(Track("ends", record.trajectory.positions[:, :2], "none", ends=True))
@@ -197,10 +197,6 @@ def _map_figure(record: RunRecord) -> MapFigure | None:
     return map_figure(
         record.map_image, record.map_heights, record.map_extent, tracks, legend, about, by="own", dots=dots
     )
-
-
-def _entropy(score: Crispness | None) -> str:
-    return "" if score is None or score.entropy is None else f" Map entropy {score.entropy:.2f}: lower is crisper."
 
 
 def flatten(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, list[str]]]:
@@ -241,19 +237,14 @@ def _map_note(manifest: Mapping[str, Any]) -> str:
     return f"{built.get('file')}, built anew after the run with {points}{said}"
 
 
-def _differences_note(found: Mapping[str, Any]) -> str:
+def _differences_note(differences: Mapping[str, Any]) -> str:
     """What differs between drive and map, in words."""
-    new, gone = count_of(found["not_in_the_map"], "thing"), count_of(found["gone"], "thing")
+    new, gone = count_of(differences["not_in_the_map"], "thing"), count_of(differences["gone"], "thing")
     return (
         f"Against the map: {gone} gone, that beams passed through, and {new} not in it, new or hidden when it was made; by "
-        f"the scans that the map holds, in cells of {found['voxel_m']:g} m. lslam map --changes compares both drives by all "
-        "their beams."
+        f"the scans that the map holds, in cells of {differences['voxel_m']:g} m. lslam map --changes compares both drives by "
+        "all their beams."
     )
-
-
-def _metric_tables(evaluation: Evaluation) -> list[Table]:
-    tables = [table for metric in shown_metrics(evaluation) for table in metric.tables(evaluation)]
-    return [table for table in tables if table.rows]
 
 
 def _config_text(folder: Path | None) -> str:

@@ -1,4 +1,7 @@
-"""Data for a page's script: all scans, map points, several trajectories; and the map's image. Numbers are base64."""
+"""Data for a page's script: all scans, map points, several trajectories, loop candidates; and the map's image.
+
+Numbers are base64. Of a candidate: where it was, what was decided and why, and what both scans look like.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,14 @@ from numpy.typing import NDArray
 from lslam.core.geometry import se3, so3
 from lslam.core.types.arrays import Floats, Longs
 from lslam.core.types.cloud import ArrayCloud
-from lslam.core.types.run_record import FeatureView, RunRecord
+from lslam.core.types.constraint import LoopCandidate, LoopStage
+from lslam.core.types.run_record import FeatureView, PairView, RunRecord
 from lslam.core.types.scan_result import ScanResult
 from lslam.core.types.trajectory import Trajectory
-from lslam.reports import svg
-from lslam.reports.crops import Crop, crop_images
-from lslam.reports.localization import STATES, state_codes
-from lslam.reports.plots import Figure, first_available
-from lslam.reports.png import VIRIDIS, coloured_png, data_uri, density_png, halved, usual_range
+from lslam.maps.colour import CHANNELS
+from lslam.reports.back_end import STATES, state_codes
+from lslam.reports.plots import Figure, first_available, line_figure, numbered_lines
+from lslam.reports.png import VIRIDIS, Crop, coloured_png, crop_images, data_uri, density_png, halve, usual_range
 from lslam.reports.svg import MOST_POINTS, By, Track, plane_chart
 
 if TYPE_CHECKING:
@@ -52,15 +55,15 @@ def scan_data(record: RunRecord, evaluation: Evaluation | None) -> dict[str, Any
     data: dict[str, Any] = {
         "count": len(trajectory),
         "first_stamp_ns": str(int(trajectory.stamps_ns[0])),
-        "stamps": packed(trajectory.stamps_ns - trajectory.stamps_ns[0], "<f8"),
-        "index": packed(np.array([-1 if r is None else r.index for r in results]), "<i4"),
-        "positions": packed(trajectory.positions, "<f4"),
-        "angles": packed(_angles_deg(trajectory.poses), "<f4"),
-        "way": packed(trajectory.path_lengths, "<f4"),
-        "status": packed(np.array([_status(r) for r in results]), "u1"),
+        "stamps": pack(trajectory.stamps_ns - trajectory.stamps_ns[0], "<f8"),
+        "index": pack(np.array([-1 if r is None else r.index for r in results]), "<i4"),
+        "positions": pack(trajectory.positions, "<f4"),
+        "angles": pack(_angles_deg(trajectory.poses), "<f4"),
+        "way": pack(trajectory.path_lengths, "<f4"),
+        "status": pack(np.array([_status(r) for r in results]), "u1"),
         "statuses": STATUSES,
         "flags": FLAGS,
-        "posed_by": packed(np.array([names.index(who) if who else len(names) for who in posers]), "u1"),
+        "posed_by": pack(np.array([names.index(who) if who else len(names) for who in posers]), "u1"),
         "posers": names,
         "reasons": {
             str(k): r.reason[:LONGEST_REASON] for k, r in enumerate(results) if r is not None and r.status != "ok"
@@ -75,7 +78,7 @@ def _against_map(record: RunRecord) -> dict[str, Any]:
     """State of each scan against the map that the run was located in; empty without one."""
     if not record.map_fixes:
         return {}
-    return {"fixes": packed(state_codes(record), "u1"), "states": [list(state) for state in STATES.values()]}
+    return {"fixes": pack(state_codes(record), "u1"), "states": [list(state) for state in STATES.values()]}
 
 
 def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
@@ -89,10 +92,10 @@ def _truth(trajectory: Trajectory, evaluation: Evaluation) -> dict[str, Any]:
     some = evaluation.gt_positions[:: -(-len(evaluation.gt_positions) // MOST_TRUTH)]
     return {
         "alignment": absolute.alignment,
-        "error": packed(error, "<f4"),
-        "truth_way": packed(way, "<f4"),
+        "error": pack(error, "<f4"),
+        "truth_way": pack(way, "<f4"),
         "aligned": np.column_stack([absolute.scale * T[:3, :3], T[:3, 3]]).tolist(),
-        "truth": packed(se3.apply(se3.inverse(T), some) / absolute.scale, "<f4"),
+        "truth": pack(se3.apply(se3.inverse(T), some) / absolute.scale, "<f4"),
     }
 
 
@@ -125,19 +128,19 @@ def cloud_data(
     if cloud.intensity is not None and np.ptp(cloud.intensity[order]) > 0:
         values = cloud.intensity[order].astype(np.float64)
         least, most = usual_range(values, 0.1)
-        data["intensity"] = packed(np.rint(255 * np.clip((values - least) / (most - least), 0, 1)), "u1")
+        data["intensity"] = pack(np.rint(255 * np.clip((values - least) / (most - least), 0, 1)), "u1")
         data["values"] = [least, most]
     if "red" in cloud.columns:
-        data["rgb"] = packed(np.column_stack([cloud.columns[name][order] for name in ("red", "green", "blue")]), "u1")
+        data["rgb"] = pack(np.column_stack([cloud.columns[name][order] for name in CHANNELS]), "u1")
     if "class" in cloud.columns:
         data |= _kinds(cloud.columns["class"][order])
     if "change" in cloud.columns and cloud.columns["change"].any():
-        data["change"] = packed(cloud.columns["change"][order], "i1")
+        data["change"] = pack(cloud.columns["change"][order], "i1")
     if trajectory is not None and len(trajectory):
-        data["nearest"] = packed(_nearest(points, trajectory.positions), "<u2" if len(trajectory) <= QUANTA else "<u4")
+        data["nearest"] = pack(_nearest(points, trajectory.positions), "<u2" if len(trajectory) <= QUANTA else "<u4")
     if sessions:
         owner = np.repeat(np.arange(len(sessions)), [len(positions) for positions in sessions])
-        data["session"] = packed(owner[_nearest(points, np.concatenate(sessions))], "u1")
+        data["session"] = pack(owner[_nearest(points, np.concatenate(sessions))], "u1")
     return data
 
 
@@ -147,7 +150,7 @@ def pack_points(points: NDArray[np.floating]) -> dict[str, Any]:
     low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.zeros(3))
     step = np.maximum((high - low) / QUANTA, 1e-6)
     quanta = np.rint((points - low) / step) - (QUANTA + 1) // 2
-    return {"count": len(points), "points": packed(quanta, "<i2"), "low": low.tolist(), "step": step.tolist()}
+    return {"count": len(points), "points": pack(quanta, "<i2"), "low": low.tolist(), "step": step.tolist()}
 
 
 def _spacing(points: Floats) -> float:
@@ -168,7 +171,7 @@ def _kinds(labels: NDArray[Any]) -> dict[str, Any]:
     names = [str(label) for label in known[np.argsort(rank)]]
     if len(names) > MOST_KINDS:
         names = [*names[: MOST_KINDS - 1], "others"]
-    return {"kind": packed(np.minimum(rank, MOST_KINDS - 1)[which], "u1"), "kinds": names}
+    return {"kind": pack(np.minimum(rank, MOST_KINDS - 1)[which], "u1"), "kinds": names}
 
 
 def ways_data(
@@ -187,10 +190,10 @@ def ways_data(
         data = {
             "name": name,
             "style": style,
-            "positions": packed(positions[some], "<f4"),
-            "index": packed(index[some], "<i4"),
+            "positions": pack(positions[some], "<f4"),
+            "index": pack(index[some], "<i4"),
         }
-        shown.append(data if before is None else data | {"before": packed(before[k][some], "<f4")})
+        shown.append(data if before is None else data | {"before": pack(before[k][some], "<f4")})
     return shown
 
 
@@ -237,7 +240,7 @@ def _angles_deg(poses: Floats) -> Floats:
     return angles
 
 
-def packed(values: NDArray[Any], kind: str) -> str:
+def pack(values: NDArray[Any], kind: str) -> str:
     """Base64 of an array in one of numpy's little-endian types."""
     return base64.b64encode(np.ascontiguousarray(values).astype(kind).tobytes()).decode("ascii")
 
@@ -281,7 +284,7 @@ def map_figure(
         span, style = usual_range(heights), "coloured"
         png = coloured_png(image, heights, *span)
         while len(png) > MOST_PICTURE:
-            image, heights = halved(image, heights)
+            image, heights = halve(image, heights)
             png = coloured_png(image, heights, *span)
     chart = plane_chart(
         tracks,
@@ -321,21 +324,15 @@ def feature_figures(view: FeatureView | None) -> list[Figure]:
     whole = plane_chart(
         [], "feature map", backdrop=_backdrop(view.map_planes, around), dots=[("s1", around.inside(edges))]
     )
-    lines = [
-        svg.Line("edges", view.scans.astype(np.float64), view.edge_counts.astype(np.float64), "s1"),
-        svg.Line("planar points", view.scans.astype(np.float64), view.plane_counts.astype(np.float64), "s2"),
-    ]
-    counts = svg.line_chart(lines, "scan", "features", "features per scan", whole_x=True, by="scan")
+    counts = [view.edge_counts.astype(np.float64), view.plane_counts.astype(np.float64)]
+    lines = numbered_lines([name for _, name in LEGEND], view.scans.astype(np.float64), counts)
+    per_scan: dict[str, Any] = {"spoken": "features per scan", "whole_x": True, "by": "scan"}
     looked = f"{len(view.scans)} scans, evenly spaced over the run."
+    caption = "Sharp and flat features; grey: the less sharp and less flat."
     return [
-        Figure(
-            f"Features of scan {view.scan}",
-            scan,
-            LEGEND,
-            "Sharp and flat features; grey: the less sharp and less flat.",
-        ),
+        Figure(f"Features of scan {view.scan}", scan, LEGEND, caption),
         Figure("Feature map", whole, LEGEND[:1], f"Less sharp edges; grey: less planar points; of {looked}"),
-        Figure("Features per scan", counts, LEGEND, f"Of {looked}"),
+        line_figure("Features per scan", lines, "scan", "features", f"Of {looked}", **per_scan),
     ]
 
 
@@ -343,3 +340,48 @@ def _backdrop(points: Floats, crop: Crop) -> tuple[str, tuple[float, float, floa
     (image,), top = crop_images([points], crop)
     assert image is not None
     return data_uri(density_png(image, top)), crop.extent
+
+
+MOST_CANDIDATES = 1000
+
+
+def candidate_data(record: RunRecord) -> dict[str, Any] | None:
+    """The candidates that were registered, the most doubtful first; None for a run that has no pose graph.
+
+    poses : of both keyframes, positions in the trajectory; views : some of the candidates' clouds, by the candidate's position
+    """
+    if not len(record.trajectory) or record.map_fixes:
+        return None
+    tried = [c for c in record.loops if c.stage != LoopStage.THINNED]
+    tried = sorted(tried, key=lambda c: (-c.doubt, c.a, c.b))[:MOST_CANDIDATES]
+    views = {id(view.candidate): pair_data(view) for view in record.pair_views}
+    epsg = None if record.georeference is None else record.georeference.epsg
+    return {
+        "candidates": [
+            {"poses": record.keyframe_scans[[c.a, c.b]].tolist(), "doubt": round(c.doubt, 3), **judgement(c)}
+            for c in tried
+        ],
+        "views": {str(k): views[id(c)] for k, c in enumerate(tried) if id(c) in views},
+        "crs": "" if epsg is None else f"EPSG:{epsg}",
+    }
+
+
+def judgement(candidate: LoopCandidate) -> dict[str, Any]:
+    """What was decided; numbers that are not known are None."""
+    known = {"rmse": candidate.rmse, "overlap": candidate.overlap, "away": candidate.distance}
+    return {
+        "verdict": str(candidate.verdict),
+        "stage": str(candidate.stage),
+        "reason": candidate.reason,
+        **{name: round(value, 4) if np.isfinite(value) else None for name, value in known.items()},
+    }
+
+
+def pair_data(view: PairView) -> dict[str, Any]:
+    """Both clouds as `pack_points` has them, and the rows (3, 4) of `before` and `after`."""
+    return {
+        "a": pack_points(view.a),
+        "b": pack_points(view.b),
+        "before": view.before[:3].round(5).tolist(),
+        "after": None if view.after is None else view.after[:3].round(5).tolist(),
+    }

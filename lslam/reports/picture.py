@@ -123,12 +123,12 @@ def _draw(evaluations: Sequence[Evaluation], names: Sequence[str]) -> Any:
 
 
 def _trajectories(
-    above: Any, height: Any, evaluations: Sequence[Evaluation], names: Sequence[str], shown: Sequence[AbsoluteError]
+    above: Any, height: Any, evaluations: Sequence[Evaluation], names: Sequence[str], errors: Sequence[AbsoluteError]
 ) -> None:
     first = evaluations[0]
     above.plot(*first.gt_positions[:, :2].T, color="black", lw=2.5, alpha=0.35, label="ground truth")
     height.plot(first.distance, first.gt_positions[:, 2], color="black", lw=2.5, alpha=0.35)
-    for e, name, error, colour in zip(evaluations, names, shown, _colours(len(names)), strict=True):
+    for e, name, error, colour in zip(evaluations, names, errors, _colours(len(names)), strict=True):
         above.plot(*error.aligned_positions[:, :2].T, color=colour, lw=1.2, label=f"{name} ({error.alignment})")
         height.plot(e.distance, error.aligned_positions[:, 2], color=colour, lw=1.1)
     above.plot(*first.gt_positions[0, :2], "o", color="black", ms=5)
@@ -239,7 +239,7 @@ def as_html(text: str, picture_svg: bytes | None = None) -> str:
     return f'{shown}<img alt="" src="data:image/svg+xml;base64,{base64.b64encode(picture_svg).decode()}">'
 
 
-def drawn(make: Any) -> bytes:
+def draw_svg(make: Any) -> bytes:
     """SVG of the matplotlib figure that `make` returns, in the common style."""
     with house_style():
         return picture(make(), "svg")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from operator import attrgetter
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lslam.core.types.arrays import Floats
+from lslam.core.types.imu import XYZ
 from lslam.core.types.run_record import RunRecord
 from lslam.reports import svg
 from lslam.reports.facts import RunFacts, stage_matrix
@@ -20,7 +22,8 @@ if TYPE_CHECKING:
     from lslam.evaluation.metric import AbsoluteError, Evaluation
 
 
-DISTANCE = "distance along ground truth, m"
+DISTANCE, WAY = "distance along ground truth, m", "distance travelled, m"
+RPY = ("roll", "pitch", "yaw")
 # What of a scan plane and abscissa are: without, and with ground truth.
 _BY_WAY: tuple[By, By] = ("own", "way")
 _BY_TRUTH: tuple[By, By] = ("aligned", "truth")
@@ -34,6 +37,8 @@ ALIGNED = {
 }
 SHADES = 8  # of the style sheet that are all different
 PLAN_HEIGHT = 340  # of one beside a chart
+FAILED = (("failed", "bridged or skipped scan"),)  # legend of the marks of such scans
+Legend = tuple[tuple[str, str], ...]
 # A limit further away than this many times the usual scan would press the stages flat: an arrow says where it is.
 LIMIT_IN_VIEW = 4.0
 
@@ -44,10 +49,36 @@ class Figure:
 
     title: str
     svg: str
-    legend: tuple[tuple[str, str], ...] = ()
+    legend: Legend = ()
     caption: str = ""
     wide: bool = False
     is_area: bool = False
+
+
+def legend_of(items: Sequence[svg.Line | Track]) -> Legend:
+    """Legend of lines or tracks, each under its label."""
+    return tuple((one.style, one.label) for one in items)
+
+
+def line_figure(
+    title: str,
+    lines: list[svg.Line],
+    x_label: str,
+    y_label: str,
+    caption: str = "",
+    *,
+    spoken: str = "",
+    legend: Legend | None = None,
+    more: Legend = (),
+    **chart: Any,
+) -> Figure:
+    """Figure of lines over a common abscissa; its SVG is empty where no value is finite.
+
+    spoken : title for screen readers, where it is another one; chart : as of `svg.line_chart`
+    legend : in place of that of the lines; more : entries after it
+    """
+    drawing = svg.line_chart(lines, x_label, y_label, spoken or title, **chart)
+    return Figure(title, drawing, (legend_of(lines) if legend is None else legend) + more, caption)
 
 
 def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list[Figure]:
@@ -56,7 +87,7 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
     if evaluation is None or absolute is None:
         positions = record.trajectory.positions
         truth, distance = None, record.trajectory.path_lengths
-        caption, x_label, along = "Estimate in its own world.", "distance travelled, m", _BY_WAY
+        caption, x_label, along = "Estimate in its own world.", WAY, _BY_WAY
     else:
         positions, truth, distance = absolute.aligned_positions, evaluation.gt_positions, evaluation.distance
         caption, x_label, along = (
@@ -70,13 +101,10 @@ def trajectory_figures(record: RunRecord, evaluation: Evaluation | None) -> list
     top = plane_chart(tracks, "trajectory from above", points=failed, tallest=PLAN_HEIGHT, by=along[0])
     lines = [] if truth is None else [svg.Line("ground truth", distance, truth[:, 2], "gt")]
     lines.append(svg.Line("estimate", distance, positions[:, 2], "s1"))
-    height = svg.line_chart(lines, x_label, "height z, m", "height profile", zero=False, by=along[1])
-    legend = tuple((t.style, t.label) for t in tracks)
-    start_end = (("start", "start"), ("end", "end"))
-    extra = (("bad", "bridged or skipped scan"),) if len(failed) else ()
+    more = (("start", "start"), ("end", "end"), *((("bad", FAILED[0][1]),) if len(failed) else ()))
     return [
-        Figure("Trajectory from above", top, legend + start_end + extra, caption),
-        Figure("Height", height, legend, caption),
+        Figure("Trajectory from above", top, legend_of(tracks) + more, caption),
+        line_figure("Height", lines, x_label, "height z, m", caption, spoken="height profile", zero=False, by=along[1]),
     ]
 
 
@@ -84,36 +112,26 @@ def error_figures(evaluation: Evaluation) -> list[Figure]:
     """Errors over distance for each alignment, and per axis (origin alignment)."""
     available = [a for a in evaluation.ate.values() if a.available]
     distance = evaluation.distance
-    position = [
-        svg.Line(a.alignment, distance, np.linalg.norm(a.errors, axis=1), f"s{i + 1}") for i, a in enumerate(available)
-    ]
+    names = [a.alignment for a in available]
+    position = numbered_lines(names, distance, [np.linalg.norm(a.errors, axis=1) for a in available])
+    recipe = "Distance between matched {}, per alignment."
     if not any(a.rotation_deg for a in available):
-        caption = "Distance between matched positions, per alignment."
-        return [_lines("Position error", position, DISTANCE, "position error, m", caption)]
-    rotation = [svg.Line(a.alignment, distance, a.rotation_errors_deg, f"s{i + 1}") for i, a in enumerate(available)]
-    axes = evaluation.scores["thesis1"]
-    figures = [
-        _lines(
-            "Position error", position, DISTANCE, "position error, m", "Distance between matched poses, per alignment."
-        ),
-        _lines(
-            "Rotation error", rotation, DISTANCE, "rotation error, deg", "Angle between matched poses, per alignment."
-        ),
+        caption = recipe.format("positions")
+        return [line_figure("Position error", position, DISTANCE, "position error, m", caption, by="truth")]
+    rotation = numbered_lines(names, distance, [a.rotation_errors_deg for a in available])
+    shown = [
+        ("Position error", position, "position error, m", recipe.format("poses")),
+        ("Rotation error", rotation, "rotation error, deg", "Angle between matched poses, per alignment."),
     ]
+    axes = evaluation.scores["thesis1"]
     if axes is not None:
         recipe = "Estimate minus ground truth, first poses coincide (origin)."
-        figures += [
-            _lines(
-                "Error per axis", _three(("x", "y", "z"), distance, axes.xyz), DISTANCE, "position error, m", recipe
-            ),
-            _lines(
-                "Error per angle",
-                _three(("roll", "pitch", "yaw"), distance, axes.rpy_deg),
-                DISTANCE,
-                "angle error, deg",
-                recipe,
-            ),
+        xyz, rpy = (numbered_lines(*of) for of in ((XYZ, distance, axes.xyz.T), (RPY, distance, axes.rpy_deg.T)))
+        shown += [
+            ("Error per axis", xyz, "position error, m", recipe),
+            ("Error per angle", rpy, "angle error, deg", recipe),
         ]
+    figures = [line_figure(title, lines, DISTANCE, unit, text, by="truth") for title, lines, unit, text in shown]
     return [figure for figure in figures if figure.svg]
 
 
@@ -135,11 +153,11 @@ def registration_figures(record: RunRecord) -> list[Figure]:
     index = np.array([r.index for r in results], np.float64)
     failed = np.array([r.index for r in results if r.status != "ok"], np.float64)
     series = [
-        ("Inliers", "inliers", "inliers and source points", ["inliers", "source_points"]),
-        ("Overlap", "overlap", "overlap, share of source points", ["overlap"]),
-        ("Residual", "rmse", "rmse of the residuals, m", ["rmse"]),
-        ("Iterations", "iterations", "iterations", ["iterations"]),
-        ("Motion prior", "prior_norm", "2-norm of inv(prior) pose - I", ["prior_norm", "imu.steady_norm"]),
+        ("Inliers", "inliers and source points", ["inliers", "source_points"]),
+        ("Overlap", "overlap, share of source points", ["overlap"]),
+        ("Residual", "rmse of the residuals, m", ["rmse"]),
+        ("Iterations", "iterations", ["iterations"]),
+        ("Motion prior", "2-norm of inv(prior) pose - I", ["prior_norm", "imu.steady_norm"]),
     ]
     words = {
         "source_points": "source points",
@@ -147,22 +165,17 @@ def registration_figures(record: RunRecord) -> list[Figure]:
         "imu.steady_norm": "constant velocity, for comparison",
     }
     figures = []
-    for title, _, y_label, fields in series:
+    for title, y_label, fields in series:
         # None, where there is nothing to compare with, becomes NaN.
         known = {f: np.array([attrgetter(f)(r) for r in results], np.float64) for f in fields}
         fields = [f for f in fields if np.isfinite(known[f]).any()]
         values = [known[f] for f in fields]
         if not any(np.any(np.isfinite(v) & (v != 0)) for v in values):
             continue
-        lines = [
-            svg.Line(words.get(f, f), index, v, f"s{i + 1}")
-            for i, (f, v) in enumerate(zip(fields, values, strict=True))
-        ]
-        chart = svg.line_chart(lines, "scan", y_label, f"{title} per scan", marks=failed, whole_x=True, by="scan")
-        legend = tuple((line.style, line.label) for line in lines) if len(lines) > 1 else ()
-        if len(failed):
-            legend += (("failed", "bridged or skipped scan"),)
-        figures.append(Figure(title, chart, legend))
+        lines = numbered_lines([words.get(f, f) for f in fields], index, values)
+        legend, more = None if len(lines) > 1 else (), FAILED if len(failed) else ()
+        chart: dict[str, Any] = {"spoken": f"{title} per scan", "marks": failed, "whole_x": True, "by": "scan"}
+        figures.append(line_figure(title, lines, "scan", y_label, legend=legend, more=more, **chart))
     return figures
 
 
@@ -188,16 +201,11 @@ def uncertainty_figures(record: RunRecord) -> list[Figure]:
         recipe += " Bridged and skipped scans are marked and left out of the lines."
     figures = []
     for title, unit, names, values in (
-        ("Position uncertainty", "m", ("x", "y", "z"), sigma[:, :3]),
+        ("Position uncertainty", "m", XYZ, sigma[:, :3]),
         ("Rotation uncertainty", "deg", ("about x", "about y", "about z"), np.degrees(sigma[:, 3:])),
     ):
-        lines = _three(names, distance, values)
-        chart = svg.line_chart(
-            lines, "distance travelled, m", f"sigma, {unit}", title, marks=distance[failed], by="way"
-        )
-        legend = tuple((line.style, line.label) for line in lines)
-        legend += (("failed", "bridged or skipped scan"),) if failed.any() else ()
-        figures.append(Figure(title, chart, legend, recipe))
+        lines, marks, more = numbered_lines(names, distance, values.T), distance[failed], FAILED if failed.any() else ()
+        figures.append(line_figure(title, lines, WAY, f"sigma, {unit}", recipe, more=more, marks=marks, by="way"))
     return [figure for figure in figures if figure.svg]
 
 
@@ -228,13 +236,9 @@ def share_bar(facts: RunFacts) -> str:
     return frame.svg("share of each stage")
 
 
-def _lines(title: str, lines: list[svg.Line], x_label: str, y_label: str, caption: str) -> Figure:
-    chart = svg.line_chart(lines, x_label, y_label, title, by="truth")
-    return Figure(title, chart, tuple((line.style, line.label) for line in lines), caption)
-
-
-def _three(names: tuple[str, str, str], x: NDArray[Any], values: Floats) -> list[svg.Line]:
-    return [svg.Line(name, x, values[:, i], f"s{i + 1}") for i, name in enumerate(names)]
+def numbered_lines(names: Sequence[str], x: NDArray[Any], series: Iterable[Floats]) -> list[svg.Line]:
+    """Lines over `x` (N,), one for each (N,) of the series, in the styles `s1`, `s2`, ..."""
+    return [svg.Line(name, x, y, f"s{i + 1}") for i, (name, y) in enumerate(zip(names, series, strict=True))]
 
 
 def _failed_positions(record: RunRecord, absolute: AbsoluteError | None) -> Floats:

@@ -44,7 +44,7 @@ def template(name: str) -> Template:
 @cache
 def script_of(entry: str) -> Script:
     """The script of a page that starts with the module `entry`."""
-    text = '\n"use strict";\n' + "\n".join(bundled(entry).values())
+    text = '\n"use strict";\n' + "\n".join(bundle(entry).values())
     digest = base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
     return Script(text, f"sha256-{digest}")
 
@@ -54,7 +54,7 @@ def policy(script: Script) -> str:
     return f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src '{script.digest}'"
 
 
-def bundled(entry: str) -> dict[str, str]:
+def bundle(entry: str) -> dict[str, str]:
     """Text of each module that `entry` imports, by name, each after those it imports, without `import` and `export`.
 
     A page is one file, so its modules become one script and share their names.

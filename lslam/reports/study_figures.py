@@ -47,11 +47,8 @@ def picture_points(figure: Any, cross: str) -> list[PicturePoint]:
                     continue
                 value = cross if line.get_marker() == LOST else _value_text(ordinate, _number(y) + half)
                 words = (title, name, _value_text(abscissa, _tick(plot, x)), value)
-                found.append(
-                    PicturePoint(
-                        round(float(left), 4), round(float(1 - up), 4), ", ".join(word for word in words if word)
-                    )
-                )
+                text = ", ".join(word for word in words if word)
+                found.append(PicturePoint(round(float(left), 4), round(float(1 - up), 4), text))
     return found
 
 
@@ -156,34 +153,34 @@ def study_figures(result: StudyResult) -> Iterator[StudyFigure]:
             yield StudyFigure(name, title, caption + more, png, svg, picture_points(figure, _LOST))
 
 
-def _errors(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+def _errors(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
     left, right = figure.subplots(1, 2)
-    _quantity(left, result, shown, "translation", "rmse of translation, m", lambda row: row.error)
-    _quantity(right, result, shown, "angular", "rmse of rotation, deg", lambda row: row.angular_rmse_deg)
+    _quantity(left, result, curves, "translation", "rmse of translation, m", lambda row: row.error)
+    _quantity(right, result, curves, "angular", "rmse of rotation, deg", lambda row: row.angular_rmse_deg)
     _legend(figure, left)
-    return any(r.means["translation"].n.any() for r in shown)
+    return any(r.means["translation"].n.any() for r in curves)
 
 
-def _zoom(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+def _zoom(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
     """Figure without the lost points; only where some curves diverge and others do not."""
-    steady = [r for r in shown if not r.curve.loses_most.any()]
-    return len(steady) < len(shown) and bool(steady) and _errors(figure, result, steady)
+    steady = [r for r in curves if not r.curve.loses_most.any()]
+    return len(steady) < len(curves) and bool(steady) and _errors(figure, result, steady)
 
 
-def _times(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+def _times(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
     left, right = figure.subplots(1, 2)
-    _quantity(left, result, shown, "time_per_scan", "registration per scan, ms", registration_ms)
-    _quantity(right, result, shown, "total_time", "total time, s", lambda row: row.total_time_s)
+    _quantity(left, result, curves, "time_per_scan", "registration per scan, ms", registration_ms)
+    _quantity(right, result, curves, "total_time", "total time, s", lambda row: row.total_time_s)
     _legend(figure, left)
-    return any(r.means["total_time"].n.any() for r in shown)
+    return any(r.means["total_time"].n.any() for r in curves)
 
 
-def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+def _stages(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
     """Draw a panel per curve with a line per stage of registration. Returns False if registration has a single stage."""
-    own = [[name for name, m in r.stage_means.items() if name not in NOT_REGISTRATION and m.n.any()] for r in shown]
+    own = [[name for name, m in r.stage_means.items() if name not in NOT_REGISTRATION and m.n.any()] for r in curves]
     if max(len(names) for names in own) < 2:
         return False
-    panels = list(zip(shown, own, strict=True))[:_STAGE_PANELS]
+    panels = list(zip(curves, own, strict=True))[:_STAGE_PANELS]
     names = list(dict.fromkeys(name for _, stages in panels for name in stages))
     plots = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for plot, (r, stages) in zip(plots, panels, strict=True):
@@ -198,28 +195,28 @@ def _stages(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> b
     return True
 
 
-def _efficiency(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+def _efficiency(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
     """Efficiency of each curve relative to its largest value; a bar below where it is within a tenth of that."""
     names = ("efficiency", "total_efficiency")
     for plot, name in zip(figure.subplots(1, 2), names, strict=True):
-        for k, (r, look) in enumerate(_with_looks(result, shown)):
+        for k, (r, look) in enumerate(_with_looks(result, curves)):
             values = normalise(r.medians[name])
             plot.plot(r.curve.values, values, label=r.curve.label, **look)
             flat = np.flatnonzero(values >= 1 - FLAT_SHARE)
-            if len(shown) <= len(COLOURS):
+            if len(curves) <= len(COLOURS):
                 plot.plot(r.curve.values[flat], np.full(len(flat), -0.04 * (k + 1)), "s", ms=3.5, color=look["color"])
         plot.set_yticks(np.linspace(0, 1, 6))
-        _abscissa(plot, shown[0])
+        _abscissa(plot, curves[0])
         title = "E, per scan (equation 5.2)" if name == "efficiency" else "E tot, in all (equation 5.3)"
         label(plot, with_unit(result.parameters[0]), f"{title}, over the largest")
     _legend(figure, figure.axes[0])
-    return any(r.optimum is not None for r in shown)
+    return any(r.optimum is not None for r in curves)
 
 
 def _quantity(
     plot: Any,
     result: StudyResult,
-    shown: Sequence[CurveResult],
+    curves: Sequence[CurveResult],
     name: str,
     words: str,
     of_row: Callable[[StudyRow], float],
@@ -227,7 +224,7 @@ def _quantity(
     """Means with their intervals; crosses at the top where a curve is lost; reference runs as dotted lines."""
     tops = []
     rows_of_crosses = 0
-    for r, look in _with_looks(result, shown):
+    for r, look in _with_looks(result, curves):
         means, values = r.means[name], r.curve.values
         if r.curve.loses_most.any():
             lost, height = values[r.curve.loses_most], 1.0 + 0.03 * rows_of_crosses
@@ -252,7 +249,7 @@ def _quantity(
         plot.set_ylim(0.7 * drawn.min(), 1.5 * drawn.max())
     else:
         plot.set_ylim(0, 1.15 * drawn.max() if len(drawn) else 1.0)
-    _abscissa(plot, shown[0])
+    _abscissa(plot, curves[0])
     label(plot, with_unit(result.parameters[0]), words)
 
 
@@ -266,7 +263,7 @@ def _beside(result: StudyResult, of_row: Callable[[StudyRow], float]) -> Iterato
         yield row, ("0.25", "0.5", "0.7")[k % 3]
 
 
-def _with_looks(result: StudyResult, shown: Sequence[CurveResult]) -> Iterator[tuple[CurveResult, dict[str, Any]]]:
+def _with_looks(result: StudyResult, among: Sequence[CurveResult]) -> Iterator[tuple[CurveResult, dict[str, Any]]]:
     """Curves with their line styles, the same in all figures of a study.
 
     Colour by curve while there are few; where there are many, by second parameter in order, with a dash per series.
@@ -293,7 +290,7 @@ def _with_looks(result: StudyResult, shown: Sequence[CurveResult]) -> Iterator[t
             for curve in curves
         ]
     by_label = {curve.label: look for curve, look in zip(curves, looks, strict=False)}
-    return ((r, by_label[r.curve.label]) for r in shown)
+    return ((r, by_label[r.curve.label]) for r in among)
 
 
 def _abscissa(plot: Any, result: CurveResult) -> None:
@@ -319,10 +316,10 @@ def _legend(figure: Any, *plots: Any) -> None:
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=columns, frameon=False)
 
 
-def draw_laws(figure: Any, result: StudyResult, shown: Sequence[CurveResult]) -> bool:
+def draw_laws(figure: Any, result: StudyResult, curves: Sequence[CurveResult]) -> bool:
     """Draw the law of each curve, or of each series over both parameters. Returns False if there is none."""
     colours = {r.curve.label: colour for r, colour in zip(result.results, COLOURS, strict=False)}
-    singles = [(r.curve.label, r.law) for r in shown if r.law is not None and r.curve.label in colours]
+    singles = [(r.curve.label, r.law) for r in curves if r.law is not None and r.curve.label in colours]
     laws = list(result.products.items()) or singles
     if not laws:
         return False

@@ -1,23 +1,32 @@
-"""A study as tables: verdicts, landmarks, laws, means, failures; the best points while it runs; the runs of a batch."""
+"""A study as tables: verdicts, landmarks, laws, means, failures; the best points while it runs; the runs of a batch.
+
+Its report.html is one self-contained page, with figures beside it as PNG and SVG, and tables as text.
+"""
 
 from __future__ import annotations
 
+import base64
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Set
 from dataclasses import asdict, dataclass
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lslam.core.config.config import with_unit
+from lslam.core.errors import OutputError, cause
 from lslam.core.printable import count_of, metres, with_decimals
 from lslam.core.types.study import CurveResult, Interval, Law, StudyResult, StudyRow
 from lslam.evaluation import ALIGNMENTS
 from lslam.evaluation.curves import normalise
-from lslam.reports.compare_table import CompareTable
+from lslam.io.formats.atomic import atomic_write
+from lslam.reports.compare_table import CompareTable, as_text
 from lslam.reports.evaluations import strict
-from lslam.reports.text import Grid
+from lslam.reports.shell import render
+from lslam.reports.study_figures import StudyFigure, study_figures
+from lslam.reports.text import Grid, csv_table
 
 UNKNOWN = "-"
 LABELS = {"ate_se3": "ATE se3", "ate_origin": "ATE origin", "thesis_rmse": "thesis_rmse"}
@@ -206,7 +215,7 @@ class Best:
     sequence: str
     method: str
     runs: int
-    failed: int
+    failures: int
     point: tuple[StudyRow, ...]
 
     def mean(self, name: str) -> float:
@@ -274,9 +283,92 @@ def _best(rows: Sequence[StudyRow]) -> tuple[StudyRow, ...]:
 
 
 def _line(best: Best) -> list[str]:
-    head = [best.sequence, best.method, str(best.runs), str(best.failed)]
+    head = [best.sequence, best.method, str(best.runs), str(best.failures)]
     if not best.point:
         return [*head, "-", "-", "-", "-"]
     at = ", ".join(f"{key.partition('.')[2]} {value}" for key, value in best.point[0].parameters.items())
     errors = [f"{best.mean('error'):.3f}", f"{best.mean('angular_rmse_deg'):.2f}"]
     return [*head, at or "its own values", *errors, f"{best.mean('total_time_s'):.2f}"]
+
+
+@dataclass(frozen=True)
+class StudySection:
+    """One studied parameter on one sequence: its figures with their data, its tables."""
+
+    result: StudyResult
+    figures: list[tuple[StudyFigure, str]]
+    tables: list[CompareTable]
+    recipes: list[str]
+
+
+def write_study_files(folder: Path, results: Sequence[StudyResult], rows: Sequence[StudyRow], title: str) -> None:
+    """Write report.html, report.md, report.tex, report.csv and figures/*.png and *.svg, each atomically.
+
+    rows : all of the study, for its head. Raises OutputError.
+    """
+    try:
+        (folder / "figures").mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"folder {folder / 'figures'} cannot be made: {cause(error)}") from None
+    sections = []
+    keys = {result.parameters[0] for result in results}
+    for result in results:
+        figures = list(study_figures(result))
+        for figure in figures:
+            stem = "-".join([*_file_words(result, keys), figure.name])
+            _write_bytes(folder / "figures" / f"{stem}.png", figure.png)
+            _write_bytes(folder / "figures" / f"{stem}.svg", figure.svg)
+        data = [f"data:image/svg+xml;base64,{base64.b64encode(figure.svg).decode('ascii')}" for figure in figures]
+        shown = list(zip(figures, data, strict=True))
+        sections.append(StudySection(result, shown, study_tables(result), study_recipes(result)))
+    page = render(
+        "study.html.j2",
+        title=title,
+        rows=rows,
+        failed=sum(not row.is_usable for row in rows),
+        notes=timing_notes(rows),
+        sections=sections,
+    )
+    _write_bytes(folder / "report.html", page.encode("utf-8", "replace"))
+    for style, heading, item in (("md", "## {}", "- {}"), ("tex", "% {}", "% {}")):
+        parts = [part for section in sections for part in _section_text(section, style, heading, item)]
+        _write_bytes(folder / f"report.{style}", ("\n\n".join(parts) + "\n").encode("utf-8", "backslashreplace"))
+    _write_bytes(folder / "report.csv", (csv_table(means_grid(results)) + "\n").encode())
+
+
+def timing_notes(rows: Sequence[StudyRow]) -> list[str]:
+    """Reasons why findings about time are undecided, and how to decide them; empty when they are decided."""
+    usable = [row for row in rows if row.is_usable]
+    shared = sum(not row.is_timing_comparable for row in usable)
+    if not shared:
+        return []
+    were_several = any(row.at_once > 1 for row in usable)
+    return [
+        f"{shared} of {count_of(len(usable), 'run')} shared a core or ran on a cluster: times of this study cannot be compared, "
+        "and findings about time are left undecided. To have them judged, run it on an idle machine into another folder: "
+        f"lslam sweep STUDY{' --jobs 1' if were_several else ''} --out DIR"
+    ]
+
+
+def _section_text(section: StudySection, style: str, heading: str, item: str) -> list[str]:
+    result = section.result
+    title = heading.format(f"{result.study}: {' and '.join(result.parameters)} on {result.sequence}")
+    recipes = "\n".join(item.format(line) for line in section.recipes)
+    return [title, *as_text(section.tables, style), recipes]
+
+
+def _file_words(result: StudyResult, keys: Set[str]) -> list[str]:
+    """File name parts that distinguish one result from others, safe for any file system.
+
+    keys : of all results; the section is named where two have a key of the same name in it
+    """
+    key = result.parameters[0]
+    last = key.rpartition(".")[2]
+    is_clear = sum(other.rpartition(".")[2] == last for other in keys) == 1
+    words = (result.study, result.sequence, last if is_clear else key)
+    return ["".join(c if c.isalnum() or c in "._" else "_" for c in word) for word in words]
+
+
+def _write_bytes(path: Path, content: bytes) -> None:
+    with atomic_write(path) as stream:
+        stream.write(content)

@@ -146,13 +146,13 @@ def _text(x: float, y: float, text: str, anchor: str, style: str) -> str:
     return f'<text class="{style}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
-def ticks(low: float, high: float, wanted: int = 5, whole: bool = False) -> list[float]:
-    """Round values (1, 2, 2.5 or 5 times a power of ten) inside [low, high], about `wanted` of them.
+def ticks(low: float, high: float, count: int = 5, whole: bool = False) -> list[float]:
+    """Round values (1, 2, 2.5 or 5 times a power of ten) inside [low, high], about `count` of them.
 
     >>> ticks(0.0, 1.0)
     [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
     """
-    raw = (high - low) / max(wanted, 1)
+    raw = (high - low) / max(count, 1)
     power = 10.0 ** np.floor(np.log10(raw))
     step = float(min((m * power for m in (1, 2, 2.5, 5, 10)), key=lambda s: abs(np.log(s / raw))))
     if whole:

@@ -10,11 +10,11 @@ import numpy as np
 
 from lslam.core.printable import count_of, metres
 from lslam.core.types.run_record import RunRecord
-from lslam.core.types.scan_result import sum_stages
+from lslam.core.types.scan_result import ScanResult, sum_stages
 from lslam.evaluation.evaluate import shown_metrics
 from lslam.maps.colour import ColourCounts
 from lslam.reports.back_end import back_end_rows, before_and_after
-from lslam.reports.facts import Failure, RunFacts, run_facts
+from lslam.reports.facts import RunFacts, run_facts
 
 if TYPE_CHECKING:
     from lslam.evaluation.metric import Evaluation
@@ -97,14 +97,7 @@ def imu_rows(record: RunRecord) -> list[tuple[str, str]]:
         return []
     if imu.get("prior_error_m") is None:
         return [("imu", "used" if imu["used"] else "refused")]
-    own, steady = imu["prior_error_m"], imu["constant_velocity_error_m"]
-    used = "used" if imu["used"] else "refused on the way"
-    rows = [
-        (
-            "imu",
-            f"{used}; predicts scans to {metres(own)} m, constant velocity to {metres(steady)} m (medians, turns at 10 m)",
-        )
-    ]
+    rows = [("imu", _prior_text(imu, "predicts"))]
     if imu.get("mean_iterations"):
         rows.append(("", f"{imu['mean_iterations']:.1f} iterations per scan; {_saving_text(imu)}"))
     if said := _calibration_text(imu):
@@ -117,21 +110,20 @@ def wheel_rows(record: RunRecord) -> list[tuple[str, str]]:
     wheels = record.manifest.get("wheels")
     if not wheels:
         return []
-    own, steady = wheels["prior_error_m"], wheels["constant_velocity_error_m"]
-    if own is None:
+    if wheels["prior_error_m"] is None:
         return [
             ("wheels", f"{'' if wheels['used'] else 'not '}used; no scan with surfaces along the way told their scale")
         ]
-    used = "used" if wheels["used"] else "refused on the way"
     parts = [f"scale {wheels['scale']:.4f} ({wheels['scale_sigma']:.4f})"]
     parts += [f"slip in {count_of(wheels['scans_with_slip'], 'scan')}"] if wheels["scans_with_slip"] else []
-    return [
-        (
-            "wheels",
-            f"{used}; they predict scans to {metres(own)} m, constant velocity to {metres(steady)} m (medians, turns at 10 m)",
-        ),
-        ("", ", ".join(parts)),
-    ]
+    return [("wheels", _prior_text(wheels, "they predict")), ("", ", ".join(parts))]
+
+
+def _prior_text(facts: dict[str, Any], predict: str) -> str:
+    """Whether a sensor was used, and the errors of its motion prior."""
+    used = "used" if facts["used"] else "refused on the way"
+    own, steady = metres(facts["prior_error_m"]), metres(facts["constant_velocity_error_m"])
+    return f"{used}; {predict} scans to {own} m, constant velocity to {steady} m (medians, turns at 10 m)"
 
 
 def _calibration_text(imu: dict[str, Any]) -> str:
@@ -165,7 +157,7 @@ def _saving_text(imu: dict[str, Any]) -> str:
     )
 
 
-def _failure(failure: Failure) -> str:
+def _failure(failure: ScanResult) -> str:
     return f"scan {failure.index} {failure.status}: {failure.reason or 'reason not given'}"
 
 
@@ -203,21 +195,12 @@ def _time_rows(record: RunRecord, facts: RunFacts) -> list[tuple[str, str]]:
     if facts.total is None:
         return [("time", "no stage was timed")]
     total = facts.total
-    rows = [
-        (
-            "time",
-            f"{1e3 * total.median:.1f} ms per scan (median), p95 {1e3 * total.p95:.1f}, max {1e3 * total.max:.1f}: "
-            + ", ".join(f"{name} {1e3 * stage.median:.1f}" for name, stage in facts.stages.items()),
-        )
-    ]
+    text = f"{1e3 * total.median:.1f} ms per scan (median), p95 {1e3 * total.p95:.1f}, max {1e3 * total.max:.1f}: "
+    text += ", ".join(f"{name} {1e3 * stage.median:.1f}" for name, stage in facts.stages.items())
+    rows = [("time", text)]
     if facts.real_time_factor:
-        rows.append(
-            (
-                "real time",
-                f"{facts.real_time_factor:.1f} times as fast as the sensor; {facts.over_limit} of {facts.scans} scans over the "
-                f"limit of {1e3 * record.real_time_limit:.0f} ms",
-            )
-        )
+        text = f"{facts.real_time_factor:.1f} times as fast as the sensor; {facts.over_limit} of {facts.scans} scans over the "
+        rows.append(("real time", f"{text}limit of {1e3 * record.real_time_limit:.0f} ms"))
     if later := sum_stages(record.back_end_seconds.values()):
         each = ", ".join(f"{name} {s:.2f}" for name, s in later.items())
         rows.append(("back end", f"{sum(later.values()):.1f} s on {len(record.keyframe_scans)} keyframes: {each}"))
@@ -231,7 +214,7 @@ def markdown(grid: Grid, names: int = 1) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, rule, *body])
 
 
-def comma_separated(grid: Grid, _: int = 1) -> str:
+def csv_table(grid: Grid, _: int = 1) -> str:
     """CSV table for spreadsheets."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([[cell.strip() for cell in row] for row in grid])
@@ -247,7 +230,7 @@ def latex(grid: Grid, names: int = 1) -> str:
     )
 
 
-def aligned(grid: Grid, names: int = 1) -> str:
+def text_table(grid: Grid, names: int = 1) -> str:
     """Table of columns of equal width, two spaces between them."""
     widths = [max(len(cell) for cell in column) for column in zip(*grid, strict=True)]
     return "\n".join(

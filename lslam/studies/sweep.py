@@ -74,7 +74,7 @@ def write_study_report(
     Raises OutputError.
     """
     from lslam.evaluation.sensitivity import evaluate_study
-    from lslam.reports.study_html import write_study_files
+    from lslam.reports.study_table import write_study_files
 
     results = evaluate_study(rows, findings)
     write_study_files(folder, results, rows, title or ", ".join(dict.fromkeys(row.study for row in rows)))
@@ -88,7 +88,7 @@ def report_folder(folder: Path) -> list[StudyResult]:
 
     Raises InputError for a folder without runs and what cannot be read, ConfigError for findings that make no sense, OutputError.
     """
-    from lslam.reports.study_html import timing_notes
+    from lslam.reports.study_table import timing_notes
 
     rows = read_study_csv(folder / RESULTS)
     if not rows:

@@ -41,7 +41,7 @@ from pyproj import CRS, Transformer
 from lslam.core.geometry import se3, so3
 from lslam.core.geometry.geodesy import local_crs
 from lslam.io.formats.trajectory_files import read_trajectory
-from lslam.reports.survey_sheet import nice
+from lslam.reports.plans import nice
 from tests.maps.geoid_grids import write_gtx
 from tests.pages import page
 from tests.test_tutorials import missing_lines

@@ -25,7 +25,7 @@ from lslam.maps.octree import points_of
 from lslam.pipeline.map_files import MapNote, georeference_note, write_map
 from lslam.pipeline.rebuild import viewed_run
 from lslam.pipeline.view.tiles import MapTiles
-from lslam.reports.recording import MOST_POINTS, by_height
+from lslam.reports.figures import MOST_POINTS, by_height
 
 POINTS = np.random.default_rng(0).uniform(-50, 50, (400, 3))
 

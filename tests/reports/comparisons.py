@@ -108,7 +108,7 @@ def comparison(folder: Path, **changes: Any) -> Comparison:
             row("dark", "icp", {"time.mean": SeedStatistics(12.0, none, 1)}, runs=1, note="no ground truth"),
             row("dark", "kiss-icp", {}, runs=1, failed=1),
         ),
-        "paired": (PairedComparison("kiss-icp", "icp", 1, 3.0, 0, 0, 2, none, "n too small"),),
+        "pairs": (PairedComparison("kiss-icp", "icp", 1, 3.0, 0, 0, 2, none, "n too small"),),
         "differences": (Difference("dark", "kiss-icp", "icp", 0, 1.5, 0.5),),
         "notes": ("others were using the machine",),
         "configs": {m: {"odometry": {"method": m}, "map": {"voxel": 0.2}} for m in ("icp", "kiss-icp")},

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lslam.core.types.cloud import ArrayCloud
 from lslam.maps.floor_plan import top_view
-from lslam.reports.merge_html import SessionView, write_page
+from lslam.reports.compare_html import SessionView, write_merge_page
 
 
 def sessions(scans: int = 50) -> list[SessionView]:
@@ -39,5 +39,5 @@ def write(path: Path, scans: int = 50, has_map: bool = True, problems: Sequence[
         for v in views
     ]
     shown = (top_view(floor), floor) if has_map else (None, None)
-    write_page(path, views, rows, problems, ties(), *shown)
+    write_merge_page(path, views, rows, problems, ties(), *shown)
     return path

@@ -12,7 +12,7 @@ import numpy as np
 from lslam.backend.loops.find_loops import FEW_POINTS, MOST_VIEWS
 from lslam.core.types.constraint import LoopCandidate, LoopStage, Verdict
 from lslam.core.types.run_record import PairView, RunRecord
-from lslam.reports.candidates import candidate_data, pair_data
+from lslam.reports.page_data import candidate_data, pair_data
 
 
 def rejected(k: int, stage: LoopStage = LoopStage.OVERLAP) -> LoopCandidate:

@@ -22,7 +22,7 @@ from lslam.core.config.outputs import EvalConfig
 from lslam.core.types.comparison import SeedStatistics
 from lslam.reports.compare_html import render_page, time_figure
 from lslam.reports.compare_table import recipes, render, tables, to_document
-from lslam.reports.crops import Crop, choose_crops, crop_images
+from lslam.reports.png import Crop, choose_crops, crop_images
 from lslam.studies.results import metrics_of
 
 

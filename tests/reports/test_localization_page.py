@@ -17,9 +17,9 @@ from lslam.core.geometry import se3
 from lslam.core.types.cloud import ArrayCloud
 from lslam.core.types.constraint import Constraint, FixStatus, LoopCandidate, MapFix, Verdict
 from lslam.core.types.run_record import Crispness, RunRecord
-from lslam.reports.cards import loop_residuals
+from lslam.reports.back_end import STATES, localization_figures, localization_tracks
+from lslam.reports.facts import loop_residuals
 from lslam.reports.html import render_report, with_new_map
-from lslam.reports.localization import STATES, localization_figures, localization_tracks
 
 MakeRecord = Callable[..., RunRecord]
 STATUSES: list[FixStatus] = ["held", "held", "changed", "beyond", "unread", "held"]
@@ -33,8 +33,8 @@ def located(make_record: MakeRecord, scans: int = 60, **changes: Any) -> RunReco
     for k, result in enumerate(record.results):
         status = STATUSES[k * len(STATUSES) // scans]
         share, moved = (0.8, 0.01 + 0.001 * k) if status == "held" else (0.2, 0.0)
-        is_doubted = scans // 6 <= k < scans // 3
-        fixes.append(MapFix(result.T_world_lidar, np.eye(6), status, 0.9, share, (moved, 0.0), "", is_doubted))
+        is_doubtful = scans // 6 <= k < scans // 3
+        fixes.append(MapFix(result.T_world_lidar, np.eye(6), status, 0.9, share, (moved, 0.0), "", is_doubtful))
     points = np.random.default_rng(0).uniform((-10, -5, 0), (60, 35, 8), (900, 3))
     change = np.zeros(900, np.int8)
     change[:6], change[6:9] = -1, 1

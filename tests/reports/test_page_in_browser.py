@@ -27,7 +27,7 @@ from lslam.reports.compare_html import write_page
 from lslam.reports.html import write_report
 from lslam.reports.picture import COLOURS
 from lslam.reports.png import palette
-from lslam.reports.study_html import write_study_files
+from lslam.reports.study_table import write_study_files
 
 pytest.importorskip("selenium")
 

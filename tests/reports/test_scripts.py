@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from lslam.reports.shell import CHARTS, MAP, RUN, bundled
+from lslam.reports.shell import CHARTS, MAP, RUN, bundle
 
 HERE = Path(__file__).parent
 
 
 @pytest.mark.parametrize("entry", [CHARTS, MAP, RUN])
 def test_a_page_has_each_module_once_after_those_it_needs_and_each_name_once(entry: str) -> None:
-    modules = bundled(entry)
-    folder = Path(bundled.__code__.co_filename).parent / "scripts"
+    modules = bundle(entry)
+    folder = Path(bundle.__code__.co_filename).parent / "scripts"
     names = list(modules)
     for name in names:
         wanted = re.findall(r'^import .*"\./([^"]+)"', (folder / name).read_text(encoding="utf-8"), re.MULTILINE)

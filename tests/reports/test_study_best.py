@@ -28,7 +28,7 @@ def test_the_best_point_has_the_least_mean_error_over_its_seeds() -> None:
 @pytest.mark.parametrize("status", ["diverged", "failed", "crashed"])
 def test_a_point_that_fails_for_one_seed_is_not_the_best(status: str) -> None:
     (best,) = best_points([row(1, 0.1), row(1, 0.1, 1, status=status), row(2, 0.4)])
-    assert (best.runs, best.failed, best.point[0].run) == (3, 1, "2-0")
+    assert (best.runs, best.failures, best.point[0].run) == (3, 1, "2-0")
 
 
 def test_with_and_without_imu_and_beside_stand_apart_in_words() -> None:

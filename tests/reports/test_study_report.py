@@ -19,8 +19,7 @@ from lslam.core.types.study import StudyResult, StudyRow
 from lslam.evaluation.sensitivity import evaluate_study
 from lslam.reports.picture import COLOURS
 from lslam.reports.study_figures import StudyFigure, study_figures
-from lslam.reports.study_html import timing_notes, write_study_files
-from lslam.reports.study_table import means_grid, study_tables
+from lslam.reports.study_table import means_grid, study_tables, timing_notes, write_study_files
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from lslam.reports.scene_plan import bar_length, write_plan
+from lslam.reports.plans import bar_length, write_plan
 from lslam.simulation.plan import BORDER, COARSE, COLOURS, FINEST, PATH, plan_of
 from lslam.simulation.scenarios import SimulatedDrive, simulate
 

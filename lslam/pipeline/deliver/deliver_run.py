@@ -32,8 +32,8 @@ from lslam.pipeline.deliver.survey import Survey
 from lslam.pipeline.deliver.tables import layers_of, write_trajectories
 from lslam.pipeline.map_files import georeference_of, note_of
 from lslam.pipeline.rebuild import map_of
+from lslam.reports.plans import SurveySheet, survey_pdf
 from lslam.reports.png import density_grey
-from lslam.reports.survey_sheet import SurveySheet, survey_pdf
 
 MAP, PLAN, FLOOR = "map.laz", "plan.tif", "floor_plan.tif"
 GPKG, SHEET, README = "survey.gpkg", "sheet.pdf", "README.txt"

@@ -25,7 +25,7 @@ from lslam.io.formats.atomic import write_text
 from lslam.io.formats.trajectory_files import read_trajectory
 from lslam.pipeline.rebuild import read_run, results_of
 from lslam.pipeline.run_folder import KEYFRAMES
-from lslam.reports.candidates import judgement, pair_data
+from lslam.reports.page_data import judgement, pair_data
 
 EDITS, POINTS = "edits.csv", "points.csv"
 SHOWN = 12_000  # points of a scan's surroundings on the page, at most

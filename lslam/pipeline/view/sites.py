@@ -18,7 +18,7 @@ from lslam.pipeline.view.graph_job import GraphJob
 from lslam.pipeline.view.page import page_of
 from lslam.pipeline.view.server import RunServer, Site
 from lslam.pipeline.view.tiles import MapTiles
-from lslam.reports.page_data import packed
+from lslam.reports.page_data import pack
 
 
 class ViewedSites:
@@ -104,4 +104,4 @@ def change_between(old: Trajectory, new: Trajectory) -> dict[str, Any]:
     positions = se3.apply(T, new.positions)
     shared, mine, other = np.intersect1d(old.stamps_ns, new.stamps_ns, return_indices=True)
     moved = np.linalg.norm(positions[other] - old.positions[mine], axis=1) if len(shared) else np.zeros(1)
-    return {"positions": packed(positions, "<f4"), "most_m": float(moved.max()), "mean_m": float(moved.mean())}
+    return {"positions": pack(positions, "<f4"), "most_m": float(moved.max()), "mean_m": float(moved.mean())}
