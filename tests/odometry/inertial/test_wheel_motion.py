@@ -216,9 +216,7 @@ def test_a_pause_is_constant_velocitys() -> None:
     wheels = readings(12.0)
     keep = (wheels.stamps_ns < 6_000_000_000) | (wheels.stamps_ns > 9_000_000_000)
     assert wheels.yaw_rate is not None
-    motion = WheelMotion(
-        WheelStream(wheels.stamps_ns[keep], wheels.speed[keep], wheels.yaw_rate[keep], T_LIDAR_BASE), 0.2
-    )
+    motion = WheelMotion(WheelStream(wheels.stamps_ns[keep], wheels.speed[keep], wheels.yaw_rate[keep], T_LIDAR_BASE))
     drive(motion, stamps[:75], poses[:75])
     prior = motion.sweep(int(stamps[75]), Span())
     np.testing.assert_array_equal(prior.pose, motion.predict(int(stamps[75])))
