@@ -26,7 +26,7 @@ def create(config: Config) -> FastLio | FastLio2:
     return FastLio2(registration_of(config, recovery=recovery))
 
 
-create_motion = FilterMotion.of
+create_motion = FilterMotion
 
 
 class FilterMethod(MapMethod):

@@ -12,7 +12,6 @@ from lslam.core.types.scan_result import ScanEquations
 from lslam.odometry.fast_lio import FastLio2
 from lslam.odometry.icp import registration_of
 from lslam.odometry.inertial.filter import warm_up_solver
-from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.window import WindowMotion
 from lslam.registration.optimiser import KERNEL_MIN_M, normal_equations
 from lslam.registration.preprocessing.prepare import PreparedPoints
@@ -25,9 +24,7 @@ def create(config: Config) -> LioMapping:
     return LioMapping(registration_of(config, recovery=rest_alone(config.recovery)), config.lio_mapping.window - 1)
 
 
-def create_motion(opening: InertialStart, config: Config) -> WindowMotion:
-    """The window, which estimates its scans together."""
-    return WindowMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, config.lio_mapping.window)
+create_motion = WindowMotion
 
 
 class LioMapping(FastLio2):

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lslam.backend.graph.inertial_smoother import InertialSmoother
 from lslam.core.config.config import Config
 from lslam.core.config.odometry import rest_alone
 from lslam.core.types.motion_prior import MotionPrior
@@ -19,16 +18,13 @@ from lslam.core.types.scan_result import ScanResult
 from lslam.odometry.base import MapMethod
 from lslam.odometry.feature_target import LoamVariant
 from lslam.odometry.icp import Icp, registration_of
-from lslam.odometry.inertial.initialise import InertialStart
-from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
+from lslam.odometry.inertial.smoothing import SmootherMotion
 from lslam.odometry.loam import Loam
 from lslam.odometry.uncertainty import PoseUncertainty
 from lslam.registration.result import RegistrationResult
 
 # The newest keyframes make the local map; a new one where the sensor moved or turned so far (Shan et al. 2020).
 KEYFRAMES, KEYFRAME_M, KEYFRAME_DEG = 25, 1.0, 10.0
-# Scans after which the smoother's graph begins anew, with what it knows as its prior.
-RESET_SCANS = 100
 
 
 def create(config: Config) -> LioSam | LioSamOfPoints:
@@ -41,10 +37,7 @@ def create(config: Config) -> LioSam | LioSamOfPoints:
     return LioSamOfPoints(registration_of(config, recovery=rest_alone(config.recovery), target="keyframe", **keys))
 
 
-def create_motion(opening: InertialStart, config: Config) -> SmootherMotion:
-    """The smoother, whose states predict the next one."""
-    smoother = InertialSmoother(smoother_noise(opening.estimate.gyroscope.noise), RESET_SCANS)
-    return SmootherMotion(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu, smoother)
+create_motion = SmootherMotion
 
 
 class SmoothedUncertainty(PoseUncertainty):

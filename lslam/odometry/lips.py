@@ -39,7 +39,7 @@ def create(config: Config) -> Lips:
     return Lips(config)
 
 
-create_motion = LinkedMotion.of
+create_motion = LinkedMotion
 
 
 class Lips(Traits, Stateful):

@@ -123,7 +123,7 @@ def test_a_run_goes_on_where_it_was_and_carries_a_scan_that_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Over a reset of the graph, and a scan of which too little is left to register."""
-    monkeypatch.setattr("lslam.odometry.lio_sam.RESET_SCANS", 5)
+    monkeypatch.setattr("lslam.odometry.inertial.smoothing.RESET_SCANS", 5)
     config = config_of(TIGHT, POINTS)
     scans = [walk().scan(i) for i in range(16)]
     scans[10] = scans[10].select(np.arange(3))

@@ -129,7 +129,7 @@ def _begin(sequence: Sequence, imu: ImuStream, T_lidar_imu: Floats, config: Conf
     is_moved = opening.offset_s != 0 and config.imu.time_offset_s is None
     if not is_moved and first.covariances is not None:
         return opening
-    motion = InertialMotion(opening.imu, T_lidar_imu, opening.estimate, config.imu)
+    motion = InertialMotion(opening, config)
     better = first_poses(sequence, config, motion)
     if not is_moved:
         on_time = config.imu.model_copy(update={"time_offset_s": 0.0})
@@ -324,7 +324,7 @@ def calibration_of(gyroscope: Gyroscope, opening: InertialStart) -> dict[str, An
 
 def motion_of(opening: InertialStart, config: Config) -> InertialMotion:
     """The motion model that the method asks for: `create_motion` of its module, where it has one."""
-    create: Callable[[InertialStart, Config], InertialMotion] = InertialMotion.of
+    create: Callable[[InertialStart, Config], InertialMotion] = InertialMotion
     if config.odometry.method in METHODS:
         module, _ = METHODS[config.odometry.method]
         create = getattr(import_module(module), "create_motion", create)

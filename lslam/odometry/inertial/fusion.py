@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 
 from lslam.core.config import Config
-from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
 from lslam.core.types.arrays import Floats
 from lslam.core.types.imu import GRAVITY, GravityDirection, ImuState, ImuStream
@@ -33,7 +32,8 @@ log = logging.getLogger("lslam")
 class InertialMotion(Stateful):
     """Predicts with the IMU where it has samples, and with constant velocity where it has none.
 
-    imu : cleaned, on the clock of the scans; T_lidar_imu : (4, 4); estimate : at the first scan, in the LiDAR frame there
+    opening : the IMU as a run opened it: cleaned, on the clock of the scans, and the estimate at the first scan, in the LiDAR
+        frame there
     """
 
     # One scan in so many is registered from constant velocity too, to tell what the IMU saves.
@@ -54,10 +54,10 @@ class InertialMotion(Stateful):
     )
     TRANSIENT: ClassVar[tuple[str, ...]] = ("_taught", "_increments", "_expected")
 
-    def __init__(self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig) -> None:
-        self.imu, self.T_lidar_imu, self.config = imu, T_lidar_imu, config
-        self.T_imu_lidar = se3.inverse(T_lidar_imu)
-        self.estimate = self._opening = estimate
+    def __init__(self, opening: InertialStart, config: Config) -> None:
+        self.imu, self.T_lidar_imu, self.config = opening.imu, opening.T_lidar_imu, config.imu
+        self.T_imu_lidar = se3.inverse(self.T_lidar_imu)
+        self.estimate = self._opening = opening.estimate
         self.coasting = ConstantVelocity()
         self.refusal = ""
         self.gap_scans = 0
@@ -67,7 +67,7 @@ class InertialMotion(Stateful):
         self.is_inertial = False
         # Whether the newest pose has no registration.
         self._was_bridged = False
-        self._gaps = gaps(imu, IMU_GAP_S)
+        self._gaps = gaps(self.imu, IMU_GAP_S)
         self._instant_ns: int | None = None
         self._pose = np.eye(4)
         # From `weigh` at an instant, ns, for `correct`: the gyroscope, and the variance of the registered position, m2.
@@ -76,11 +76,6 @@ class InertialMotion(Stateful):
         self._increments: Increments | None = None
         self._expected: tuple[int, Floats] | None = None
         self.errors = PredictionErrors()
-
-    @classmethod
-    def of(cls, opening: InertialStart, config: Config) -> Self:
-        """A model that takes nothing but the IMU as a run opened it, and its section."""
-        return cls(opening.imu, opening.T_lidar_imu, opening.estimate, config.imu)
 
     @property
     def _is_filter(self) -> bool:
@@ -341,7 +336,7 @@ def warm_up() -> None:
         np.arange(60, dtype=np.int64) * 10_000_000, np.tile([0.0, 0.0, GRAVITY], (60, 1)), np.zeros((60, 3))
     )
     estimate = ImuEstimate(none, np.array([0.0, 0.0, -GRAVITY]), none, Gyroscope.of_bias(none, 0.01), 1e-2 * np.eye(9))
-    motion = InertialMotion(imu, np.eye(4), estimate, ImuConfig())
+    motion = InertialMotion(InertialStart(imu, np.eye(4), estimate), Config())
     for k in range(3):
         stamp_ns = 100_000_000 * k
         prior = motion.sweep(stamp_ns, Span(0.0, 0.1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -70,11 +70,11 @@ class InertialStart:
     imu: ImuStream
     T_lidar_imu: Floats
     estimate: ImuEstimate
-    offset_s: float
-    has_turn_check: bool
-    is_static: bool
-    notes: list[str]
-    problems: list[str]
+    offset_s: float = 0.0
+    has_turn_check: bool = False
+    is_static: bool = False
+    notes: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
 
 def start(

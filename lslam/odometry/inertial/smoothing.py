@@ -10,11 +10,11 @@ from typing import ClassVar
 import numpy as np
 
 from lslam.backend.graph.inertial_smoother import InertialSmoother
-from lslam.core.config.odometry import ImuConfig
+from lslam.core.config import Config
 from lslam.core.errors import GraphError
 from lslam.core.geometry import noise, se3
 from lslam.core.types.arrays import Floats
-from lslam.core.types.imu import ImuStream, InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
+from lslam.core.types.imu import InertialChain, InertialLink, InertialState, InertialStep, SmootherNoise
 from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.constant_velocity import middle_of
@@ -22,13 +22,16 @@ from lslam.odometry.inertial.filter import BEGIN_SIGMA
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import ImuNoise
 from lslam.odometry.inertial.imu_estimate import GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import Increments
 from lslam.registration.result import RegistrationResult
 
 log = logging.getLogger("lslam")
 
+# Scans after which the smoother's graph begins anew, with what it knows as its prior.
+RESET_SCANS = 100
 # Velocity, gravity and accelerometer bias of an `ImuEstimate` among the 18 of an `InertialState`.
-ESTIMATE = np.r_[6:9, 15:18, 9:12]
+_ESTIMATE = np.r_[6:9, 15:18, 9:12]
 
 
 def smoother_noise(noise: ImuNoise) -> SmootherNoise:
@@ -47,13 +50,12 @@ class SmootherMotion(InertialMotion):
     STATE: ClassVar[tuple[str, ...]] = (*InertialMotion.STATE, "_is_begun", "smoother")
     TRANSIENT: ClassVar[tuple[str, ...]] = (*InertialMotion.TRANSIENT, "_added")
 
-    def __init__(
-        self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, smoother: InertialSmoother
-    ) -> None:
-        super().__init__(imu, T_lidar_imu, estimate, config)
-        self.smoother = smoother
+    def __init__(self, opening: InertialStart, config: Config) -> None:
+        super().__init__(opening, config)
+        gyroscope = opening.estimate.gyroscope
+        self.smoother = InertialSmoother(smoother_noise(gyroscope.noise), RESET_SCANS)
         # Taken off the gyroscope's readings, so that what the smoother estimates does not change with the axes.
-        self._usual_bias = estimate.gyroscope.bias
+        self._usual_bias = gyroscope.bias
         # Whether the smoother's newest state is that of the newest sweep, `_instant_ns`.
         self._is_begun = False
         # The state that `fuse` added, ns and the state, for `correct`.
@@ -201,7 +203,7 @@ class SmootherMotion(InertialMotion):
         e = self.estimate
         P = np.zeros((18, 18))
         P[:6, :6] = BEGIN_SIGMA**2 * np.eye(6)
-        P[np.ix_(ESTIMATE, ESTIMATE)] = e.covariance
+        P[np.ix_(_ESTIMATE, _ESTIMATE)] = e.covariance
         axes = e.gyroscope.axes
         P[12:15, 12:15] = axes @ e.gyroscope.covariance[:3, :3] @ axes.T
         bias = axes @ (e.gyroscope.bias - self._usual_bias)
@@ -214,5 +216,5 @@ class SmootherMotion(InertialMotion):
         gyroscope = device.with_bias(
             self._usual_bias + unturned @ state.gyro_bias, unturned @ state.covariance[12:15, 12:15] @ unturned.T
         )
-        P = state.covariance[np.ix_(ESTIMATE, ESTIMATE)]
+        P = state.covariance[np.ix_(_ESTIMATE, _ESTIMATE)]
         return ImuEstimate(state.velocity, state.gravity, state.accel_bias, gyroscope, P)

@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from lslam.core.config.odometry import ImuConfig
+from lslam.core.config import Config
 from lslam.core.geometry import noise, se3, so3
 from lslam.core.kernels import linalg
 from lslam.core.types.arrays import Floats
@@ -36,6 +36,7 @@ from lslam.odometry.inertial.filter import (
 )
 from lslam.odometry.inertial.gyroscope import Gyroscope, ImuNoise
 from lslam.odometry.inertial.imu_estimate import GRAVITY_SIGMA_M_S2, GRAVITY_WALK, ImuEstimate
+from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.inertial.integrate import integrate
 from lslam.odometry.kernels.rotation import vector_between
 from lslam.registration.result import RegistrationResult
@@ -306,11 +307,9 @@ class WindowMotion(FilterMotion):
     HAS_DEVICE: ClassVar[bool] = False
     STATE: ClassVar[tuple[str, ...]] = (*FilterMotion.STATE, "window")
 
-    def __init__(
-        self, imu: ImuStream, T_lidar_imu: Floats, estimate: ImuEstimate, config: ImuConfig, size: int
-    ) -> None:
-        super().__init__(imu, T_lidar_imu, estimate, config)
-        self.size = size
+    def __init__(self, opening: InertialStart, config: Config) -> None:
+        super().__init__(opening, config)
+        self.size = config.lio_mapping.window
         self.window: Window | None = None
         # Of the scan that is being registered: equations that were taken, and the window with it.
         self._equations: dict[int, ScanEquations] = {}

@@ -73,7 +73,7 @@ def _swept_by_imu(
         begun = start(imu, T_lidar_imu, first, int(sequence.stamps_ns[-1]), config.imu)
         if not begun.offset_s:
             return first
-        motion = InertialMotion(begun.imu, T_lidar_imu, begun.estimate, config.imu)
+        motion = InertialMotion(begun, config)
         again = told_poses(first_poses(sequence, config, motion), imu)[0]
     except ImuRefusedError:
         return first

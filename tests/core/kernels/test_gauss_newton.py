@@ -79,7 +79,7 @@ def step(
     H: Floats,
     g: Floats,
     scale: float = 1.0,
-    allowed: Floats | None = None,
+    projector: Floats | None = None,
     S: Floats | None = None,
     population: float = 0.0,
 ) -> tuple[Floats, Floats, bool, Floats, tuple[Floats, ...]]:
@@ -96,7 +96,7 @@ def step(
     limits = 1e-9, 0.0, UNSEEN
     none = np.zeros((0, 6))
     kernel = gauss_newton.step if S is None else gauss_newton.step_on_surfaces
-    moved, count, move, turn = kernel(pose, sums, scale, limits, none if allowed is None else allowed, d, weak)
+    moved, count, move, turn = kernel(pose, sums, scale, limits, none if projector is None else projector, d, weak)
     if np.linalg.norm(d[:3]) < 2 * scale:
         np.testing.assert_allclose([move, turn], [np.linalg.norm(d[:3]), np.linalg.norm(d[3:])])
     return *pose, moved, weak[:count], sums

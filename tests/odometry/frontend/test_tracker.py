@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lslam.core.config import Config
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3
 from lslam.core.types.imu import GRAVITY, ImuStream
@@ -19,6 +20,7 @@ from lslam.odometry.frontend.tracker import ScanInput, Tracker
 from lslam.odometry.inertial.fusion import InertialMotion
 from lslam.odometry.inertial.gyroscope import Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
+from lslam.odometry.inertial.initialise import InertialStart
 from lslam.odometry.scan_outcome import to_scan_result
 from lslam.registration.result import RegistrationResult
 
@@ -154,7 +156,9 @@ def braked(
     )
     oracle = kind(np.asarray(poses))
     oracle.lost_m, oracle.missed = lost_m, missed
-    tracker = Tracker(oracle, motion=InertialMotion(imu, np.eye(4), known, ImuConfig(use=True)))
+    tracker = Tracker(
+        oracle, motion=InertialMotion(InertialStart(imu, np.eye(4), known), Config(imu=ImuConfig(use=True)))
+    )
     times = np.linspace(*span, 3, dtype=np.float32)
     scans = [Scan(np.ones((3, 3), np.float32), int(1e9 * k * 0.1), k, times=times) for k in range(count)]
     return oracle, [tracker.track(ScanInput(k, scan.stamp_ns, scan, scan)) for k, scan in enumerate(scans)]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of
 from numpy.typing import NDArray
 
+from lslam.core.config import Config
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import ImuStream
@@ -28,7 +31,7 @@ def motion_of(imu: ImuStream | None = None, **keys: object) -> InertialMotion:
     stamps, poses = truth_of(drive, 50)
     first = FirstPoses(stamps, poses, stamps, poses, np.repeat(LEAST[None], 50, axis=0))
     begun = start(stream_of(drive), extrinsics_of(drive), first, int(drive.stamps_ns[-1]), config)
-    return InertialMotion(begun.imu if imu is None else imu, begun.T_lidar_imu, begun.estimate, config)
+    return InertialMotion(begun if imu is None else replace(begun, imu=imu), Config(imu=config))
 
 
 def part(imu: ImuStream, keep: slice) -> ImuStream:

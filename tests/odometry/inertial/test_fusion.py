@@ -10,6 +10,7 @@ import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of, walk
 from numpy.typing import NDArray
 
+from lslam.core.config import Config
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import GRAVITY, ImuStream
@@ -36,7 +37,8 @@ def motion_of(
         int(drive.stamps_ns[-1]),
         config,
     )
-    return InertialMotion(begun.imu if imu is None else imu, T, begun.estimate, config)
+    begun = dataclasses.replace(begun, imu=begun.imu if imu is None else imu, T_lidar_imu=T)
+    return InertialMotion(begun, Config(imu=config))
 
 
 def imu_until(imu: ImuStream, end_ns: int) -> ImuStream:
@@ -293,12 +295,10 @@ def test_the_lever_arm_of_the_imu_is_part_of_the_prediction() -> None:
     far = simulate_imu(drive.vehicle, IMUS["ideal"], arm, drive.end, np.random.default_rng(0))
     stamps, poses = truth_of(drive, 50)
     begun = start(far.stream, arm, FirstPoses(stamps, poses, stamps, poses), int(drive.stamps_ns[-1]), ImuConfig())
-    own, _ = errors(InertialMotion(far.stream, arm, begun.estimate, ImuConfig()), drive, span=Span())
+    own, _ = errors(InertialMotion(dataclasses.replace(begun, imu=far.stream), Config()), drive, span=Span())
     assert np.median(own[10:, 0]) < 0.002
-    mistaken = dataclasses.replace(begun, T_lidar_imu=se3.make(arm[:3, :3], np.zeros(3)))
-    ignored, _ = errors(
-        InertialMotion(far.stream, mistaken.T_lidar_imu, begun.estimate, ImuConfig()), drive, span=Span()
-    )
+    mistaken = dataclasses.replace(begun, imu=far.stream, T_lidar_imu=se3.make(arm[:3, :3], np.zeros(3)))
+    ignored, _ = errors(InertialMotion(mistaken, Config()), drive, span=Span())
     assert np.median(ignored[10:, 0]) > 5 * np.median(own[10:, 0])
 
 

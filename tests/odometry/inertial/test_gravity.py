@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from imu_drives import drone, extrinsics_of, stream_of, truth_of, walk
 from numpy.typing import NDArray
 
+from lslam.core.config import Config
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import GravityDirection, ImuStream
@@ -32,7 +34,7 @@ def directions(
     config = ImuConfig.model_validate(keys)
     first = FirstPoses(stamps[:50], poses[:50], stamps[:50], poses[:50])
     begun = start(stream_of(drive), extrinsics_of(drive), first, int(stamps[-1]), config)
-    motion = InertialMotion(begun.imu if imu is None else imu, extrinsics_of(drive), begun.estimate, config)
+    motion = InertialMotion(begun if imu is None else replace(begun, imu=imu), Config(imu=config))
     found = []
     for stamp, pose in zip(stamps, poses, strict=True):
         motion.correct(int(stamp), pose, motion.sweep(int(stamp), Span()))

@@ -7,13 +7,14 @@ from imu_drives import GYRO_BIAS, drone, extrinsics_of, stream_of, truth_of
 from numpy.typing import NDArray
 
 from lslam.backend.graph.inertial_smoother import InertialSmoother
+from lslam.core.config import Config
 from lslam.core.config.odometry import ImuConfig
 from lslam.core.geometry import se3, so3
 from lslam.core.types.imu import GRAVITY, ImuStream
 from lslam.core.types.scan import Span
 from lslam.odometry.inertial.gyroscope import USUAL_NOISE, Gyroscope
 from lslam.odometry.inertial.imu_estimate import ImuEstimate
-from lslam.odometry.inertial.initialise import FirstPoses, start
+from lslam.odometry.inertial.initialise import FirstPoses, InertialStart, start
 from lslam.odometry.inertial.smoothing import SmootherMotion, smoother_noise
 from lslam.registration.result import RegistrationResult
 
@@ -33,7 +34,9 @@ def swinging() -> SmootherMotion:
     imu = ImuStream(np.round(1e9 * t).astype(np.int64), felt @ R + FORCE_BIAS, rate @ R + RATE_BIAS)
     gyroscope = Gyroscope.of_bias(RATE_BIAS, 1e-4)
     estimate = ImuEstimate(np.zeros(3), np.array([0, 0, -GRAVITY]), FORCE_BIAS, gyroscope, 1e-4 * np.eye(9))
-    return SmootherMotion(imu, T_lidar_imu, estimate, ImuConfig(), InertialSmoother(IMU_NOISE, 10))
+    motion = SmootherMotion(InertialStart(imu, T_lidar_imu, estimate), Config())
+    motion.smoother = InertialSmoother(IMU_NOISE, 10)
+    return motion
 
 
 def test_readings_are_transformed_to_the_lidar() -> None:
@@ -66,7 +69,7 @@ def flying(count: int) -> SmootherMotion:
     """An IMU in flight after so many scans, registered where they were."""
     first = FirstPoses(stamps()[:50], poses()[:50], stamps()[:50], poses()[:50], np.repeat(SURE[None], 50, axis=0))
     begun = start(stream_of(drone()), extrinsics_of(drone()), first, int(stamps()[-1]), ImuConfig())
-    motion = SmootherMotion(begun.imu, begun.T_lidar_imu, begun.estimate, ImuConfig(), InertialSmoother(IMU_NOISE, 100))
+    motion = SmootherMotion(begun, Config())
     for k in range(count):
         weighed(motion, k)
     return motion
