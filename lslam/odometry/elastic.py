@@ -148,7 +148,7 @@ class ElasticResult:
 class SweepPoints:
     """Source points in the order of their times, in `SWEEP_PARTS` parts that share the map's levels but no correspondence."""
 
-    def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float, blob_weight: float) -> None:
+    def __init__(self, points: PreparedPoints, levels: Sequence[GaussianMap], sigma: float) -> None:
         assert points.source_times is not None
         order = np.argsort(points.source_times, kind="stable").astype(np.int64)
         self.times = points.source_times[order]
@@ -159,7 +159,7 @@ class SweepPoints:
         self.matches = [Correspondences(part.stop - part.start) for part in self.parts]
         kind = find_residual("plane")
         self._terms: list[list[Term]] = [
-            voxel_terms(kind, (self._moved[part], self.points.scatter[part]), levels, matches, sigma, blob_weight)
+            voxel_terms(kind, (self._moved[part], self.points.scatter[part]), levels, matches, sigma)
             for part, matches in zip(self.parts, self.matches, strict=True)
         ]
 

@@ -20,7 +20,7 @@ from lslam.registration.alignment import prior_term, upright_directions, voxel_t
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.optimiser import EVERYWHERE, Annealing, Correspondences, Limits, Term, optimise, slots_of
 from lslam.registration.preprocessing.features import Features
-from lslam.registration.residuals import PLANE
+from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
 
 NONE: Floats = np.zeros((0, 3))
@@ -115,7 +115,7 @@ def solve_on_map(
         (float(lines.size), float(noise.edge) ** 2, float(MIN_LINE_POINTS), FLOOR_M2),
         (*slots_of(len(edges)), matches.away2[len(planes) :]),
     )
-    on_planes = voxel_terms(PLANE, (planes, scatter), levels or target.planes.levels, matches, noise.plane, 0.0)
+    on_planes = voxel_terms(PLANES_ALONE, (planes, scatter), levels or target.planes.levels, matches, noise.plane)
     limits = Limits(noise.weak_share, noise.least / noise.plane**2, unseen=1.0)
     prior = [] if information is None else [prior_term(T_prior, information)]
     return optimise([on_lines, *on_planes, *prior], T_prior, annealing, limits, matches, inlier_ratio=inlier_ratio)

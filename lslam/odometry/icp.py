@@ -109,7 +109,7 @@ class Icp(MapMethod):
         """Both poses of the sweep."""
         began, registration = time.perf_counter(), self.registration
         attempt, c = registration.attempt(prepared, prior.pose, is_near), registration.config
-        points = SweepPoints(prepared, registration.map.levels, c.sigma, c.blob_weight)
+        points = SweepPoints(prepared, registration.map.levels, c.sigma)
         width = max(attempt.annealing.start, KERNEL_MIN_M)
         annealing = Annealing(width, KERNEL_MIN_M, KERNEL_DECAY, c.max_iterations)
         elastic = register_elastic(points, constraints.expected, constraints, annealing, c.weak_share)

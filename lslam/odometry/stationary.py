@@ -17,6 +17,7 @@ from lslam.registration.gaussian_map import GaussianMap
 from lslam.registration.local_map import COARSE_FACTOR
 from lslam.registration.optimiser import KERNEL_DECAY, Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints, prepare_points, small_room
+from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
 
 # A scan that moved by less since the last registered one is stationary: several times the noise of a registration.
@@ -41,7 +42,7 @@ class StationaryDetector(Stateful):
 
     def __init__(self, preprocess: PreprocessConfig, registration: RegistrationConfig) -> None:
         self._preprocess = preprocess
-        self._config = registration.model_copy(update={"blob_weight": 0.0})
+        self._config = registration
         self._limit_m, self._limit_rad = STANDING_M, float(np.deg2rad(STANDING_DEG))
         c = self._config
         # Of the reference, in voxels as coarse as those of a map's first scans: a ring is no plane.
@@ -94,7 +95,7 @@ class StationaryDetector(Stateful):
     def _step(self, points: PreparedPoints) -> RegistrationResult:
         c = self._config
         once = Annealing(c.kernel_max, c.kernel_max, KERNEL_DECAY, 1)
-        return solve((self._planes,), points, np.eye(4), once, c)
+        return solve((self._planes,), points, np.eye(4), once, c, residual=PLANES_ALONE)
 
     def _is_stationary(self, scan: Scan) -> bool:
         if self._T_own is None:

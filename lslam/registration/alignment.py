@@ -51,7 +51,7 @@ def solve(
     Points without a plane or a blob in one of the maps, the finest first, are matched in the next. `directions` as in `Limits`.
     """
     matches = Correspondences(len(points.source))
-    terms = voxel_terms(residual, residual.points(points, c.sigma), levels, matches, c.sigma, c.blob_weight)
+    terms = voxel_terms(residual, residual.points(points, c.sigma), levels, matches, c.sigma)
     limits = Limits(c.weak_share, by_surfaces=residual.by_surfaces, directions=directions)
     return optimise(terms, T_prior, annealing, limits, matches)
 
@@ -68,11 +68,10 @@ def voxel_terms(
     levels: Sequence[GaussianMap],
     matches: Correspondences,
     sigma: float,
-    blob_weight: float,
 ) -> list[Term]:
     """The residual of the points on each of the maps, the finest first, which share their matches.
 
-    points : arrays that the residual takes of them; sigma : m, noise of a point; blob_weight : of voxels that are no plane
+    points : arrays that the residual takes of them; sigma : m, noise of a point
 
     The mean of a voxel beyond the second size constrains nothing.
     """
@@ -86,7 +85,7 @@ def voxel_terms(
                 level.size,
                 float(sigma) ** 2,
                 part_of_usual(level.size, usual),
-                float(blob_weight) if k < 2 else 0.0,
+                float(kind.blob_weight) if k < 2 else 0.0,
                 kind.along,
                 0 < k == last,
             ),
@@ -132,7 +131,7 @@ class MapAlignment:
         width, end = (max(width, end), end) if c.inlier_distance is None else (c.inlier_distance,) * 2
         matches = self._recall(len(points.source))
         arrays, levels = self.kind.points(points, c.sigma), (self.map.fine, *coarser)
-        terms = voxel_terms(self.kind, arrays, levels, matches, c.sigma, c.blob_weight)
+        terms = voxel_terms(self.kind, arrays, levels, matches, c.sigma)
         if information is not None:
             terms.append(prior_term(start, information))
         limits = Limits(c.weak_share, by_surfaces=self.kind.by_surfaces, directions=directions)

@@ -34,7 +34,7 @@ from lslam.registration.result import RegistrationResult
 # m; points this near belong together. Poles and leaves make no planes: their voxels are as large, one point is enough,
 # and none of them passes for a plane.
 NEAR_M = 0.4
-ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, blob_weight=1.0, weak_share=0.0)
+ALL_ALIKE = RegistrationConfig(sigma=NEAR_M, weak_share=0.0)
 # m above the ground: crash barriers are lower, along which a sensor's rings match best where nothing moved.
 HIGH_M = 1.2
 # m; from so far away they find each other: starts that far apart leave no gap, not even between piers of a facade.
@@ -67,7 +67,7 @@ class NonGroundPoints:
     def agreeing(self, high: PreparedPoints, T_world_lidar: Floats) -> Bools:
         """(S,) which of them have one of these points near by when seen from `T_world_lidar` (4, 4)."""
         matches = Correspondences(len(high.source))
-        terms = voxel_terms(MEANS, MEANS.points(high, NEAR_M), (self._cells,), matches, NEAR_M, 1.0)
+        terms = voxel_terms(MEANS, MEANS.points(high, NEAR_M), (self._cells,), matches, NEAR_M)
         normal_equations(terms, T_world_lidar, NEAR_M, matches)
         return (matches.away2 >= 0) & (matches.away2 < NEAR_M**2)
 

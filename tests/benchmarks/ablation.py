@@ -54,6 +54,7 @@ THIRDS = ("street", "corridor", "urban")
 
 
 BLOBS_AS_BEFORE = {**residuals.RESIDUALS, "plane": replace(residuals.RESIDUALS["plane"], along=1.0)}
+WITHOUT_BLOBS = {**residuals.RESIDUALS, "plane": residuals.PLANES_ALONE}
 MAP: dict[str, Variant] = {
     "breadth": ((), ((local_map, "LEAST_BREADTH", 0.0),)),
     "wide voxels": ((), ((local_map, "WIDE_FACTORS", ()),)),
@@ -62,7 +63,7 @@ MAP: dict[str, Variant] = {
 WITHOUT: dict[str, dict[str, Variant]] = {
     "icp": {
         **MAP,
-        "blobs": (("registration.blob_weight=0",), ()),
+        "blobs": ((), ((residuals, "RESIDUALS", WITHOUT_BLOBS),)),
         "along": ((), ((residuals, "RESIDUALS", BLOBS_AS_BEFORE),)),
         "coarse-to-fine": (("recovery.coarse_to_fine=false",), ()),
         "start search": (("recovery.start_search=false",), ()),

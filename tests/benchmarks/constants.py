@@ -82,7 +82,7 @@ NOT_OF_IT = {
 KEYS = {
     "points": (
         "preprocess.range_max", "preprocess.least_line", "preprocess.source_points_min", "preprocess.source_points_max",
-        "registration.sigma", "registration.blob_weight", "registration.kernel_max", "registration.max_iterations",
+        "registration.sigma", "registration.kernel_max", "registration.max_iterations",
         "registration.start_scans", "registration.start_reach", "registration.min_overlap", "registration.min_agreement",
         "registration.max_jump_m", "registration.max_jump_deg", "registration.weak_share",
     ),

@@ -94,8 +94,7 @@ def scanned(sweep: ElasticSweep, registration: Registration | None = None) -> Sw
         R = sweep.begin[:3, :3] @ so3.exp(share * so3.log(sweep.begin[:3, :3].T @ sweep.end[:3, :3]))
         seen[part] = (world[part] - t) @ R
     points = prepare_points(seen, registration.preprocess, 0, times)
-    c = registration.config
-    return SweepPoints(points, registration.map.levels, c.sigma, c.blob_weight)
+    return SweepPoints(points, registration.map.levels, registration.config.sigma)
 
 
 def test_both_poses_of_a_sweep_are_found_from_a_wrong_start() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def align(
     farthest: float = np.inf, width: float = 1.0,
 ) -> RegistrationResult:  # fmt: skip
     matches = Correspondences(len(source))
-    terms = voxel_terms(RESIDUALS["plane"], (source, np.zeros((len(source), 6))), [m], matches, 0.03, 0.5)
+    terms = voxel_terms(RESIDUALS["plane"], (source, np.zeros((len(source), 6))), [m], matches, 0.03)
     return optimise(
         terms, se3.make(R, t), Annealing(width, 0.1, 0.5, steps), Limits(weak_share), matches, inlier_distance=farthest
     )
@@ -168,8 +169,8 @@ def test_each_map_serves_what_the_finer_ones_left(residual: str) -> None:
 
     def found(count: int) -> RegistrationResult:
         return solve(
-            levels[:count], scan, np.eye(4), Annealing(1.0, 0.15, 0.7, 40), RegistrationConfig(blob_weight=0.0),
-            residual=find_residual(residual),
+            levels[:count], scan, np.eye(4), Annealing(1.0, 0.15, 0.7, 40), RegistrationConfig(),
+            residual=replace(find_residual(residual), blob_weight=0.0),
         )  # fmt: skip
 
     one, two, three = (found(k) for k in (1, 2, 3))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from itertools import repeat
 
 import numpy as np
@@ -28,6 +29,7 @@ from lslam.registration.alignment import solve, upright_directions
 from lslam.registration.gaussian_map import FLOOR_M2, GaussianMap
 from lslam.registration.optimiser import Annealing
 from lslam.registration.preprocessing.prepare import PreparedPoints
+from lslam.registration.residuals import PLANE, PLANES_ALONE
 from lslam.registration.result import RegistrationResult
 
 Floats = NDArray[np.float64]
@@ -42,8 +44,8 @@ def as_source(points: NDArray[np.float32]) -> PreparedPoints:
 
 
 def on(target: GaussianMap, points: NDArray[np.float32], prior: Floats, blob_weight: float = 0.5) -> RegistrationResult:
-    config = RegistrationConfig(sigma=NOISE, blob_weight=blob_weight, weak_share=1e-3)
-    return solve((target,), as_source(points), prior, FINE, config)
+    config = RegistrationConfig(sigma=NOISE, weak_share=1e-3)
+    return solve((target,), as_source(points), prior, FINE, config, residual=replace(PLANE, blob_weight=blob_weight))
 
 
 def map_of(world: Floats) -> GaussianMap:
@@ -81,7 +83,7 @@ def test_the_ground_aligns_height_and_tilt_alone(room_map: GaussianMap, weak_sha
     start = T @ off
     result = solve(
         (room_map,), as_source(seen_from(room(rng, 300), T)), start, FINE,
-        RegistrationConfig(sigma=NOISE, blob_weight=0.5, weak_share=weak_share), directions=upright_directions(start),
+        RegistrationConfig(sigma=NOISE, weak_share=weak_share), directions=upright_directions(start),
     )  # fmt: skip
     moved = se3.log(se3.relative(start, result.T_world_lidar))
     left = se3.log(se3.relative(T, result.T_world_lidar))
@@ -151,8 +153,8 @@ def test_a_degenerate_direction_is_estimated_down_to_three_tenths_of_the_thresho
 
     def solved(weak_share: float) -> RegistrationResult:
         annealing = Annealing(0.3, 0.3, 0.5, 20)
-        config = RegistrationConfig(sigma=NOISE, blob_weight=0.0, weak_share=weak_share)
-        return solve((target,), seen, start, annealing, config)
+        config = RegistrationConfig(sigma=NOISE, weak_share=weak_share)
+        return solve((target,), seen, start, annealing, config, residual=PLANES_ALONE)
 
     first = solved(1e-12)
     assert first.covariance is not None

@@ -70,7 +70,6 @@ class RegistrationConfig(Section):
         "their means, 5/8 of it",
     )
     sigma: float = Field(0.03, gt=0, description="m; noise of a point, ranging and calibration together")
-    blob_weight: float = Field(0.5, ge=0, description="weight of voxels that are no plane; 0 leaves them out")
     kernel_max: float = Field(
         1.0, gt=0.15, description="m; widest Geman-McClure kernel, where annealing starts; it ends at 0.15 m"
     )

@@ -34,7 +34,7 @@ from lslam.registration.optimiser import (
     optimise,
 )
 from lslam.registration.preprocessing.prepare import PreparedPoints
-from lslam.registration.residuals import PLANE
+from lslam.registration.residuals import PLANES_ALONE
 from lslam.registration.result import RegistrationResult
 
 # Edge of a cell of directions, rad: two rings of sixteen beams, a hundred shots.
@@ -78,7 +78,7 @@ def empty_share(before: Longs, now: Longs) -> float:
     return min((float(half.mean()) for half in halves), default=0.0)
 
 
-SETTINGS = RegistrationConfig(blob_weight=0.0)
+SETTINGS = RegistrationConfig()
 # Edge of the smallest voxels as a part of the median range of the points, and its bounds, m: a voxel is small against the
 # room, and spans several points and several sigma of their noise.
 EDGE_SHARE, SMALLEST_M, LARGEST_M = 0.2, 0.3, COARSE_FACTOR * SETTINGS.voxel_size
@@ -154,9 +154,7 @@ class PairRegistration:
         self._view, self._source = filled_directions(first), last.source
         # What one start looked up the others need not.
         self._matches = Correspondences(len(last.source))
-        self._terms = voxel_terms(
-            PLANE, PLANE.points(last, sigma), self._planes, self._matches, sigma, SETTINGS.blob_weight
-        )
+        self._terms = voxel_terms(PLANES_ALONE, PLANES_ALONE.points(last, sigma), self._planes, self._matches, sigma)
 
     def near(self, start: Floats) -> MotionHypothesis:
         """The motion that fits near a start (4, 4): planes capture points as far as they reach."""
