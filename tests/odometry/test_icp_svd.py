@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from lslam.core.types.motion_prior import MotionPrior
 from lslam.core.types.scan import Scan
 from lslam.odometry.frontend.register_scans import estimate
 from lslam.odometry.icp_svd import Partners, align_closed_form, create, keep_pairs
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]
 
@@ -103,12 +104,17 @@ def test_without_partners_or_on_a_line_the_prior_stays() -> None:
         assert (found.inliers, found.converged) == (0, False)
 
 
+@cache
+def from_rest() -> SimulatedDrive:
+    return simulate("block", seed=0, count=30, start_speed=0.0)
+
+
 @pytest.mark.parametrize("kind", ["target", "grid", "random"])
 def test_a_drive_is_followed_with_every_down_sampling_and_standing_still_would_not_pass(kind: str) -> None:
     config = Config.model_validate(
         {"preprocess": {"downsample": kind, "range_shape": "cylinder"}, "odometry": {"method": "icp-svd"}}
     )
-    drive = simulate("block", seed=0, count=30, start_speed=0.0)
+    drive = from_rest()
     assert drive.ground_truth is not None
     truth = drive.ground_truth.poses
     results = estimate(drive, create(config))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -196,11 +197,15 @@ def test_a_walk_of_another_town_is_not_tied(monkeypatch: pytest.MonkeyPatch, tmp
     assert len(set(columns(tmp_path / "out")["frame"])) == 2
 
 
+@cache
+def street() -> SimulatedDrive:
+    return simulate("street", seed=7, lidar="vlp16", count=45, motion_compensated=False, imu="icm20948")
+
+
 @pytest.mark.parametrize("method", ["icp", "fast-lio2"])
 def test_a_run_with_an_imu_begins_a_segment_where_its_map_is_lost(
     method: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    drive = simulate("street", seed=7, lidar="vlp16", count=45, motion_compensated=False, imu="icm20948")
     traced = SimulatedDrive.scan
 
     def scan(self: SimulatedDrive, index: int) -> Scan:
@@ -208,7 +213,7 @@ def test_a_run_with_an_imu_begins_a_segment_where_its_map_is_lost(
         return scan if index < 30 else replace(scan, points=scan.points * np.float32([1, -1, 1]))
 
     monkeypatch.setattr(SimulatedDrive, "scan", scan)
-    lslam.run(drive, config("imu.use=true", f"odometry.method={method}"), out=tmp_path / "out")
+    lslam.run(street(), config("imu.use=true", f"odometry.method={method}"), out=tmp_path / "out")
     segments = columns(tmp_path / "out")["segment"]
     assert segments[:30] == ["0"] * 30
     assert segments[-1] == "1"

@@ -23,7 +23,7 @@ from lslam.registration.preprocessing.prepare import prepare_points
 from lslam.registration.registration import Registration
 from lslam.registration.residuals import RESIDUALS as TABLE
 from lslam.registration.residuals import find_residual
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 Floats = NDArray[np.float64]
 RESIDUALS: list[Residual] = list(TABLE)
@@ -99,11 +99,16 @@ def test_the_second_scan_of_a_drive_agrees_as_on_planes(residual: Residual) -> N
     assert shares[residual] > 0.8 * shares["plane"]
 
 
+@cache
+def on_a_motorway(seed: int) -> SimulatedDrive:
+    return simulate("motorway", seed=seed, count=10, motion_compensated=True)
+
+
 @pytest.mark.parametrize("residual", ["point", "vgicp"])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_rings_on_flat_ground_do_not_bias_the_velocity(residual: Residual, seed: int) -> None:
     """3 m per scan on a motorway: what the first steps are short of would be kept at every later one."""
-    drive = simulate("motorway", seed=seed, count=10, motion_compensated=True)
+    drive = on_a_motorway(seed)
     registration = Registration(RegistrationConfig(residual=residual))
     found = [registration.register(drive.scan(i).points).T_world_lidar for i in range(len(drive))]
     truth = drive.ground_truth.poses

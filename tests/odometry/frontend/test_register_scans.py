@@ -17,7 +17,7 @@ from lslam.core.types.scan_result import ScanResult, Status
 from lslam.core.types.sequence import select
 from lslam.odometry import create_odometry
 from lslam.odometry.frontend.register_scans import PRIOR_COVARIANCE, diverges, estimate, read_ahead, to_trajectory
-from lslam.simulation.scenarios import simulate
+from lslam.simulation.scenarios import SimulatedDrive, simulate
 
 
 def outcomes(*runs: tuple[Status, int]) -> list[ScanResult]:
@@ -137,11 +137,12 @@ def test_a_skipped_scan_is_more_doubtful_than_the_one_before() -> None:
 
 def test_distorted_scans_are_deskewed_twice_and_the_first_one_too() -> None:
     """Round a block, rays fired on the way: centimetres become millimetres."""
+    drives = [
+        simulate("block", seed=seed, count=20, speed=10.0, start_speed=6.0, motion_compensated=False, lidar="vlp16")
+        for seed in range(3)
+    ]
 
-    def off(seed: int, *settings: str) -> NDArray[np.float64]:
-        drive = simulate(
-            "block", seed=seed, count=20, speed=10.0, start_speed=6.0, motion_compensated=False, lidar="vlp16"
-        )
+    def off(drive: SimulatedDrive, *settings: str) -> NDArray[np.float64]:
         results = estimate(drive, create_odometry(load_config(None, list(settings), {})))
         assert all(r.status == "ok" for r in results)
         poses, truth = np.stack([r.T_world_lidar for r in results]), drive.ground_truth.poses
@@ -150,7 +151,7 @@ def test_distorted_scans_are_deskewed_twice_and_the_first_one_too() -> None:
 
     # Steps tell what the map holds; its tilt, a milliradian by the first sweep's own acceleration, adds up along the way.
     deskewed, distorted = (
-        [off(seed, *settings) for seed in range(3)] for settings in ([], ["preprocess.deskew=false"])
+        [off(drive, *settings) for drive in drives] for settings in ([], ["preprocess.deskew=false"])
     )
     # The second scan makes no good of a first one that is left as it was.
     assert np.max(deskewed) < 0.02
