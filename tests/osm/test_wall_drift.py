@@ -120,7 +120,7 @@ def test_downweighted_sightings_give_the_same_rates_with_larger_sigmas() -> None
     assert (ratio < 5.1).all()
 
 
-@pytest.mark.parametrize("size", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("size", [0.1, 1.0])
 def test_errors_of_the_map_are_no_drift(size: float) -> None:
     graph = odometry(0.0, 0.0)
     for seed in range(20):

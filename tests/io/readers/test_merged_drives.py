@@ -56,7 +56,7 @@ FOLDERS, FRAMES, TOPICS = (0.0, "folders", ""), (HALF_MS, "frames", "mcap"), (HA
 @pytest.mark.parametrize(
     ("written", "method", "uses_imu"),
     [
-        (FOLDERS, "icp", False), (FRAMES, "icp", False), (TOPICS, "icp", False), (FRAMES, "icp", True), (TOPICS, "loam", True),
+        (FOLDERS, "icp", False), (TOPICS, "icp", False), (FRAMES, "icp", True), (TOPICS, "loam", True),
     ],
 )  # fmt: skip
 def test_two_lidars_are_no_worse_than_one(

@@ -75,20 +75,23 @@ def wrong_share(clock: SweepClock, scan: Scan) -> float:
     return float((np.abs(off - np.median(off)) > 0.02 * SECONDS).mean())
 
 
-@pytest.mark.parametrize("clockwise", [True, False])
-@pytest.mark.parametrize("begin_deg", [0.0, 100.0, -180.0])
-@pytest.mark.parametrize(
-    ("change", "kind"),
-    [
-        (lambda scan: scan, "columns"),
-        (rows_first, "columns"),
-        (half, "order"),
-        (lambda scan: half(rows_first(scan)), "azimuth"),
-        (two_returns, "order"),
-        (second_returns_behind, "azimuth"),
-        (front, "order"),
-    ],
-)  # fmt: skip
+# Each kind of clock from every azimuth in both senses; what else leads to it, from two.
+ROUND = [(begin_deg, clockwise) for begin_deg in (0.0, 100.0, -180.0) for clockwise in (True, False)]
+CHANGED = [
+    *((lambda scan: scan, "columns", *begun) for begun in ROUND),
+    *((half, "order", *begun) for begun in ROUND),
+    *((lambda scan: half(rows_first(scan)), "azimuth", *begun) for begun in ROUND),
+    *(
+        (*change, *begun)
+        for change in (
+            (rows_first, "columns"), (two_returns, "order"), (second_returns_behind, "azimuth"), (front, "order"),
+        )
+        for begun in ((100.0, True), (-180.0, False))
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "kind", "begin_deg", "clockwise"), CHANGED)
 def test_the_order_of_points_proposes_the_times_at_which_they_were_fired(
     change: object, kind: str, begin_deg: float, clockwise: bool
 ) -> None:
