@@ -78,7 +78,7 @@ class Landmarks:
 class PlaneWindow:
     """States, planes and the factors among them; every method returns a new window.
 
-    values : of `LAG_SCANS` states at most; steps : between them; seen : planes in them; T_imu_lidar : (4, 4)
+    values : of `LAG_SCANS` states at most; steps : between them; sightings : planes in them; T_imu_lidar : (4, 4)
     """
 
     T_imu_lidar: Floats

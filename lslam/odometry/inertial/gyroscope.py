@@ -83,7 +83,7 @@ class Gyroscope:
     covariance : (12, 12) of the bias and of the rows of `axes`; (13, 13) where the offset of the clocks is estimated too
     rate_variance : (rad/s)^2 per Hz, of what is left
     noise : of the device, its accelerometer's too
-    offset_s : s to add to the stamps; is_mounted : whether what rotation there is in `axes` is the accelerometer's too
+    offset_s : s to add to the stamps; has_mounting : whether what rotation there is in `axes` is the accelerometer's too
     """
 
     bias: Floats

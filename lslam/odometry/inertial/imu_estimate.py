@@ -156,8 +156,9 @@ class ImuEstimate:
         """The estimate at the last instant of `step`, updated by the registered motion over it.
 
         step : as this estimate finds it `over` the two instants
-        R, R_end : (3, 3) of the IMU in the world at the first and the last instant; moved : (3,) m in between
-        gyroscope : as the turn has `calibrate`
+        R, R_end : (3, 3) of the IMU in the world at the first and the last instant
+        displacement : (3,) m in between
+        gyroscope : as `calibrate` has it of the turn
         noise : (3, 3) m2, world axes, of either place; None for a registration without covariance
         """
         rest = vector_between(R @ step.rotations[-1], R_end)

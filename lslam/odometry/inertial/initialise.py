@@ -64,7 +64,7 @@ class InertialStart:
     """A usable IMU: its stream on the clock of the scans, the estimate at the first of them, and what was decided.
 
     problems : what was given and could not be used
-    offset_s : what was added to its stamps; is_checked : whether its turns could be compared with those of the scans
+    offset_s : what was added to its stamps; has_turn_check : whether its turns could be compared with those of the scans
     """
 
     imu: ImuStream

@@ -136,8 +136,8 @@ def propagate(
     """Mean (12,) and covariance (12, 12) of displacement, velocity, gravity and accelerometer bias after `t` seconds.
 
     x (9,), covariance (9, 9) : velocity, m/s, gravity and accelerometer bias, m/s2, at the beginning
-    gained (3,), displacement (3,), velocity_arm (3, 3), position_arm (3, 3) : velocity, position and their arms at the end, as in
-        `Increments`
+    velocity_gain (3,), displacement (3,), velocity_arm (3, 3), position_arm (3, 3) : velocity, position and their arms at the
+        end, as in `Increments`
     R : (3, 3) world from IMU at the beginning; force_noise : m/s2 per sqrt(Hz)
     """
     mean, F = np.empty(12), np.zeros((12, 9))
@@ -168,9 +168,9 @@ def propagate(
 def correct_by_displacement(
     x: Floats, P: Floats, displacement: Floats, noise: Floats, gravity: float, gravity_sigma: float, outlier: float
 ) -> tuple[Floats, Floats]:
-    """Mean (12,) and covariance (12, 12) of `propagate` after the update by the displacement `moved` (3,), m, of registration.
+    """Mean (12,) and covariance (12, 12) of `propagate` after the update by the `displacement` (3,), m, of registration.
 
-    noise : (3, 3) covariance of `moved`, m2; gravity, gravity_sigma : magnitude of gravity and its sigma, m/s2
+    noise : (3, 3) covariance of `displacement`, m2; gravity, gravity_sigma : magnitude of gravity and its sigma, m/s2
     """
     H, rest = np.zeros((3, 12)), np.empty(3)
     for i in range(3):

@@ -56,7 +56,7 @@ def certainty_of_pair(
 ) -> tuple[float, float, float, float, float, float, float]:
     """Inverse xx..zz of the sum of both covariances, and the squared Mahalanobis distance, m2, scaled by `thin`.
 
-    p : (8,) row of `planes`; e : from its mean to the point, m; spread : m2, of the point, world axes
+    p : (8,) row of `planes`; e : from its mean to the point, m; scatter : m2, of the point, world axes
     thin : m2, the variance of the pair along a common normal
     """
     if is_plane:

@@ -78,7 +78,7 @@ def follow_rings(points: NDArray[Any]) -> RingOrder | None:
 class _Blocks:
     """Mean azimuths of blocks of points in their order.
 
-    middles : (B,) index of the middle of each block; angles : (B,) rad; turned : (B,) rad from the first block, in the sense
+    middles : (B,) index of the middle of each block; angles : (B,) rad; turn_rad : (B,) from the first block, in the sense
     """
 
     middles: Floats

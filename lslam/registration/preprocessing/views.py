@@ -72,7 +72,7 @@ class RingView(SequenceView):
 
     def __init__(self, whole: Sequence, rule: RingRule, is_strict: bool = True) -> None:
         super().__init__(whole, notes=[*whole.notes, str(rule)])
-        self.rule, self._is_required = rule, is_strict
+        self.rule, self._is_strict = rule, is_strict
 
     def scan(self, index: int) -> Scan:
         """Read scan `index` and find its rings, by itself where it does not obey the rule.
@@ -88,7 +88,7 @@ class RingView(SequenceView):
             try:
                 rule = decide_rings([scan])
             except InputError:
-                if self._is_required:
+                if self._is_strict:
                     raise error from None
                 log.warning("scan %d: its points get no ring: %s", scan.index, error)
                 return scan
@@ -97,7 +97,7 @@ class RingView(SequenceView):
             scan = replace(scan, fault="; ".join(filter(None, (scan.fault, why))))
         scan = replace(scan, rings=rings)
         has_ring = rings != NO_RING
-        return scan if has_ring.all() or not self._is_required else scan.select(has_ring)
+        return scan if has_ring.all() or not self._is_strict else scan.select(has_ring)
 
 
 class WithoutClasses(SequenceView):
@@ -204,7 +204,7 @@ class MergedLidars(SequenceView):
         return _join(scan, parts, self._is_timed)
 
     def with_rings(self, choice: str, is_strict: bool = True) -> Sequence:
-        """The same with the rings of each LiDAR found by itself; is_required : as of `RingView`."""
+        """The same with the rings of each LiDAR found by itself; is_strict : as of `RingView`."""
         others = [replace(other, scans=with_rings(other.scans, choice, is_strict)) for other in self.further_lidars]
         return MergedLidars(with_rings(self.whole, choice, is_strict), others)
 
